@@ -9,7 +9,7 @@ from tests.marks import slow
 from twoloop import solve_dae
 from twoloop.kernels.steps import crossing_step
 from twoloop.methods.tableaux import gauss
-from twoloop.run.fallbacks import lengths_across
+from twoloop.run.fallbacks import sizes_across
 
 S = crossing_step.S
 
@@ -57,6 +57,6 @@ def test_few_steps_lead_across_and_the_method_goes_on_behind(tolerance):
 def test_no_length_is_tried_twice():
     """A length above the longest step allowed would be cut to that, and the attempt be the same once more."""
     for longest, allowed in ((0.1, 0.02), (0.01, 0.02)):
-        lengths = lengths_across(longest, allowed)
+        lengths = sizes_across(longest, allowed)
         assert lengths[0] == min(longest, allowed) and len(set(lengths)) == len(lengths)
         assert lengths == sorted(lengths, reverse=True)

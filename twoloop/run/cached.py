@@ -1,8 +1,8 @@
-"""Cache integrators: a call with the same options as an earlier one reuses its plan, code, arrays and checks.
+"""Cache integrators: a call with the same options as an earlier call reuses the plan, code, arrays and checks.
 
-`CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and makes a first chunk of
-steps. If the chunk reaches the end and nothing unusual happens, the fields of the result are computed when they are
-read. Otherwise `IntegrationLoop` continues the run.
+`CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and takes a first chunk of
+steps. If the chunk reaches the end of the run and nothing unusual happens, the fields of the result are computed when
+they are read. Otherwise `IntegrationLoop` continues the run.
 """
 
 import time
@@ -65,43 +65,43 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
 Array = NDArray[np.float64]
 
-MAX_IDLE = 4  # largest number of idle integrators with equal options; each thread takes one
-# length of the first call of compiled code, in chunks, if no states are sampled for `StiffnessMonitor`: a longer call
+MAX_IDLE = 4  # largest number of idle integrators with equal options: one for each thread that integrates
+# number of chunks in the first call of compiled code, if no states are sampled for `StiffnessMonitor`: a longer call
 # would delay the answer to Ctrl-C by more than 0.1 s
 FIRST_CHUNKS = 4
-AFTER_ERROR = 16  # number of calls that do not use an integrator after a callback raised in it
+CALLS_SKIPPED = 16  # number of calls that do not use an integrator after a callback raised an exception in it
 STEP_FIELDS = (*OF_STEPS, "stats")  # fields of a result that are computed from the array of steps
 OTHER_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # CPU time of a run, s, below which elapsed time is measured instead: that clock is faster to read
-REACHED_END = Status.REACHED_END  # a global name, because looking it up in the enumeration takes longer
+SHORT_RUN = 1e-3  # CPU time of the last run, s, below which elapsed time is measured: this clock is faster to read
+REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
 
 class Output(NamedTuple):
-    """Requested output: states at `times` (the two ends of the run if `at_ends`); None: at all steps."""
+    """Requested output of a cached run."""
 
-    times: Array | None
-    at_ends: bool
+    times: Array | None  # output times; None: the ends of all steps
+    at_ends: bool  # whether all output times are ends of the run
     dense: bool  # whether `sol` is requested, too
     time_limit: float | None  # limit of elapsed time, s
 
     @property
     def between(self) -> Array | None:
-        """Output times at which states must be interpolated, or None."""
+        """Output times if states must be interpolated at them, else None."""
         return None if self.at_ends else self.times
 
     def request(self, run: Run) -> OutputRequest:
-        """Return the request for the output that `IntegrationLoop` has to record."""
+        """Return this output as an OutputRequest for `IntegrationLoop`."""
         return OutputRequest(self.times, self.at_ends or run.lands, self.dense, None, MemoryStore())
 
 
-STEPS = Output(None, False, False, None)
+STEPS = Output(None, False, False, None)  # output at the ends of all steps
 
 
 @dataclass(frozen=True)
 class MissedChanges:
-    """Request to repeat a run that may have missed short changes, with evaluations at most `every` seconds apart."""
+    """Request to repeat a run that may have missed short changes of forces."""
 
-    every: float
+    every: float  # largest time between two evaluations in the repetition, s
     cpu_time: float  # CPU time of the run to be repeated, s
 
 
@@ -111,16 +111,16 @@ class CachedIntegrator:
     Parameters
     ----------
     run : Run
-        A run at its start, which belongs to the integrator from now on.
+        A run at its start, which no other object uses.
     system : ConstrainedSystem
-        System of the call; `run.system` may be a copy of it with derived callbacks.
+        System given by the user; `run.system` may be a copy with derived callbacks.
     code : GeneratedCode or None
-        The machine code that the plan of the run calls.
+        The generated code that the plan of the run calls.
     definite : bool
-        Whether M has an inverse at the start.
+        Whether M is definite at the start.
     options : Options
     shared : SharedSetup or None
-        Setup for systems with other parameters, if the integrator is used for these, too.
+        Setup for systems with other parameters; None: the integrator is used for `system` only.
     """
 
     def __init__(
@@ -137,14 +137,14 @@ class CachedIntegrator:
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (n_attempts := first_chunk(run))
         checked = system if self.parametric is None else self.parametric.system
-        # skips: number of the next calls that do not use the integrator, because a callback raised
+        # skips: number of next calls that do not use the integrator, because a callback raised an exception
         self.evaluation, self.loops, self.skips = StartEvaluation(checked), cached_run(), 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # indices in `arrays.block` at which the states begin, and the report of a run with a single state
+        # indices in `arrays.block` at which the states begin, and at which the report of a run with one state begins
         self.states_from, self.width = self.arrays.report.size, len(run.state)
         self.one_state_from = self.states_from - self.loops.N_HEAD - 1
-        self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` that are not arrays
+        self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
         self.at_start = {name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.between = OutputInterpolation(run)
@@ -154,13 +154,13 @@ class CachedIntegrator:
 
     @staticmethod
     def can_start(run: Run) -> bool:
-        """Return whether compiled code can start this run: callbacks compiled, dense algebra, no warning."""
+        """Return whether compiled code can start this run: compiled callbacks, dense algebra, and no warning."""
         return run.static is None and not run.start_warning and not run.system.called_in_python
 
     @staticmethod
     def can_provide(run: Run, output: Output, shared: SharedSetup | None) -> bool:
         """Return whether an integrator that reuses its arrays can provide an output."""
-        # `sol` and interpolated output must agree; and `sol` would read arrays that a shared setup fills anew
+        # `sol` and interpolated output must agree; `sol` must not use arrays that are filled for other parameters
         if output.dense and (output.between is not None or shared is not None):
             return False
         return output.between is None or not (run.lands or run.kit.flags[FORM] == indices.AUGMENTED)
@@ -175,10 +175,10 @@ class CachedIntegrator:
         output: Output,
         interrupts: Interrupts,
     ) -> dict[str, Any] | MissedChanges | None:
-        """Integrate a system from a start, and return the fields of the result.
+        """Integrate a system from a start; return the fields of the result, or a request to repeat the run.
 
-        Return None if the start must be checked more closely, or if a callback raised: `set_up` then describes the
-        problem. If nothing unusual happened, the fields are computed when they are read, from a copy of the arrays.
+        Return None if the start needs more checks, or if a callback raised: `set_up` then describes the problem. After
+        a usual run, the fields are `status` and `later`, which computes the other fields from a copy of the arrays.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
         due = region.is_comparison_due()
@@ -202,11 +202,11 @@ class CachedIntegrator:
             if n == loops.IN_DOUBT and self.evaluation.is_surely_consistent(0, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
         except Exception:  # raised by a callback: `IntegrationLoop` will handle it
-            self.skips, arrays.last_start[loops.N_EQUAL] = AFTER_ERROR, loops.NEVER
+            self.skips, arrays.last_start[loops.N_EQUAL] = CALLS_SKIPPED, loops.NEVER
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, timed_states = n, None  # one row for each step, unless `_finish` counts them
+        n_rows, timed_states = n, None  # one row for each step, unless `_finish` is called
         rows_differ = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent
         all_steps = output.times is None and not output.dense
         if n < 0 or rows_differ or due or not all_steps or parametric is not None:
@@ -223,7 +223,7 @@ class CachedIntegrator:
         fields["later"] = partial(
             _deferred_field, data, timed_states, self.run_fields, self.cpu_time, system, t1, self.options
         )
-        region.count()  # runs that the loop ends are counted there
+        region.count()  # runs that `IntegrationLoop` has continued are counted by `compare_callbacks`
         return fields
 
     def _finish(
@@ -237,11 +237,11 @@ class CachedIntegrator:
         due: bool,
         fields: dict[str, Any],
     ) -> dict[str, Any] | MissedChanges | tuple[tuple[Array, Array] | None] | None:
-        """Check the first chunk of a run, and integrate to the end if the run has further chunks.
+        """Check the first chunk of a run, and integrate to the end if this chunk does not reach it or is unusual.
 
-        Return all fields of an unusual run, or None if the start must be checked more closely, as in `integrate`. For
-        any other run, return a tuple of one element: (output times, states), or None for output at all steps. Write
-        `sol` to `fields` if it is requested.
+        Return the result of `integrate` for an unusual run, or None if the start needs more checks. For any other run,
+        return a tuple of one element: (output times, states), or None for output at all steps; store `sol` in `fields`
+        if it is requested.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -283,7 +283,7 @@ class CachedIntegrator:
         return (timed_states,)
 
     def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
-        """Update the redundant rows at a new start. Return False if the start or new parameters need more checks."""
+        """Set the redundant rows at a new start; return False if the start, or new parameters, need more checks."""
         run = self.run
         if run.rows_warning:  # rounding may decide which of several dependent rows is left out
             independent = self.arrays.start_rows.tobytes()
@@ -298,17 +298,17 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.agrees(run.t0, q0, v0, t1, mass, derivatives)
 
     def _return_to_start(self) -> None:
-        """Restore the attributes of the run, besides arrays, that the loop may have changed."""
+        """Restore the attributes of the run, other than arrays, that `IntegrationLoop` may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            # the loop may have loaded a step into the kit
+            # the run's own plan is unchanged, but its kit may have been renewed to load a step: use the new kit
             self.at_start |= {"kit": run.kit, "functions": run.functions}
         vars(run).update(self.at_start, crossings=[], jumps=[], lengths=[], substituted=False)
 
     def _compare_callbacks(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
-        """Compare callbacks with their traces at states outside the checked region; return whether they agree.
+        """Check callbacks at sampled states of the run outside the checked region; return whether they are correct.
 
-        `inside`: all states lie in the region. `due`: compare at all states.
+        `inside`: whether all states are within the region. `due`: whether to check at all sampled states.
         """
         run, region, parameters = self.run, self.region, self.run.varied_parameters
         if describe_changed_force(run) is not None:
@@ -321,7 +321,7 @@ class CachedIntegrator:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
             states = sample.states()
-            if not everywhere:  # with the extreme states, the region contains all states of an equal run
+            if not everywhere:  # if the extreme states are added to it, the region contains all states of an equal run
                 states = np.concatenate([extreme_states(t, rows[:, :n]), states])
             if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
                 return False
@@ -334,7 +334,7 @@ class CachedIntegrator:
 def fields_of(
     record: Record, options: Options, system: ConstrainedSystem, compiled: bool, t_end: float
 ) -> dict[str, Any]:
-    """Return the fields of the result of a run that the loop integrated to its end."""
+    """Return the fields of the result of a run, from the record of `IntegrationLoop`; `compiled`: see `Result`."""
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
     fields["t_end"] = t_end
     if (own := options.own_tolerance) is not None:  # Newmark has a tolerance of its own for positions
@@ -352,9 +352,9 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Compute the deferred field `name` of a result; return a dict of this and related fields.
+    """Return a dict with the deferred field `name` of a result, and with other fields that are computed with it.
 
-    `data`: copy of the run's report, steps and states. `timed_states`: the output; None for output at all steps.
+    `data`: copy of the run's report, times, steps and states. `timed_states`: output times and states; None: all steps.
     """
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
@@ -372,22 +372,22 @@ def _deferred_field(
     return OTHER_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-# ratio of the smallest pivot at a start to that at the first start, below which the start is checked anew
+# ratio of the smallest pivot at a start to that at the first start, below which `set_up` checks the start
 RECHECK_PIVOT = 0.1
 
 
 def first_chunk(run: Run) -> int:
-    """Return the number of attempted steps of the first chunk, which is also its largest number of rows."""
+    """Return the largest number of attempted steps in the first chunk, which is its largest number of states, too."""
     return max(LANES, run.chunk * (FIRST_CHUNKS if run.plan.stable_to is None else 1))
 
 
 def arrays_of(
     run: Run, evaluation: StartEvaluation, code: GeneratedCode | None, definite: bool, options: Options, n_attempts: int
 ) -> SimpleNamespace:
-    """Create the arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for `n_attempts` steps.
+    """Return new arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for `n_attempts` attempts.
 
-    `run` must be at its start; its clock, control and tolerances are replaced by views of one array. `evaluation` is
-    for the system of the call. The other arguments are those of `CachedIntegrator`.
+    `run` must be at its start; its clock, control and tolerances are replaced by views of one array.
+    `evaluation.system` has the parameters of the call. The other arguments are those of `CachedIntegrator`.
     """
     from twoloop.kernels.evaluation import checks as start_checks
     from twoloop.kernels.linalg import rank as pivots
@@ -404,7 +404,7 @@ def arrays_of(
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = DependentColumns(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.find else (none, none, 0, np.zeros(0), none, none)
-    places = np.flatnonzero(memory.view(np.int64))  # compared as bits, because -0.0 must be restored, too
+    places = np.flatnonzero(memory.view(np.int64))  # indices of nonzero bits, because -0.0 must be restored, too
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     start_constants: tuple[float, ...]
     start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
@@ -439,7 +439,7 @@ def arrays_of(
 
 
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
-    """Return a choice of pivots as the array that kernels read, and the scale of the added rows."""
+    """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
     index = int(np.searchsorted(-LEAST, -choice.least))
@@ -447,25 +447,25 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     return np.array(numbers, dtype=np.int64), choice.scale
 
 
-# limits of the cache: sets of options of a system; floats in the workspace of a run; entries with equal options, which
-# differ in the start, as another start may need other code
+# limits of a system's cache. MAX_OPTIONS: number of sets of options. MAX_WORKSPACE: number of floats in the workspace
+# of a run. MAX_ENTRIES: number of entries with equal options; their starts differ, and may need different code
 MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
 class CacheEntry(NamedTuple):
-    """Run at its start and idle integrators, for calls with the same options from this or other starts."""
+    """Run at its start, and idle integrators, for calls with the same options from this or other starts."""
 
     run: Run
-    start: tuple[float, bytes, bytes]
-    t1: float
+    start: tuple[float, bytes, bytes]  # t0, and the bytes of q0 and v0
+    t1: float  # end of the run, s
     code: GeneratedCode | None
     definite: bool  # whether M was definite at the start
     for_other_starts: bool  # whether copies of the run can begin at other starts
-    idle: list[CachedIntegrator] | None  # None: the compiled loop cannot start this run
-    shared: SharedSetup | None = None  # setup shared with systems of other parameters
+    idle: list[CachedIntegrator] | None  # integrators not in use; None: compiled code cannot start this run
+    shared: SharedSetup | None = None  # setup shared with systems that have other parameters
 
 
-# the last start; the entries by options; the id of the last run's code, if that run was created anew
+# cached data of a system: the last start; the entries by options; the id of the code of the last run, if it was new
 NO_RUNS: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 
@@ -479,10 +479,10 @@ def cached_result(
     output: Output,
     interrupts: Interrupts,
 ) -> tuple[dict[str, Any], str] | MissedChanges | Run | None:
-    """Integrate with a cached integrator for a system and options; the first call creates it.
+    """Integrate with a cached integrator for a system and options; create it at the first call.
 
-    Return the fields of the result and a warning of redundant rows; or a request to repeat the run; or, if the run
-    cannot be cached, a `Run` at its start; or, if the start must be checked more closely by `set_up`, None.
+    Return the fields of the result and a warning about redundant rows (or ""); or a request to repeat the run; or, if
+    the run cannot be cached, a `Run` at its start; or None, if `set_up` must check the start.
     """
     entries = system.derived.get("runs", NO_RUNS)[1].get(options.key, ())
     if not entries and (shared := system.shared.get("runs")):
@@ -517,9 +517,9 @@ def cached_result(
 def set_up(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, CacheEntry | None]:
-    """Create a run at its start, or copy a cached run; return it, and the cache entry if one was added for it.
+    """Return a run at its start (new, or a copy of a cached run), and the cache entry if one was added for it, or None.
 
-    Runs are cached if the method is twoloop's own, callbacks are compiled, and traces are trusted.
+    Runs are cached if the method is one of twoloop's own, callbacks are compiled, and traces are trusted.
 
     Raises
     ------
@@ -574,7 +574,7 @@ def _trace_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
-    """Cache the setup of a run for systems with other parameters, once a second such system is integrated."""
+    """Cache a setup for systems that differ in their parameters, when the second of these systems is integrated."""
     key, functions, cached = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
     if key not in cached:
         system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {key: functions}
@@ -592,7 +592,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a copy of a cached run for another start; None if that start needs other code or another form."""
+    """Return a copy of a cached run at another start; None if this start needs other code or another form."""
     _check_start(system, t0, q0, v0, options.check_derivatives)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None
@@ -605,7 +605,7 @@ def _copy_for_start(
 def _new_run(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, GeneratedCode | None]:
-    """Create a run at its start: check the start, derive callbacks, generate code and choose a plan."""
+    """Check a start, derive callbacks, generate code, choose a plan; return a new run at the start, and the code."""
     fixed, original, new = options.step_size is not None, system, not system.checked
     if new:
         load_checked_bounds(system)
@@ -636,7 +636,7 @@ def _new_run(
 
 
 def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, derivatives: bool) -> None:
-    """Check a start, unless the last check was of the same start."""
+    """Check a start, unless it is the start that was checked last; raise if it is refused."""
 
     def check() -> None:
         check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))

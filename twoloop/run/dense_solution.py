@@ -30,15 +30,15 @@ Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
 
 MAX_DIVIDED = 512  # largest number of intervals whose interior states are cached
-MAX_ACCURATE = 65536  # largest number of intervals that are remembered to have accurate polynomials
-# largest accepted residual of a polynomial in the constraints and the equations of motion, relative to the tolerances.
-# ACROSS: in steps across singular positions, where the residual was measured to be a tenth of the error of velocities
+MAX_ACCURATE = 65536  # largest number of intervals in the cache of intervals with accurate polynomials
+# largest accepted residual of a polynomial in the constraints and the equations of motion, relative to the tolerances;
+# MAX_ERROR_ACROSS: in steps across singular positions, where the residual was a tenth of the error of velocities
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
-N_REPAIR = 4  # number of steps that divide an interval whose polynomial has a larger residual
+N_REPAIR = 4  # number of steps into which an interval is divided if its polynomial has a larger residual
 
 
 class Table(NamedTuple):
-    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), and the kinds of the n - 1 intervals."""
+    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), and kinds of the n - 1 intervals."""
 
     t: Array
     states: Array
@@ -46,7 +46,7 @@ class Table(NamedTuple):
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
-    """Return the rank of C_q and the rank of [C_q; A], from which `workspace` computes the sizes of arrays."""
+    """Return the rank of C_q and the rank of [C_q; A] at a state, for the argument `ranks` of `workspace`."""
     from twoloop.kernels import advance
 
     kit = kit_of(system, t, q)
@@ -58,7 +58,7 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 
 
 class Interpolator:
-    """Interpolator of the states of a run (see `Table`), with a workspace of its own.
+    """Interpolator between the states of a `Table`, with a workspace of its own.
 
     Parameters
     ----------
@@ -73,7 +73,8 @@ class Interpolator:
     ranks : (int, int)
         Rank of C_q, and rank of [C_q; A].
     plans : dict, optional
-        For each kind of interval the plan that divides it into `plan.parts` fixed steps; other kinds are not divided.
+        By kind of interval: the plan with which such an interval is divided into `plan.parts` equal steps. Intervals of
+        other kinds are not divided.
     """
 
     def __init__(
@@ -99,16 +100,17 @@ class Interpolator:
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
-        self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of them
-        self.filled: dict[float, tuple[Array, Array]] = {}  # interior states, by the times at which intervals begin
-        # polynomials (memory arrays of the steps) across singular positions, by the times at which intervals begin
+        self.failures, self.warns = 0, True  # number of times at which the last call failed; whether failures warn
+        # times and states that divide an interval, including its ends, by the time at which the interval begins
+        self.filled: dict[float, tuple[Array, Array]] = {}
+        # memory arrays of steps across singular positions, with their polynomials, by the first times of the intervals
         self.across: dict[float, Array] = {}
-        self.accurate: set[float] = set()  # beginnings of intervals that neighbouring states interpolate well
+        self.accurate: set[float] = set()  # first times of intervals whose polynomials need no interior states
         self.judges = True  # whether interior states may be computed; false if they were read from a file
         self._allocate()
 
     def _prepare(self) -> None:
-        """Set up the workspace and the kits, for the current form of linear algebra."""
+        """Create the workspace and the kits for the current form of linear algebra, `self.static`."""
         system, t0, row = self.arguments[:3]
         q0, static = row[: system.n_q], self.static
         for plan in self.plans.values():
@@ -139,7 +141,7 @@ class Interpolator:
         self.nodes[:], self.scratch[:], self.rows[:] = 0.0, 0.0, 0.0
 
     def _become_dense(self) -> None:
-        """Replace the static form of linear algebra, which failed, by the dense form."""
+        """Replace the static form of linear algebra, after a failure, by the dense form."""
         self.static = None
         self._prepare()
 
@@ -151,7 +153,7 @@ class Interpolator:
 
     def __reduce__(self) -> tuple[Any, ...]:  # for copies and pickles
         *arguments, plans = self.arguments
-        # generated code has addresses that are valid in this process only: copies do without it
+        # generated code is called at addresses that are valid in this process only: copies do not use it
         plans = {kind: plan.changed(own=()) if plan.own else plan for kind, plan in plans.items()}
         state = {name: getattr(self, name) for name in ("parts", "filled", "across", "judges")}
         return type(self), (*arguments, plans), state
@@ -161,7 +163,7 @@ class Interpolator:
         self._allocate()
 
     def states(self, table: Table, times: Array) -> Array:
-        """Interpolate rows [q, v] at sorted `times` within the table."""
+        """Return rows [q, v] at `times`, which must be sorted and within the table."""
         if len(times) == 0 or len(table.t) == 1:
             return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
         intervals = np.searchsorted(table.t[1:-1], times, side="right")
@@ -182,7 +184,7 @@ class Interpolator:
         return out
 
     def within(self, table: Table, t: float) -> Callable[[float], Array]:
-        """Return a function that interpolates [q, v] at single times in the interval that contains t."""
+        """Return a function of one time that returns [q, v], for times in the interval of the table that contains t."""
         groups = _groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, indices.END_TIME] = 1
         self._divide_where_needed(table, groups)
@@ -203,7 +205,7 @@ class Interpolator:
             _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
     def _interpolate(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
-        """Write rows [q, v] at the times of the groups to `out`; return the number of failures."""
+        """Store rows [q, v] at the times of the groups in `out`; return the number of times without a valid state."""
         states = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.scratch, out)
         failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *states, *rest))
@@ -213,7 +215,7 @@ class Interpolator:
         return failures
 
     def _divide_where_needed(self, table: Table, groups: Groups) -> None:
-        """Compute interior states of each interval that is new, unless its polynomials are accurate without them."""
+        """Cache interior states of each interval that is not cached yet, unless it is accurate without such states."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
         is_new = np.array([t not in self.accurate and t not in self.filled for t in begins])
         if not self.judges or not is_new.any():
@@ -234,7 +236,7 @@ class Interpolator:
         divided, own, rest = self._split_divided(table, groups)
         errors = np.zeros(len(groups))
         errors[is_divided], errors[~is_divided] = self._errors(divided, own), self._errors(table, rest)
-        # where a plan was to divide the interval, and failed, the step is too long for a polynomial through its ends
+        # if the plan for this kind of interval failed to divide it, the interval is too long for a polynomial
         errors[~is_divided & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
         is_accurate = errors <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
         self.accurate.update(table.t[groups[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
@@ -242,16 +244,16 @@ class Interpolator:
             self._repair(table, groups[k], float(errors[k]))
 
     def _errors(self, table: Table, groups: Groups) -> Array:
-        """Estimate the residuals of the polynomials of intervals, relative to the tolerances."""
+        """Return estimated residuals (one per group) of the polynomials of intervals, relative to the tolerances."""
         out, groups = np.zeros(len(groups)), np.ascontiguousarray(groups)
         arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.scratch, self.rows, out
         entry_point(self.kernels.estimate_errors)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
     def _repair(self, table: Table, group: Groups, smallest: float) -> None:
-        """Interpolate an interval through other states if that reduces its residual, at first `smallest`; cache them.
+        """Cache other states for the polynomial of an interval if they reduce its residual, which is `smallest` so far.
 
-        These are, in this order, states of one step across a singular position, of N_REPAIR steps, and the ends alone.
+        They are, in this order, those of a step across a singular position, of N_REPAIR steps, and the ends alone.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
@@ -274,7 +276,7 @@ class Interpolator:
             self.accurate.add(begin)
 
     def _cross_interval(self, table: Table, i: int) -> tuple[Array, Array] | None:
-        """Compute interior states by a step across a singular position, as long as the interval; None if it fails."""
+        """Return times and states in interval i, computed by a step across a singular position; None if it fails."""
         from twoloop.kernels.steps import crossing_step as kernels
 
         if self.static is not None:
@@ -291,17 +293,18 @@ class Interpolator:
         return self._states_of_crossing(table, i, plan.memory) if succeeded else None
 
     def _states_of_crossing(self, table: Table, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states in interval i, by the polynomial of a step across a singular position in `memory`."""
+        """Return times and states in interval i, by the polynomial in `memory` of a step across a singular position."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
         times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
         states = np.array([state_at(memory, options, t) for t in times])
-        states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]  # but not a, which may be a rounding error
+        # a of the stored states is not copied, because it may consist of rounding errors
+        states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]
         return times, states
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
-        """Return plan and kit of the steps that divide an interval of this kind whose polynomial is not accurate."""
+        """Return plan and kit of N_REPAIR steps that divide an interval of this kind with an inaccurate polynomial."""
         stiff = kind == indices.VELOCITIES
         if stiff not in self.repairs:
             from twoloop.methods.dop853 import DOP853
@@ -321,7 +324,7 @@ class Interpolator:
         return self.repairs[stiff]
 
     def _split_divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
-        """Return a table of cached interior states, the groups of intervals with such states, and the other groups."""
+        """Return a table of cached interior states, the groups of these intervals in it, and the other groups."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
         filled = np.array([t in self.filled for t in begins], dtype=bool)
         pairs = [self.filled[t] for t in begins if t in self.filled]
@@ -335,7 +338,7 @@ class Interpolator:
         return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
 
     def _divide(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
-        """Divide intervals by fixed steps, fewer if steps fail; return (times, states) by their first time."""
+        """Return (times, states) of equal steps in intervals, by first time; fewer steps if steps fail, or none."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
@@ -355,10 +358,10 @@ class Interpolator:
         return filled
 
     def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
-        """Yield interior states of divided intervals in blocks, to be stored in a file and restored by `keep`.
+        """Yield the interior states of all divided intervals, in blocks to be stored in a file; `keep` restores them.
 
-        A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q); the last ones are NaN if an interval has fewer
-        states.
+        A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q) of m intervals. If an interval has fewer states,
+        its last entries are NaN.
         """
         groups = _groups(table, np.arange(len(table.t) - 1))
         for block in _blocks(groups):
@@ -372,7 +375,7 @@ class Interpolator:
             yield t, states
 
     def keep(self, t: Array, states: Array) -> None:
-        """Restore interior states that `interiors` yielded; no other interior states are computed from now on."""
+        """Replace the cached interior states by those that `interiors` yielded; from now on none are computed."""
         self.parts, self.judges = t.shape[1] - 1, False
         self._allocate()
         sizes = np.isfinite(t).sum(axis=1).tolist()
@@ -381,7 +384,7 @@ class Interpolator:
         }
 
     def complete(self, times: Array, states: Array, out: Array) -> None:
-        """Compute [a, lam] for given rows [q, v] on the constraints, and write them to `out`."""
+        """Store [a, lam] at times and rows [q, v] on the constraints in `out`; NaN where the computation fails."""
         complete, times, states = entry_point(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
         failures = complete(self.kit, self.work, times, states, out)
         if failures > 0 and self.static is not None:
@@ -393,12 +396,12 @@ class Interpolator:
 
 
 def _blocks(groups: Groups) -> list[Groups]:
-    """Split groups into blocks whose interior states fit into the cache."""
+    """Return the groups in blocks of at most MAX_DIVIDED, whose interior states the cache can contain."""
     return [groups[begin : begin + MAX_DIVIDED] for begin in range(0, len(groups), MAX_DIVIDED)]
 
 
 def _groups(table: Table, intervals: Groups) -> Groups:
-    """Return a group (row of indices for kernels) for each of `intervals`, without indices of output times."""
+    """Return a group (row of indices for kernels) for each of `intervals`; indices of output times are 0."""
     groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
     groups[:, indices.KIND] = table.kinds[intervals]
@@ -423,12 +426,11 @@ def _warn(what: str, stacklevel: int = 4) -> None:
 
 
 class OutputInterpolation:
-    """Interpolation of states at output times, for runs that use the same arrays one after another.
+    """Interpolation of states at output times, for successive runs that use the arrays of one Run.
 
     Parameters
     ----------
     run : Run
-        The run whose arrays are used.
     """
 
     def __init__(self, run: Run):
@@ -436,10 +438,10 @@ class OutputInterpolation:
         self._interpolator: Interpolator | None = None
 
     def interpolate(self, times: Array, t: Array, rows: Array, kinds: NDArray[np.int64], pattern: Array) -> None:
-        """Interpolate [q, v] at `times`, and store these rows.
+        """Interpolate rows [q, v] at output `times`, and store them for `complete_rows`.
 
-        `t`, `rows`: times and rows [q, v, a, lam] of accepted steps. `kinds`: kinds of the intervals between them.
-        `pattern`: 1 at the entries of the constraint rows at the start.
+        `t`, `rows`: times and rows [q, v, a, lam] of accepted steps. `kinds`: kinds of the intervals between steps.
+        `pattern`: 1 at the entries of the constraint rows at the start, 0 elsewhere.
         """
         run = self.run
         table = Table(t, rows[:, : 3 * run.system.n_q].copy(), kinds)
@@ -452,7 +454,7 @@ class OutputInterpolation:
         self._interpolator, self._rows = interpolator, interpolator.states(table, times)
 
     def complete_rows(self, times: Array) -> Array | None:
-        """Return rows [q, v, a, lam] at the times of `interpolate`; None if one of them fails."""
+        """Return rows [q, v, a, lam] at the times given to `interpolate`; None if the computation fails at a time."""
         interpolator, rows = self._interpolator, self._rows
         if interpolator is None or interpolator.failures > 0:
             return None
@@ -464,7 +466,7 @@ class OutputInterpolation:
 
 
 def interpolator_of(run: Run, row: Array) -> Interpolator:
-    """Create the interpolator of a run; `row` is [q, v, a] at its start."""
+    """Return a new interpolator for the states of a run; `row` is [q, v, a] at its start."""
     ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[indices.ATOL :]
     interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
     return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)
@@ -493,7 +495,7 @@ class DenseState:
         self.q, self.v = self._unsorted(rows[:, :n]), self._unsorted(rows[:, n:])
 
     def _unsorted(self, rows: Array) -> Array:
-        """Return columns in the order of `t`, given rows in the order of time."""
+        """Return rows, in the order of time, as columns in the order of `t`; for a single time, as a vector."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]
@@ -529,7 +531,7 @@ class DenseSolution:
     The steps of `RungeKutta` of order 6 and more (by Newton's method of order 7 and more) and of `Taylor`, in `auto`
     too, are too long for this. Each is divided into 2 to 6 equal steps of the method when a time within it is first
     evaluated; this costs about as much as the run. If the last of its states changes a polynomial by more than the
-    tolerances, the polynomial is compared with the constraints and the equations at two places of the interval. Beside
+    tolerances, the polynomial is compared with the constraints and the equations at two times in the interval. Beside
     a singular position, or a force that jumps, a polynomial may violate them. Then the interval gets the interior
     states of a step across the position, or of four steps of `DOP853` (or a Radau method, where Newton's method was
     used), or none, whichever fits best. The evaluations for all this are not counted.

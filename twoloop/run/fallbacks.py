@@ -1,8 +1,8 @@
 """Continue a run where its own steps cannot: with another method, across a singular position, or over a jump.
 
-A run that met a short change of forces is repeated with more evaluations, at most MAX_REPETITIONS times: the changes of
-noise have no shortest duration, so that every repetition would meet shorter ones. After the last repetition a warning
-is given.
+A run in which forces changed for a short time is repeated with more evaluations, at most MAX_REPETITIONS times: changes
+caused by noise have no shortest duration, so that every repetition would find shorter ones. After the last repetition a
+warning is issued.
 """
 
 import numpy as np
@@ -19,29 +19,29 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import Place, least_singular_value
 from twoloop.run.workspace import kit_for_plan, kit_of
 
-# durations of a change of forces or drives, relative to the longest time between two evaluations: a run that met a
-# shorter change than REPEAT_BELOW is repeated, as other changes may be shorter still; one that is not repeated warns
-# below WARN_BELOW, as such a change may fall between two evaluations
+# limits of the shortest duration of a change of forces or drives in a run, relative to the longest time between two
+# evaluations. Below REPEAT_BELOW, the run is repeated, as it may have missed shorter changes. Below WARN_BELOW, a run
+# that is not repeated warns, as such a change may be between two evaluations
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
-EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations of a repeated run within the shortest change that the run met
-MAX_REFINEMENT = 8.0  # largest ratio of the times between evaluations before and after a repetition
+EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations in a repetition during the shortest change of the repeated run
+MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
 MAX_REPETITIONS = 2  # largest number of repetitions of a run
 
 
 def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
-    """Return whether forces or drives changed for so short a time that another such change may have been missed."""
+    """Return whether forces or drives changed for so short a time, relative to `limit`, that others may be missed."""
     a, clock = run.a, run.clock
     return bool(clock[a.SHORTEST_CHANGE] < limit * clock[a.WIDEST_SAMPLING])
 
 
 def closer_sampling(run: Run) -> float:
-    """Return the largest time between evaluations, s, for a repetition that meets changes this run may have missed."""
+    """Return the largest time between evaluations, s, for a repetition of a run that may have missed short changes."""
     a, clock = run.a, run.clock
     return float(max(clock[a.SHORTEST_CHANGE] / EVALUATIONS_PER_CHANGE, clock[a.WIDEST_SAMPLING] / MAX_REFINEMENT))
 
 
 def warn_of_missed_changes(run: Run) -> str:
-    """Warn if a run that is not repeated may have missed short changes; return the sentence, or an empty one."""
+    """Warn if a run that is not repeated may have missed short changes; return the warning as a sentence, else ""."""
     if not may_have_missed_changes(run, WARN_BELOW):
         return ""
     a, clock = run.a, run.clock
@@ -55,9 +55,9 @@ def warn_of_missed_changes(run: Run) -> str:
 
 Array = NDArray[np.float64]
 
-CORRECTIONS = 3  # number of Newton corrections of positions whose error is below the tolerances
-NEGLIGIBLE = 1e-12  # singular values below this share of the largest count as zero (redundant rows)
-MAX_RESIDUAL = 1e-8  # relative residual of the equations below which they count as solved
+CORRECTIONS = 3  # number of Newton corrections of positions; their error is below the tolerances at first
+NEGLIGIBLE = 1e-12  # singular value, relative to the largest, below which it counts as zero (because of redundant rows)
+MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to their right-hand side
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
@@ -76,14 +76,14 @@ def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
 
 
 def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """Project positions onto the constraints by Newton's method."""
+    """Return positions projected onto the constraints by CORRECTIONS steps of Newton's method."""
     for _ in range(CORRECTIONS if system.n_c > 0 else 0):
         q = q - np.linalg.lstsq(system.jacobian(t, q), system.constraint(t, q), rcond=NEGLIGIBLE)[0]
     return q
 
 
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
-    """Return the matrix [M G^T; G 0] with rows G scaled to the size of M, the lengths of the rows, and this size."""
+    """Return [M G^T; G 0] with each row of G scaled to norm max|M|, the norms of the rows before, and max|M|."""
     mass, rows = system.mass(t, q), system.rows(t, q)
     lengths, size = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
     lengths[lengths == 0.0] = 1.0
@@ -91,24 +91,26 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), lengths, size
 
 
-# step lengths to try across a singular position, relative to the longest of the last steps: several, as no node of the
-# step should fall on the position
-LENGTHS = tuple(0.85**k for k in range(28))
-# longer lengths to try, in the same unit, if too few nodes of a step are beyond the position
-LONGER = tuple(1.4**k for k in range(1, 7))
-# Distances from a singular position are measured by the smallest pivot of C_q, relative to its largest one so far.
+# sizes of steps to try across a singular position, relative to H_LONG, the longest of the last steps: several, because
+# no node of the step should be at the position
+SIZES = tuple(0.85**k for k in range(28))
+# larger sizes to try, relative to H_LONG, if too few nodes of a step are beyond the position
+LARGER_SIZES = tuple(1.4**k for k in range(1, 7))
+# The distance of a state from a singular position is its smallest pivot of C_q, relative to the largest value of this
+# pivot so far in the run.
 FAR = 0.2  # distance from which on a state may be the base of the polynomial
-# factors of the tolerances and of the longest time without an evaluation, in the last attempts
+# in the last attempts, factors of the tolerances and of the longest time without an evaluation
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
-# largest age of a base: LONGEST_PAST longest last steps, or FARTHEST times twice the time to the position, if longer
+# largest age of a base: LONGEST_PAST times H_LONG, or FARTHEST times twice the time to the position, if that is longer
 LONGEST_PAST, FARTHEST = 1.5, 4.0
-BEYOND = 0.5  # an earlier state nearer than this share of the base's distance is beyond another singular position
-MIN_DIVISOR = 1e-300  # avoids a division by zero
+# distance, relative to that of the base, below which an earlier state is beyond another singular position
+MIN_DISTANCE_RATIO = 0.5
+MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
 CLEAR = 0.3  # distance from which on the run continues with steps of its own method
 
 
 def may_cross(run: Run, code: int) -> bool:
-    """Return whether steps across a singular position come next, given the code that `advance` returned."""
+    """Return whether the next steps are to cross a singular position, given the code that `advance` returned."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
@@ -119,7 +121,7 @@ def may_cross(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Switch to the substitute plan, because the method of the run is unsuitable or its values are not finite."""
+    """Replace the plan of a run by its substitute, as its method is unsuitable or its values are not finite."""
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` is only read
@@ -133,13 +135,13 @@ def switch_method(run: Run) -> None:
 
 
 def load(run: Run) -> None:
-    """Load the compiled step that a run needs next."""
+    """Compile, or load from the disk, the step to which the run switches, and renew the kit."""
     loaded(run.plan.second)
     _renew_kit(run)
 
 
 def _renew_kit(run: Run) -> None:
-    """Create the kit that calls the steps of the run's plan."""
+    """Replace the kit of a run by one that calls the steps of the run's current plan."""
     if run.static is None:
         run.kit = kit_for_plan(run.system, run.functions.flags, run.plan)
     else:
@@ -148,9 +150,9 @@ def _renew_kit(run: Run) -> None:
 
 
 def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
-    """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and controls.
+    """Return plan and controls of steps across a singular position, and prepare the first one.
 
-    `past`: states of the last accepted steps, oldest first; may be empty.
+    See kernels/steps/crossing_step.py. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock
     from twoloop.kernels.steps.crossing_step import BACK, UNSEEN
@@ -160,7 +162,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     base, run.mirrored = None, 0.0
     if not fixed:
         base, run.mirrored = _find_base(run, [place for place in past if place[0] >= earliest])
-    # nodes at earlier times are wrong if a force jumped since, and too few near the start of the run: try other origins
+    # accelerations at earlier nodes may be wrong after a jump of a force, and too few near the start: other origins
     run.origins = [(earliest, base, False), (np.inf, None, False)]
     if float(clock[a.T] - clock[a.T_START]) < clock[a.H_LONG] and not run.system.called_in_python:
         run.origins.append((-np.inf, None, False))
@@ -179,7 +181,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
-    """Prepare the first attempt with the next origin of the polynomial."""
+    """Take the next of `run.origins` for the polynomial, and set the step sizes to try with it."""
     from twoloop.kernels.steps.crossing_step import begin
 
     a, clock = run.a, run.clock
@@ -194,19 +196,19 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.looser[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     longest, allowed = float(clock[a.H_LONG]), float(control[a.MAX_STEP])
-    first = max(longest, min(run.mirrored, LONGER[-1] * longest))
-    run.lengths = lengths_across(first, allowed)
-    run.longer = [longest * part for part in LONGER if first < longest * part <= allowed]
+    first = max(longest, min(run.mirrored, LARGER_SIZES[-1] * longest))
+    run.lengths = sizes_across(first, allowed)
+    run.longer = [longest * part for part in LARGER_SIZES if first < longest * part <= allowed]
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
     run.crossed = float(clock[a.H_NEXT])
 
 
 def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
-    """Return the base of the polynomial: the latest state in `past` that is far from the singular position.
+    """Return the base of the polynomial, and the mirrored step size, s.
 
-    If none is far, the base is the farthest one, or None if the present state is farther. (At a distance s, measured by
-    the smallest singular value, rounding changes velocities by eps/s^2.) Also return a step length, s, with which the
-    step ends as far beyond the position as the base is before it, if the distance changes linearly; 0 if it grows.
+    The base is the latest state in `past` that is far from the singular position; else the farthest one, or None if the
+    current state is farther. (At a distance s, rounding changes velocities by eps/s^2.) A step of the mirrored size
+    ends as far beyond the position as the base is before it, if the distance changes linearly; 0: the distance grows.
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
     singular_value = least_singular_value(run.system, t, run.state[:n], run.rank)
@@ -216,7 +218,7 @@ def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     length, oldest = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
     for time, state in reversed(past):
         distance = scale * least_singular_value(run.system, time, state[:n], run.rank)
-        if (farthest >= FAR and length > 0.0) or distance < BEYOND * farthest or t - time > oldest:
+        if (farthest >= FAR and length > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > oldest:
             break
         if distance > farthest:
             length = 2.0 * present * (t - time) / (distance - present)
@@ -226,14 +228,14 @@ def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     return base, length
 
 
-def lengths_across(longest: float, allowed: float) -> list[float]:
-    """Return the step lengths to try across a singular position, s: `longest` and shares of it, at most `allowed`."""
+def sizes_across(longest: float, allowed: float) -> list[float]:
+    """Return the sizes of steps to try across a singular position, s: `longest` times SIZES, at most `allowed`."""
     first = min(longest, allowed)
-    return [first, *(longest * part for part in LENGTHS if longest * part < first)]
+    return [first, *(longest * part for part in SIZES if longest * part < first)]
 
 
 def crossing_kit(kit: Kit) -> Kit:
-    """Return the kit of steps across a singular position, which is cached in the kit of the run's own steps."""
+    """Return the kit of steps across a singular position; it is cached as an attribute of the run's own kit."""
     from twoloop.kernels.steps.crossing_step import CROSSING
 
     attributes = vars(kit)
@@ -243,15 +245,15 @@ def crossing_kit(kit: Kit) -> Kit:
 
 
 def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: int) -> tuple[Plan, Array, int]:
-    """Return plan, controls and code for what follows an attempt to step across a singular position.
+    """Return plan, controls and code with which the loop continues after an attempt to cross a singular position.
 
-    What follows is the next piece of the polynomial, an attempt with another length, or the run's own method.
+    The next step is the next piece of the polynomial, an attempt with another size, or a step of the run's own method.
     """
     from twoloop.kernels.steps import crossing_step as kernels
 
     a, clock = run.a, run.clock
-    end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # end of the polynomial, if one was found
-    # the end of a piece may have a rounding error
+    end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # time at which the polynomial ends; -inf: none
+    # a later end of a piece is ahead, as the end may have a rounding error
     now = float(clock[a.T] + kernels.ROUNDING * run.crossed + 4.0 * np.spacing(abs(clock[a.T])))
     if code in (a.PAUSED, a.RANK_LOST) and end > now:
         if not run.pieces:
@@ -296,7 +298,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
 
 
 def apply_jump(run: Run, t1: float) -> bool:
-    """Apply a jump of C_t or b to the velocities, and restart the method; return whether that is possible."""
+    """Store the state after a jump of C_t or b in `run.new_state`, and restart the method; return whether it exists."""
     a, clock, n = run.a, run.clock, run.system.n_q
     end = float(clock[a.JUMP_TO])
     state = state_after_jump(run.system, end, run.state[:n], run.state[n : 2 * n])

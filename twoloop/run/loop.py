@@ -6,7 +6,7 @@ raises `KeyboardInterrupt` only within functions of the user, which may take lon
 Elsewhere it is stored until the loop checks for it.
 """
 
-# `signal` tries to convert each handler to an enum member, which takes 8 microseconds: `_signal` does not
+# module `signal` tries to convert each handler to an enum member, which takes 8 microseconds; `_signal` does not
 import _signal  # type: ignore[import-not-found]
 import signal
 import threading
@@ -74,13 +74,13 @@ from twoloop.run.singular_positions import Place, velocities_turned_last
 
 Array = NDArray[np.float64]
 
-PATIENCE = 3  # number of signals after which the next one raises at once, even if the result is lost
+MAX_STORED_SIGNALS = 3  # number of signals of Ctrl-C that are stored; the next one raises, although the result is lost
 
 
 class Interrupts:
     """Handler of Ctrl-C that replaces Python's own between `listen` and `leave`, but never a handler of the user.
 
-    Before `listen`, Ctrl-C raises as usual: installing a handler takes time, and nothing is lost at that stage.
+    Before `listen`, Ctrl-C raises KeyboardInterrupt as usual, because there is no result yet that would be lost.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Interrupts:
     handlers: SignalHandlers | None = None
 
     def listen(self) -> "Interrupts":
-        """Store signals from here on, except those within functions of the user."""
+        """Install the handlers, which store signals, or raise within functions of the user; return self."""
         if self.handlers is None:
             self.handlers = SignalHandlers()
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -102,12 +102,12 @@ class Interrupts:
         return self
 
     def returns_result(self) -> bool:
-        """Return whether a run that Ctrl-C ended returns its result; else a handler raised KeyboardInterrupt."""
-        self.listen()  # a handler of the user stays, and raises; so does `_on_signal` after PATIENCE signals
-        return self._installed and self.n_signals <= PATIENCE
+        """Return whether a run that Ctrl-C ended returns a result; else a handler has raised KeyboardInterrupt."""
+        self.listen()  # a handler of the user is not replaced, and raises; so does `_on_signal` after many signals
+        return self._installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def leave(self) -> None:
-        """Restore all handlers; raise the exception of a user's handler again, if there was one."""
+        """Restore all handlers; if a user's handler raised an exception, raise it again."""
         if self._installed:
             _signal.signal(signal.SIGINT, signal.default_int_handler)
         if self.handlers is not None:
@@ -115,12 +115,12 @@ class Interrupts:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.n_signals += 1
-        if self.n_signals > PATIENCE or within_a_users_function(frame):
+        if self.n_signals > MAX_STORED_SIGNALS or within_a_users_function(frame):
             raise KeyboardInterrupt
 
 
 def describe_interrupt(t: float, table: Array) -> str:
-    """Describe a run that Ctrl-C ended at t; `table` has its rows [q, v, a, lam]."""
+    """Return the message of a run that Ctrl-C ended at t; `table`: its rows [q, v, a, lam]."""
     n_missing = int(np.isnan(table[:, -1:]).sum())  # [a, lam] of a row is either complete or NaN
     unknown = f" Accelerations and multipliers are NaN at {n_missing} of its times." if n_missing else ""
     return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
@@ -153,13 +153,16 @@ def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] |
 BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
 BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
 CHUNK_TO_EVENT = 16  # number of attempts in a chunk if an event may end the run: steps beyond the event are wasted
-CHUNK_TIME = 0.05  # CPU time, s; chunks that take longer do not grow, so that the loop notices Ctrl-C
+CHUNK_TIME = 0.05  # CPU time of a chunk, s, from which on the next chunk is not larger, so that Ctrl-C is noticed soon
 # statuses whose message may say that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-MOST_PAST = 16  # largest number of accepted states that are candidates for the base of a step across a singularity
+MAX_BASE_CANDIDATES = 16  # largest number of last states that may be the base of a step across a singular position
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
-MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs; of floats in each
-_spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for the next run, by their sizes
+MOST_SPARE, LARGEST_SPARE = (
+    16,
+    250_000,
+)  # largest number of buffers kept for later runs; largest number of floats in each
+_spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for later runs, by their sizes
 
 
 class IntegrationLoop:
@@ -168,7 +171,7 @@ class IntegrationLoop:
     Parameters
     ----------
     run : Run
-        A run at its start, or after a first chunk of steps, which is then given to `resume`.
+        A run at its start, or after a first chunk of steps, which `resume` then records.
     t1 : float
         End of the run, s.
     request : OutputRequest
@@ -178,11 +181,11 @@ class IntegrationLoop:
         Limit of elapsed time, s.
     interrupts : Interrupts
     last : bool
-        Whether this is the last attempt: it is not repeated, but warns, if it may have missed short changes.
+        Whether the run warns if it may have missed short changes; else the caller repeats it.
     start : ndarray, optional
-        The row [q, v, a, lam] at the start, if the run has made steps already.
+        The row [q, v, a, lam] at the start. None: the state of the run, which must be at its start.
     system : ConstrainedSystem, optional
-        System of the result, if the run's system is a copy whose arrays will be used for other parameters.
+        System of the result. None: the run's system. To be given if that is a copy whose arrays will be overwritten.
     """
 
     def __init__(
@@ -210,16 +213,16 @@ class IntegrationLoop:
         to_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if to_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # number of attempts from one check of progress to the next, and in total at the next check; see CHUNK_TIME
+        # number of attempts from one check of progress to the next, and total number of attempts at the next check
         self.check_interval = self.next_check = run.chunk
-        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced in steps across a singularity
+        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # others in steps across a singular position
         self.counts = INITIAL_COUNTS.copy()
         self.latest: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
-        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then the steps not stored yet
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, and rows of steps not stored yet
         if self.request.store.finished:
             self._store_step_fields()
         self.filled = np.zeros(2, dtype=np.int64)
-        may_end_before_t1 = to_event or time_limit is not None  # such runs may have any late time as t1
+        may_end_before_t1 = to_event or time_limit is not None  # users of such runs may choose t1 arbitrarily late
         self.stall = StallDetector(run.t0, np.inf if may_end_before_t1 else OUT_OF_REACH)
         self.stiffness = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
@@ -228,13 +231,13 @@ class IntegrationLoop:
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
 
     def resume(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
-        """Record a copy of the first chunk (times, rows and steps of `advance`), and handle the code of `advance`."""
+        """Record copies of the first chunk (times, rows and steps by `advance`), and act on the code of `advance`."""
         self.code, self.cpu = code, cpu_time
         self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._interval_kinds(steps, False, False))
         self._handle_code(steps, False, cpu_time)
 
     def to_end(self, check_derivatives: bool) -> Record:
-        """Integrate to the end, check callbacks at states of the run, and return its record."""
+        """Integrate to the end, check callbacks at states of the run, and return the record of the run."""
         run, recorder = self.run, self.recorder
         a, clock = run.a, run.clock
         buffers, copied = self._buffers(), True
@@ -244,7 +247,7 @@ class IntegrationLoop:
             self._advance(buffers)
             n_rows, n_steps = self.filled.tolist()
             t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
-            copied = 2 * n_rows < len(buffers[0])  # a copy of a half-empty buffer saves memory
+            copied = 2 * n_rows < len(buffers[0])  # a copy of a buffer that is less than half full saves memory
             if copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             if across and n_steps and self.request.between_steps:
@@ -270,7 +273,7 @@ class IntegrationLoop:
         return self._record(check_derivatives)
 
     def _handle_code(self, steps: Array, across: bool, spent: float) -> None:
-        """Handle the code that `advance` returned, and set it to PAUSED if the loop is to continue."""
+        """Act on the code of `advance`; set it to PAUSED if the loop is to continue. `spent`: CPU time of the chunk."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness.samples:
                 self.stiffness.add_steps(steps[:, self.run.a.H])
@@ -281,7 +284,7 @@ class IntegrationLoop:
         self.report(self.run.clock[self.run.a.T])
 
     def _advance(self, buffers: Buffers) -> None:
-        """Advance by one chunk of steps in compiled code."""
+        """Take one chunk of steps by the compiled `advance`, which fills `buffers`, and store the code."""
         run, a = self.run, self.run.a
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.attempts()))
         self.filled[:] = 0  # Ctrl-C may arrive before `advance` sets it
@@ -291,8 +294,8 @@ class IntegrationLoop:
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:
-            # raised by a callback; `to_end` raises it again unless an event ended the run before. But a sample of
-            # forces ahead may be at a state that the motion never reaches: in this case continue without samples
+            # Raised by a callback. A sample of forces ahead may be at a state that the motion never reaches: then
+            # continue without such samples. Otherwise `to_end` raises it again, unless an event has ended the run
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             else:
@@ -304,7 +307,7 @@ class IntegrationLoop:
 
     @contextmanager
     def _stopped_in_time(self) -> Iterator[None]:
-        """Stop machine code, which reads no clock, by a timer at the deadline; only where one attempt may take long."""
+        """Return a context in which a timer stops machine code at the deadline, if a single attempt may take long."""
         run, notes = self.run, self.run.work.notes
         if self.deadline == np.inf or (run.system.n_q <= SMALL and not run.system.called_in_python):
             yield
@@ -320,7 +323,7 @@ class IntegrationLoop:
             notes[indices.TIME_IS_UP] = 0.0
 
     def _store_chunk(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
-        """Store the states and the steps of a chunk."""
+        """Record the states (times, rows), steps and kinds of intervals of a chunk."""
         run = self.run
         self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
@@ -331,13 +334,13 @@ class IntegrationLoop:
             self.latest = [*self.latest[-1:], (t, rows)]
 
     def _store_step_fields(self) -> None:
-        """Store the fields that have one row per step."""
+        """Add the fields with one row per step to the store, for steps that are not stored yet."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
         for name, values in step_fields(steps, self.counts).items():
             self.request.store.add(name, values)
 
     def _check_progress(self, steps: Array, across: bool, spent: float) -> None:
-        """Check whether the run makes progress, and choose the length of the next chunk."""
+        """Choose the number of attempts of the next chunk; change the code if the run stalls, or has to stop."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
         self.stiffness.add_steps(h)
@@ -358,7 +361,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, across: bool, n_steps: int) -> None:
-        """Change the method of the next steps if the code asks for it."""
+        """Change plan, controls or kit of the next steps if the code requires it, and then set the code to PAUSED."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.is_lost_without_dense(self.code):
             run.change_form()
@@ -388,16 +391,16 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _last_states(self) -> list[Place]:
-        """Return the states of the last accepted steps, oldest first; an empty list if not all are stored."""
+        """Return the last MAX_BASE_CANDIDATES states (time, row), oldest first; [] if not all states are recorded."""
         if not self.request.every_step:
             return []
         places = [(self.run.t0, self.start)] if len(self.latest) < 2 else []
         for t, rows in self.latest:
-            places += zip(t[-MOST_PAST:].tolist(), rows[-MOST_PAST:], strict=True)
-        return places[-MOST_PAST:]
+            places += zip(t[-MAX_BASE_CANDIDATES:].tolist(), rows[-MAX_BASE_CANDIDATES:], strict=True)
+        return places[-MAX_BASE_CANDIDATES:]
 
     def _correct_last_state(self) -> None:
-        """Replace the last stored state by that of the polynomial across a singular position: it is more accurate."""
+        """Replace [q, v, a] of the last recorded state by those of the run: those of the more accurate polynomial."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)
@@ -405,7 +408,7 @@ class IntegrationLoop:
             self.latest[-1][1][-1, : len(row)] = row
 
     def _is_stalled(self, across: bool) -> bool:
-        """Return whether a method with a substitute makes no step, although no singular position is near."""
+        """Return whether a method with a substitute cannot take a step, although no singular position is near."""
         run, a = self.run, self.run.a
         stalls = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return stalls and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
@@ -459,7 +462,7 @@ class IntegrationLoop:
         return record_of(Record, DEFAULTS | fields)
 
     def _suspicious_last_step(self, t: Array, table: Array) -> list[Place]:
-        """Return the state before the last step if velocities turned in it, as near a singular position; else []."""
+        """Return [state before the last step] if velocities turned in that step, as at a singular position; else []."""
         run = self.run
         if self.request.times is not None or self.recorder.ended is not None:
             return []
@@ -468,7 +471,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if velocities_turned_last(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[Place]:
-        """Return the states at which steps had to end, if one of them is near a singular position; else []."""
+        """Return the states at which steps had to end if one of these is near a singular position; else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (equal_steps or (request.times is not None and request.lands)):
@@ -476,7 +479,7 @@ class IntegrationLoop:
         return list(zip(t.tolist(), table, strict=True))
 
     def _buffers(self) -> Buffers:
-        """Return buffers for the states and steps of a chunk; each attempt fills at most one row."""
+        """Return buffers for the times, states and steps of a chunk; each attempt fills at most one row of each."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare = _spare.pop((n_rows, n_rows * width, n_steps), None)
@@ -485,7 +488,7 @@ class IntegrationLoop:
         return np.empty(n_rows), np.empty((n_rows, width)), np.empty((n_steps, self.run.a.N_STEP_COLUMNS))
 
     def _recorder(self) -> Recorder:
-        """Create the recorder, with an interpolator if states between steps are requested."""
+        """Return a new recorder, with an interpolator if states between steps are requested."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
         spacing = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
@@ -493,7 +496,7 @@ class IntegrationLoop:
         return Recorder(self.request, interpolator, n, run.t0, self.start, every)
 
     def _interval_kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:
-        """Return the kind of interval of each accepted step, for the dense solution."""
+        """Return the kind of interval, for the dense solution, of each accepted step."""
         run = self.run
         if not self.request.between_steps:
             return NO_KINDS
@@ -505,10 +508,10 @@ class IntegrationLoop:
 
 
 def ignore_progress(t: float) -> None:
-    """Ignore the time reached: `report` of a loop without a progress bar."""
+    """Do nothing: the `report` of a loop without a progress bar."""
 
 
 def _error_note(name: str, t: float, error: Exception) -> str:
-    """Return the note that is added to an exception of a compiled callback: the system and the time."""
+    """Return the note to be added to an exception of a compiled callback: name of the system, and time."""
     beyond = ": it reads beyond the end of an array, such as a table" * isinstance(error, IndexError)
     return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{beyond}"

@@ -1,8 +1,9 @@
 """Monitor a run, and describe its end: status, message and advice.
 
-`StallDetector` detects a run that makes no progress. `StiffnessMonitor` decides whether stability, not accuracy,
-limited the steps. After the run it estimates the largest rate of vibrations and of decay at a few states, by power
-iteration with dF/dq and dF/dv (F: accelerations). Rate times step is compared with the stability limit of the method.
+`StallDetector` detects a run that makes no progress. `StiffnessMonitor` samples states; after the run,
+`describe_stiffness` decides whether stability, not accuracy, limited the steps. It estimates the fastest vibration and
+decay at the sampled states, by power iteration with dF/dq and dF/dv (F: accelerations), and compares their rates times
+the step size with the stability limits of the method.
 """
 
 import sys
@@ -36,22 +37,22 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of this module, besides those that advance() returns
-STAGNATION_STEPS = 20_000  # number of accepted steps over which the mean step is measured
-# A run stalls if its mean step is below the share STAGNATION_PACE of its longest step, and the rest of the run would
-# take more than STAGNATION_LEFT steps. It also stalls if the rest would take more than OUT_OF_REACH steps, hence days.
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of the loop in Python, besides those that advance() returns
+STAGNATION_STEPS = 20_000  # smallest number of accepted steps over which the mean step size is computed
+# A run stalls if its mean step size is below STAGNATION_PACE times the largest one, and the rest of the run would take
+# more than STAGNATION_LEFT steps. It also stalls if the rest would take more than OUT_OF_REACH steps, which take days.
 STAGNATION_PACE, STAGNATION_LEFT, OUT_OF_REACH = 1e-3, 1e7, 1e11
 
 
 class StallDetector:
-    """Monitor of the lengths of accepted steps, to detect a run that makes no progress.
+    """Monitor of the sizes of accepted steps, to detect a run that makes no progress.
 
     Parameters
     ----------
     t0 : float
         Start of the run, s.
     most : float
-        Largest number of steps that the rest of the run may take, at the mean length of the last ones.
+        Largest number of steps that the rest of the run may take, with the mean size of the last steps.
     """
 
     def __init__(self, t0: float, most: float = OUT_OF_REACH):
@@ -60,12 +61,12 @@ class StallDetector:
         self.longest = self.mean = 0.0
 
     def add_steps(self, h: Array) -> None:
-        """Add the lengths of accepted steps."""
+        """Add the sizes of accepted steps, s."""
         self.longest = max(self.longest, float(h.max(initial=0.0)))
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether the run stalls at time t: compare the mean of the last STAGNATION_STEPS steps or more."""
+        """Return whether a run from t to t1 would take too many steps; evaluated once in STAGNATION_STEPS steps."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean = (t - self.window_t) / self.window_n
@@ -79,26 +80,29 @@ class StallDetector:
 
 
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
-LAST_STEPS = 8  # the step at a state is the median of this number of steps before it
-ITERATIONS = 6  # number of power iterations at each state
-# a vector with all coordinates, times this share, is added to the directions before each estimate (see below)
-INITIAL_SHARE = 0.1
-ALIGNED = 0.9  # an image counts as opposed to its direction if the cosine between them is below -ALIGNED
-MIN_STEPS = 200  # number of accepted steps below which stiffness is not mentioned
-# share of the stability limit that half of the sampled states must reach; smooth motion stays below 0.4
-STABILITY_SHARE = 0.45
+LAST_STEPS = 8  # number of steps before a sampled state whose median is the step size at this state
+ITERATIONS = 6  # number of power iterations at each sampled state
+# factor of `initial_direction` when it is added to the directions of the previous sample: it restores coordinates that
+# became zero
+INITIAL_FACTOR = 0.1
+# the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -ALIGNED
+ALIGNED = 0.9
+MIN_STEPS = 200  # number of accepted steps below which a message does not mention stiffness
+# step size times rate, relative to the stability limit, from which on stability limits the steps (median of the sampled
+# states); in smooth motion it is below 0.4
+MIN_STABILITY_RATIO = 0.45
 
 
 class StiffnessSample(NamedTuple):
-    """State of a run with the step h there, and the stability limits of h times the rate of vibration and of decay."""
+    """Sampled state of a run, with step size and stability limits of the method."""
 
     t: float
     q: Array
     v: Array
     a: Array
-    h: float
-    vibration: float
-    decay: float
+    h: float  # step size before the state, s
+    vibration: float  # largest stable h times the angular frequency of a vibration
+    decay: float  # largest stable h times the rate of a decay
 
 
 class StiffnessMonitor:
@@ -106,17 +110,17 @@ class StiffnessMonitor:
 
     def __init__(self, plan: Plan):
         self.plan, self.every, self.n_seen, self.n_steps = plan, 1, 0, 0
-        self.last = np.zeros(0)  # lengths of the last LAST_STEPS steps
+        self.last = np.zeros(0)  # sizes of the last LAST_STEPS steps, s
         self.samples: list[StiffnessSample] = []
 
     def add_steps(self, steps: Array) -> None:
-        """Add the lengths of accepted steps."""
+        """Add the sizes of accepted steps, s."""
         self.n_steps += steps.size
         last = steps[-LAST_STEPS:]
         self.last = last if last.size == LAST_STEPS else np.concatenate([self.last, last])[-LAST_STEPS:]
 
     def sample_state(self, t: float, state: Array, n_q: int) -> None:
-        """Store the state after the last steps; in a long run only every second state, then every fourth, and so on."""
+        """Add a sample at the state after the last steps; in long runs only at every second, fourth, ... call."""
         if self.plan.stable_to is None or self.last.size < LAST_STEPS:
             return
         self.n_seen += 1
@@ -131,15 +135,15 @@ class StiffnessMonitor:
 
 
 def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
-    """Return a sentence if stability limited the steps, else an empty string. Overwrites the workspace."""
+    """Return a sentence if stability limited the steps, else ""; it overwrites the arrays in `work`."""
     if not monitor.samples or monitor.n_steps < MIN_STEPS:
         return ""
     start = initial_direction(work.Q.size)
     directions = [np.zeros_like(start), np.zeros_like(start)]
     samples = []
     for sample in monitor.samples:
-        for direction in directions:  # of the previous sample; INITIAL_SHARE restores coordinates that became zero
-            direction += INITIAL_SHARE * start
+        for direction in directions:  # eigenvectors at the previous sample
+            direction += INITIAL_FACTOR * start
         try:
             vibration, decay = _fastest_rates(kit, work, sample, directions)
         except Exception:  # raised by a callback at a displaced state, which the run did not visit
@@ -147,7 +151,7 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
         h = sample.h
         samples.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))
     by_vibration, by_decay, vibration, decay, h = np.median(samples, axis=0)
-    if max(by_vibration, by_decay) < STABILITY_SHARE:
+    if max(by_vibration, by_decay) < MIN_STABILITY_RATIO:
         return ""
     what = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"
     return (
@@ -157,7 +161,7 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
 
 
 def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]) -> tuple[float, float]:
-    """Return the angular frequency of the fastest vibration and the rate of the fastest decay, 1/s; 0 if unknown."""
+    """Return the angular frequency (rad/s) of the fastest vibration and the rate (1/s) of the fastest decay; else 0."""
     from twoloop.kernels.evaluation import tasks
 
     if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != indices.DONE:
@@ -171,9 +175,9 @@ def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: lis
 def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, independent: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Return |x| of the largest eigenvalue x of dF/dq or (`by_v`) dF/dv, and whether x < 0.
+    """Return the magnitude of the dominant eigenvalue of dF/dq or (`by_v`) dF/dv, and whether it is negative.
 
-    Power iteration in the coordinates `independent`, from `direction`, which becomes the eigenvector.
+    Power iteration in the coordinates `independent` begins with `direction`, which becomes the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 
@@ -196,19 +200,21 @@ def _dominant_eigenvalue(
     return eigenvalue, opposed
 
 
-NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message mentions it
-# error of velocities (or accelerations) within a run, relative to the tolerances, above which the rest is not trusted
+NEARLY_SINGULAR = 1e-3  # ratio of singular values of C_q (or inertias) up to which the message of a failure mentions it
+# rounding error of velocities (or accelerations) within a run, relative to the tolerances, above which the rest of the
+# run is not trusted
 MAX_LASTING_ERROR = 100.0
-LOST_AT_END = 1e-6  # ratio of singular values below which velocities at the end count as not determined
+LOST_AT_END = 1e-6  # ratio of singular values up to which constraints do not determine the velocities at the end
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
-CROSSINGS = "\0"  # placeholder in a message, replaced by the description of singular positions that were crossed
-# time after a start, s, at which the rank is compared with that at the start; singular value that counts as zero there
+CROSSINGS = "\0"  # placeholder in a message, to be replaced by the description of singular positions that were crossed
+# time after a start, s, at which the rank of the rows is compared with that at the start; singular value that counts as
+# zero at this time
 AFTER, NEGLIGIBLE_SLOPE = 1e-3, 1e-9
-# if a run stops closer to its end than this share of its length, or than a step, the message mentions it
-NEXT_TO_END = 1e-3
+# time left, relative to the duration of the run, up to which a message mentions that the end is near
+NEAR_END = 1e-3
 
 _REASONS = {
     indices.DONE: "the error estimate stayed above the tolerances",
@@ -221,16 +227,16 @@ _REASONS = {
 
 
 def _describe_jumps_and_crossings(run: "Run") -> str:
-    """Describe jumps and singular positions in a run that succeeded; return an empty string if there were none."""
+    """Return sentences about jumps, and CROSSINGS for singular positions, in a run that succeeded; "" if none."""
     text = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(run.jumps)
     return text + (CROSSINGS if run.crossings else "")
 
 
 def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later | None = None) -> dict[str, Any]:
-    """Return the field `message`, or the field `later` with a function that computes it when it is read.
+    """Return the field `message` as a dict, or the field `later` with a function that computes the message when read.
 
-    Measuring crossings takes longer than many runs. `system` must not change, although the arrays of the run may.
-    `later` computes other deferred fields.
+    The message is deferred if it describes crossings, because that takes longer than many runs. Until then `system`
+    must not change; the arrays of the run may. `later`: function that computes other deferred fields, by name.
     """
     if CROSSINGS not in words:
         return {"message": words}
@@ -248,9 +254,9 @@ def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later
 def reject_turned_velocities(
     run: "Run", last_step: list[Place], landed: list[Place], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Return status and message, or RANK_LOST if rounding or another branch of the motion changed velocities.
+    """Return `status` and `message`, or RANK_LOST and a reason if rounding or a change of branch changed velocities.
 
-    `last_step`: state before the last step, if velocities turned in it. `landed`: states at which steps had to end.
+    `last_step`: the state before the last step if velocities turned in it. `landed`: states at which steps had to end.
     """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(place for each in crossings for place in each), *landed], end)
@@ -263,7 +269,7 @@ def reject_turned_velocities(
 
 
 def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
-    """Describe the first state whose velocities rounding had changed too much; return "" if there is none."""
+    """Describe the first of the states `places`, before `end`, whose velocities rounding may have changed; else ""."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
@@ -285,7 +291,7 @@ def describe_arrival(t: float, fixed: bool) -> str:
 
 
 def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Status, str]:
-    """Return status and message of a run, from the code with which it ended."""
+    """Return the status and the message of a run, given the code of its end (of `advance`, or of this module)."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
         reached = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
@@ -348,7 +354,7 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
 
 
 def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
-    """Describe how short the steps are, how many more the run would take, and the likely reason."""
+    """Return sentences about how short the steps are, how many more would be needed, and the likely reason."""
     n_left = (t1 - float(run.clock[run.a.T])) / stall.mean
     before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
     if stall.has_slowed:
@@ -364,7 +370,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 
 def _describe_contradiction(run: "Run") -> str:
-    """Describe a redundant row that is violated although the other rows hold, and the rows on which it depended."""
+    """Describe a redundant row that is violated although the independent rows are satisfied, and its dependence."""
     t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[indices.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
     nearby_q = run.state[:n] + AFTER * run.state[n : 2 * n]
@@ -381,7 +387,7 @@ def _describe_contradiction(run: "Run") -> str:
 
 
 def warn_of_singular_end(run: "Run") -> str:
-    """Warn if the constraints have lost rank, or nearly so, at the end; return the sentence, or an empty string."""
+    """Warn if the constraints have lost rank, or nearly so, at the end; return the warning as a sentence, else ""."""
     if not run.passed_near_singular():
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
@@ -407,10 +413,7 @@ def warn_of_singular_end(run: "Run") -> str:
 
 
 def warn_of_passage_by_ordinary_steps(run: "Run") -> str:
-    """Warn if ordinary steps passed a singular position, after steps across it failed, and accuracy may have suffered.
-
-    Return the sentence of the warning, or an empty string.
-    """
+    """Warn if ordinary steps, after steps across failed, passed a singular position inaccurately; return a sentence."""
     ratio = float(run.clock[run.a.PIVOT_PASSED])
     if ratio == 0.0:
         return ""
@@ -426,7 +429,7 @@ def warn_of_passage_by_ordinary_steps(run: "Run") -> str:
 
 
 def warn_user(text: str) -> str:
-    """Warn with the line of the user's code that called twoloop; return the warning as a sentence of the message."""
+    """Issue a ConstraintWarning at the line of user code that called twoloop; return it as a sentence for a message."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("twoloop."):
         frame, level = frame.f_back, level + 1
@@ -435,7 +438,7 @@ def warn_user(text: str) -> str:
 
 
 def _velocity_error_ratio(run: "Run", t: float, q: Array, v: Array) -> float:
-    """Estimate the errors of velocities caused by rounding of positions, over the tolerances."""
+    """Return the largest error of a velocity caused by rounding of positions (an estimate), over its tolerance."""
     allowed = run.tolerances[indices.ATOL :] + run.rtol * np.abs(v).max()
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
@@ -450,15 +453,15 @@ def _ratio_text(run: "Run", t: float, q: Array) -> str:
 
 
 def _describe_near_end(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped so near its end that a step across needs nodes beyond it; else ""."""
+    """Return a sentence if the run stopped so near t1 that a step across would need nodes beyond t1, else ""."""
     time_left = t1 - float(run.clock[run.a.T])
-    if time_left > max(NEXT_TO_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
+    if time_left > max(NEAR_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""
     return f" The end of t_span is {time_left:.1g} s ahead: end a little before that position, or beyond."
 
 
 def _describe_near_singular(run: "Run", t1: float) -> str:
-    """Return a sentence if C_q is close to losing rank at the last state, else an empty string."""
+    """Return sentences if C_q is close to losing rank at the last state, else ""."""
     ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
     if ratio > NEARLY_SINGULAR:
         return ""
@@ -469,14 +472,14 @@ def _describe_near_singular(run: "Run", t1: float) -> str:
 
 
 def _describe_near_massless(run: "Run") -> str:
-    """Return a sentence if some motion has almost no inertia at the last state, else an empty string."""
+    """Return a sentence if some allowed motion has almost no inertia at the last state, else ""."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     ratio, words = least_inertia(run.system, t, q)
     return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
 
 
 def describe_not_finite(run: "Run") -> str:
-    """Describe which callback returned a value that is not finite, and at which time, if that is known."""
+    """Describe which callback returned a value that is not finite, and when; if that is unknown, where to look."""
     kind, at = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
         name = run.functions._fields[kind]

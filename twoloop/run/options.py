@@ -1,4 +1,4 @@
-"""Validate the options of a call; calls with equal options share one key, by which integrators are cached."""
+"""Validate the options of a call of `solve_dae`; integrators are cached by a key, which is equal for equal options."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -14,18 +14,18 @@ from twoloop.methods.presets import PRESETS, Compiled, check_compiled, identity,
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
 
-SMALLEST_TOLERANCE = 1e-15  # relative or absolute tolerance: if both are smaller, rounding hides the error of a step
+SMALLEST_TOLERANCE = 1e-15  # rtol and atol must not both be smaller: rounding would hide the error of a step
 
 
 @lru_cache(maxsize=1024)
 def _key(*_: Any) -> object:
-    """Return the same object for equal options: as a key of a dictionary it is faster than a tuple of them."""
+    """Return the same object for equal arguments: as a key of a dict it is faster than a tuple of the arguments."""
     return object()
 
 
 @dataclass(frozen=True)
 class Options:
-    """Validated options of a call; `solve_dae` explains the names."""
+    """Validated options of a call of `solve_dae`, whose docstring explains the names."""
 
     method: Method
     rtol: float
@@ -39,24 +39,24 @@ class Options:
 
     @cached_property
     def key(self) -> object:
-        """Key of the cache of integrators: equal for calls with equal options."""
+        """Key in caches of integrators: the same object for equal options."""
         sizes = self.first_step, self.max_step, self.max_steps, self.step_size
         tolerances = self.rtol, self.atol.tobytes()
         return _key(identity(self.method), *tolerances, *sizes, self.compiled, self.check_derivatives)
 
     @cached_property
     def own_tolerance(self) -> float | None:
-        """Tolerance of a method with an error test of its own (Newmark), else None."""
+        """Tolerance of a method with its own error test (Newmark), which replaces rtol and atol, else None."""
         return getattr(self.method, "error_tol", None)
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields of a result that follow from the options, with untested=None if all steps have an error test."""
+        """Fields `method` and `rtol` of a result, and `untested` = None if all steps have an error test."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_sizes(self, run: Run, t1: float) -> None:
-        """Set the first and the largest step, s, of a run that ends at t1, unless its steps are constant."""
+        """Set the first step size and its limits, s, in a run that ends at t1, unless its step size is constant."""
         run.work.notes[indices.KINK_AFTER] = t1  # no jump of C_t before t1 is known yet
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, t1)
@@ -80,7 +80,7 @@ def options_of(
     check_derivatives: Any,
     compiled: Any,
 ) -> Options:
-    """Validate the options of a call, unless they are the objects of the last call, which were validated then."""
+    """Return the validated options of a call; arguments that are the objects of the last call are not checked again."""
     last, options = system.shared.get("options", NO_OPTIONS)
     m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last
     # written out, because a loop or a tuple would take a tenth of the time of a short repeated call
@@ -111,7 +111,7 @@ def check_options(
     check_derivatives: Any,
     compiled: Any,
 ) -> Options:
-    """Validate and return the options of a call; raise if one is wrong."""
+    """Return the validated options of a call; raise TypeError or ValueError if one is wrong."""
     check_flag("dense_output", dense_output)
     if progress is not None:
         check_flag("progress", progress)
@@ -144,7 +144,7 @@ def check_options(
 
 
 def check_method(method: str | Method) -> Method:
-    """Return a method, given its name or the method object itself; raise for anything else."""
+    """Return the method object, given its name or the object itself; raise for any other argument."""
     names = ", ".join(PRESETS)
     if isinstance(method, str):
         if method not in PRESETS:

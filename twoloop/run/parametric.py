@@ -1,8 +1,8 @@
-"""Prepare one run for many systems that differ only in their parameters.
+"""Use one run for many systems that differ only in their parameters.
 
-Numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. For every vector of
-parameters, choices that depend on these numbers are checked again, and callbacks are compared with their traces at the
-start. Along the run callbacks are compared where states or parameters are outside the checked region.
+Numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. For new parameters,
+choices that depend on these numbers are checked again, and callbacks are compared with their traces near the start. At
+states of the run callbacks are compared if states or parameters are outside the checked region.
 """
 
 import copy
@@ -28,26 +28,26 @@ from twoloop.run.workspace import is_diagonal, kit_for_plan
 
 Array = NDArray[np.float64]
 
-NUMBERS = ("options", "numbers", "own_numbers")  # fields of a plan that may depend on parameters
-SUBPLANS = ("interior", "substitute", "within_newton")  # fields of a plan that are plans themselves
+NUMBERS = ("options", "numbers", "own_numbers")  # fields of a plan: arrays that may depend on parameters
+SUBPLANS = ("interior", "substitute", "within_newton")  # fields of a plan that contain other plans
 
 
 class SharedSetup:
-    """Setup shared by runs that differ only in the parameters.
+    """Setup shared by the runs of systems that differ only in their parameters.
 
     Parameters
     ----------
     run : Run
-        A run of one of the systems at its start; copies of it are integrated.
+        A run of one of the systems at its start; copies of this run are integrated.
     code : GeneratedCode or None
-        The machine code that its plan calls.
+        The generated code that its plan calls.
     method, fixed, compiled
-        Options with which the code was requested.
+        Options with which the code was requested; `fixed`: whether the step size is constant.
 
     Raises
     ------
     ValueError
-        If some number depends on the parameters, but was not traced as an expression in them.
+        If a number of the run depends on the parameters, but not as a traced expression in the parameters.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -72,12 +72,12 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region in which callbacks were compared, in runs with or without checks of derivatives."""
+        """Return the region in which runs of all systems, with or without checks of derivatives, compared callbacks."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
 class ParametricRun:
-    """Run whose arrays can be filled with the parameters of one system after another.
+    """Run whose arrays `use` fills with the parameters of one system after another.
 
     Parameters
     ----------
@@ -88,9 +88,9 @@ class ParametricRun:
     Attributes
     ----------
     given : ConstrainedSystem
-        The system whose parameters the arrays hold.
+        The system whose parameters the arrays contain.
     system : ConstrainedSystem
-        A copy of `given` with the arrays of this run, and with their cache.
+        A copy of `given` with the arrays of this run, and with a cache of its own.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
@@ -111,7 +111,7 @@ class ParametricRun:
         run.functions = run.kit.functions
 
     def use(self, system: ConstrainedSystem) -> bool:
-        """Fill the arrays with the parameters of a system; return whether the arrays held those of another system."""
+        """Fill the arrays with the parameters of a system; return False if they contained these parameters already."""
         if system is self.given:
             return False
         self._fill_arrays(system)
@@ -130,7 +130,7 @@ class ParametricRun:
             traced.trusted = False
 
     def agrees(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Return whether callbacks agree near the start, and M (`mass`) has the structure of M in the first run."""
+        """Return whether callbacks agree near the start, and M (`mass`) is definite or diagonal as in the first run."""
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
@@ -145,7 +145,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _numbered(self, plan: Plan) -> Plan:
-        """Return a copy of the plan in which arrays of numbers, see `_fill_arrays`, replace arrays of expressions."""
+        """Return a copy of the plan with the arrays of numbers that `_fill_arrays` fills instead of expressions."""
         array, plan_fields = self._formulas.array, vars(plan)
         changes: dict[str, Any] = {name: array(plan_fields[name]) for name in NUMBERS if plan_fields[name] is not None}
         changes |= {name: self._numbered(plan_fields[name]) for name in SUBPLANS if plan_fields[name] is not None}
@@ -153,7 +153,7 @@ class ParametricRun:
 
 
 def _plan_values(run: Run) -> list[Any]:
-    """List all values of the plans of a run, with arrays as bytes, to compare plans exactly."""
+    """Return a list of all values in the plans of a run, with arrays as bytes, to compare plans exactly."""
     plans = [run.plan, *run.interiors.values()]
     return [run.kit.flags.tobytes(), *(each for plan in plans for each in _values_of_plan(plan))]
 

@@ -1,7 +1,7 @@
-"""Project a guess onto the constraints (`consistent_state`); report how far it moved and on which assembly it is.
+"""Project a guess onto the constraints (`consistent_state`); report how far it moved, and on which assembly it is.
 
-Large systems are projected by sparse factors. Dense matrices are used in three cases: rows that depend on others on the
-constraints, but only nearly so beside them; a position near a dead centre; a guess that may lead to another assembly.
+Large systems are projected by sparse factors, except in three cases: rows that are dependent at consistent positions,
+but only nearly beside them; a position near a dead centre; a guess that may lead to another assembly.
 """
 
 from __future__ import annotations  # so that help() shows the name ArrayLike
@@ -29,16 +29,16 @@ from twoloop.run.workspace import kit_of, static_form, workspace
 
 Array = NDArray[np.float64]
 
-CLEAR = 1e-5  # sine of the angle between a row and the others, below which a position may be near a dead centre
-# largest number of Newton iterations; correction relative to the largest coordinate at which they stop
+MIN_SINE = 1e-5  # sine of the angle of a row to the other rows below which a position may be near a dead centre
+# largest number of Newton iterations; largest correction, relative to the largest coordinate, at which they stop
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# On the same assembly, a displaced position is projected to the point that C_q predicts, within this share of the
-# displacement.
-LINEAR = 0.5
+# largest difference between the projection of a displaced position and its prediction by C_q, relative to the
+# displacement, if both are on the same assembly
+MAX_NONLINEARITY = 0.5
 
 
 class _Metric:
-    """Sparse projection in the Euclidean metric: the static form with the unit matrix in place of M."""
+    """Sparse projection in the Euclidean metric, by the static form with the unit matrix in place of M."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, form: Any, rank: int | None = None):
         self.system, self.t, self.rank = system, t, rank
@@ -51,12 +51,12 @@ class _Metric:
         self.work.mass_values[:] = diagonal / np.bincount(rows, diagonal, system.n_q)[rows]
 
     def run_task(self, task: int, q: Array, v: Array, a: Array | None = None, lam: Array | None = None) -> int:
-        """Run a task of the inner loop, which changes q and v, and return its code."""
+        """Run a task of the inner loop, which may change q, v, a and lam, and return its code."""
         a, lam = self.work.x if a is None else a, self.work.lam if lam is None else lam
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def allowed_part(self, displacement: Array) -> Array:
-        """Return the part of a displacement that the constraints at `position` allow, by the current factors."""
+        """Return the component (n_q,) of a displacement that the constraints at `position` allow."""
         rows = self.system.sparse_rows(self.t, self.position)
         change = np.zeros(len(displacement))
         zero, residual = np.zeros(len(displacement)), np.ascontiguousarray(rows @ displacement)
@@ -64,7 +64,7 @@ class _Metric:
         return displacement - change
 
     def onto_constraints(self, q: Array) -> Array | None:
-        """Project q onto the independent rows; return None if that fails or violates the other rows.
+        """Return q projected onto the constraints by the independent rows; None if that fails or violates other rows.
 
         The independent rows are not chosen anew: beside the constraints the other rows are only nearly dependent.
         """
@@ -80,13 +80,13 @@ class _Metric:
         return q if is_at_rounding(residual, self.system.sparse_rows(self.t, q), q) else None
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
-        """Project q and v onto the constraints; return None if that fails."""
+        """Return q and v projected onto the constraints, or None if that fails; store the position."""
         q, discarded = q.copy(), v.copy()
         if self.run_task(tasks.RENEW_PARTITION, q, v) != indices.DONE:
             return None
         if self.run_task(tasks.RESTORE, q, discarded) != indices.DONE:
             return None
-        v = v.copy()  # project velocities at the final positions only
+        v = v.copy()  # velocities are projected at the final positions only
         for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # the second RESTORE reaches rounding
             if self.run_task(task, q, v) != indices.DONE:
                 return None
@@ -98,13 +98,13 @@ class Dependence(NamedTuple):
     """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    shares: dict[int, Array]  # coefficients (n_c,) of each dependent row in terms of the other rows
-    allowed: Array  # displacement that C_q allows, whose largest entry is 1 in the units of the coordinates, (n_q,)
-    onto_constraints: Callable[[Array], Array | None]  # projects a nearby position onto the independent rows
+    shares: dict[int, Array]  # by dependent row: its coefficients (n_c,) as a combination of the independent rows
+    allowed: Array  # displacement (n_q,) that C_q allows; its largest entry is 1 in the units of the coordinates
+    onto_constraints: Callable[[Array], Array | None]  # projects a nearby position onto the constraints; None: it fails
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
-    """Find the rows of a large sparse system that depend on others; None if sparse factors cannot decide reliably."""
+    """Return rank and dependent rows of a large sparse system at q; None if sparse factors cannot decide reliably."""
     form, all_rows = static_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
@@ -113,7 +113,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
     if code == indices.RANK_DIFFERS:
         metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
         code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), at_rest)
-    if code != indices.DONE or metric.work.notes[indices.PIVOT] < CLEAR:
+    if code != indices.DONE or metric.work.notes[indices.PIVOT] < MIN_SINE:
         return None
     independent_rows, unused = set(metric.work.rows_v.tolist()), np.zeros_like(q)
     shares: dict[int, Array] = {}
@@ -131,7 +131,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
 def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
-    """Project (q, v) onto the constraints by the least change; None if sparse factors cannot do it reliably."""
+    """Return (q, v) projected onto the constraints by the least change; None if sparse factors are not reliable."""
     form = static_form(system, t, q)
     if form is None:
         return None
@@ -143,7 +143,7 @@ def project_sparsely(
     elif code != indices.DONE:
         return None
     projected = metric.project(q, v)
-    if projected is None or metric.work.notes[indices.PIVOT] < CLEAR:
+    if projected is None or metric.work.notes[indices.PIVOT] < MIN_SINE:
         return None
     # rows that are independent at the guess must be independent at the projected position, too
     metric_there = _Metric(system, t, projected[0], form, metric.rank)
@@ -161,7 +161,7 @@ def project_sparsely(
 
 
 def _other_guesses_agree(metric: _Metric, position: Array, change: Array) -> bool:
-    """Return whether three other guesses, as far away as the given one, are projected to points that C_q predicts."""
+    """Return whether three other guesses, with displacements like `change`, are projected near points C_q predicts."""
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     rest = np.zeros(len(position))
@@ -170,19 +170,19 @@ def _other_guesses_agree(metric: _Metric, position: Array, change: Array) -> boo
             return False
         expected = position + metric.allowed_part(displacement)
         projected = metric.project(position + displacement, rest)
-        if projected is None or np.abs(projected[0] - expected).max() > LINEAR * np.abs(displacement).max():
+        if projected is None or np.abs(projected[0] - expected).max() > MAX_NONLINEARITY * np.abs(displacement).max():
             return False
     return True
 
 
-MAX_ITERATIONS = 50
+MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
 CONVERGED = 1e-2  # violation at which the iteration stops, relative to the violation that a start may have
-# ratios to the largest singular value, below which others count as zero: SINGULAR in ranks, NEGLIGIBLE in least-squares
-# solutions, WEAK in those with redundant rows
+# singular values, relative to the largest, below which they count as zero: SINGULAR for ranks, NEGLIGIBLE for
+# least-squares solutions, WEAK for least-squares solutions with redundant rows
 SINGULAR, NEGLIGIBLE, WEAK = 1e-10, 1e-13, 1e-2
-DEAD_CENTRE = 0.01  # smallest over largest singular value, below which a position is called near a dead centre
-SAME = 0.1  # distance of two positions that count as one, relative to the change that the projection makes
-LOST = 1e8  # largest change of a position, relative to its scale: beyond, rounding errors exceed the mechanism
+DEAD_CENTRE = 0.01  # ratio of the smallest to the largest singular value up to which a position is near a dead centre
+SAME_POSITION = 0.1  # distance up to which two positions count as equal, relative to the change by the projection
+MAX_CHANGE = 1e8  # largest change of a coordinate, in its unit: after a larger one, the mechanism is lost in rounding
 
 
 class Move(NamedTuple):
@@ -333,7 +333,7 @@ def _state_of_large(
 def _position(
     system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int], check_assembly: bool
 ) -> Array:
-    """Project a guess onto the constraints by its free coordinates; raise if that fails or the assembly is in doubt."""
+    """Return a guess projected by its `free` coordinates; raise if that fails, or if the assembly is in doubt."""
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
@@ -380,10 +380,10 @@ def _another_assembly(
     scales: Scales,
     cut: float,
 ) -> str | None:
-    """Describe where other guesses, as far from `position` as `guess`, lead; None: to the same assembly.
+    """Describe where other guesses, about as far from `position` as `guess`, lead; None: to the same assembly.
 
-    Different assemblies have the same values of all but the dependent coordinates. If there is only one, displaced
-    guesses are projected to the points that C_q predicts to first order, with the same sign of the determinant.
+    On the same assembly, guesses are projected to points near those that C_q predicts to first order, with the same
+    sign of the determinant. Two assemblies may differ in the dependent coordinates alone.
     """
     moved = (position - guess) / scales.columns
     far = float(np.abs(moved).max())
@@ -405,21 +405,24 @@ def _another_assembly(
         if projected is None or not excess <= 1.0:
             return "does not converge"
         expected = position + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cut)
-        if distance(projected, expected) <= LINEAR * float(np.abs(direction).max()) and sign_at(projected) == sign:
+        if (
+            distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(direction).max())
+            and sign_at(projected) == sign
+        ):
             continue
-        # curvature or another assembly: project a guess with the new dependent and the old independent coordinates
+        # due to curvature, or another assembly? Project a guess with the new dependent and the old other coordinates
         mixed = position.copy()
         mixed[columns] = projected[columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
         if mixed_projected is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
-        if distance(mixed_projected, position) > SAME * far or sign_at(mixed_projected) != sign:
+        if distance(mixed_projected, position) > SAME_POSITION * far or sign_at(mixed_projected) != sign:
             return f"ends on another one, which differs by {_describe_change(position, mixed_projected, scales)}"
     return None
 
 
 def _describe_change(before: Array, after: Array, scales: Scales) -> str:
-    """Describe which coordinate changes most, with enough digits to show the change."""
+    """Describe the coordinate that changes most, with so many digits of both values that the change is visible."""
     j = int(np.abs((after - before) / scales.columns).argmax())
     size, change = max(abs(float(before[j])), abs(float(after[j]))), abs(float(after[j] - before[j]))
     digits = min(17, 3 + max(0, math.ceil(math.log10(size / change)))) if change > 0.0 else 3
@@ -429,7 +432,7 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
-    """Project the free coordinates; return q (None: diverged), its violation over the accepted one, and iterations."""
+    """Return the projected q (None: diverged), its violation over the accepted one, and the number of iterations."""
     best, nearest, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
@@ -446,13 +449,13 @@ def _gauss_newton(
         if excess < best:
             best, nearest = excess, q
         q = q + step
-        if not (np.abs(q - guess) <= LOST * scales.columns).all():  # also true for NaN
+        if not (np.abs(q - guess) <= MAX_CHANGE * scales.columns).all():  # also true for NaN
             return None, np.inf, iteration
     return nearest if best <= 1.0 else q, best, MAX_ITERATIONS  # rounding may keep the violation above CONVERGED
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
-    """Return the smallest change (n_q,) of the free coordinates that changes C by `values` to first order."""
+    """Return the smallest change (n_q,) of the free coordinates by which C changes by `values` to first order."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
     change = np.zeros(jacobian.shape[1])
@@ -480,7 +483,7 @@ def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], i
 
 
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
-    """Return the right singular vector of the smallest nonzero singular value, scaled to a largest entry of 1."""
+    """Return the right singular vector (n_q,) of the smallest nonzero singular value; its largest entry is 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
     nonzero = values > SINGULAR * values.max()
     direction = np.zeros(scaled.shape[1])
@@ -489,7 +492,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Describe how nearly C_q loses rank, both as given and scaled; return "" if it does not."""
+    """Return a sentence if C_q, unscaled and scaled, nearly loses rank, else ""."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]

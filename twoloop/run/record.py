@@ -28,17 +28,17 @@ from twoloop.run.dense_solution import DenseSolution, Interpolator, Table
 if TYPE_CHECKING:
     from twoloop.run.run import Run
 
-MAGIC, HEADER_SIZE = b"\x93NUMPY\x01\x00", 128  # first bytes of a file in NumPy's npy format, and length of its header
+MAGIC, HEADER_SIZE = b"\x93NUMPY\x01\x00", 128  # first bytes of a file in NumPy's format, and size of its header, bytes
 OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # fields with one row per step
 
 
 class MemoryStore:
-    """Store of named arrays in memory; each is a list of parts until it is read.
+    """Store of named arrays in memory; an array is a list of parts until it is read.
 
     Attributes
     ----------
     finished : bool
-        Whether added rows must be in their final form, because they cannot be changed later.
+        Whether added rows must be complete, because they cannot be changed later.
     """
 
     finished = False
@@ -61,7 +61,7 @@ class MemoryStore:
 
 
 class FileStore:
-    """Store of arrays in a new folder: a NumPy file for each array, complete after each part.
+    """Store of named arrays in a new folder: each array is a NumPy file, which is valid after each call of `add`.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class FileStore:
         return int(dtype.itemsize * np.prod(width, dtype=np.int64))
 
     def _write_header(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-        """Write the header, after the rows: if the process dies before, the file still has the previous array."""
+        """Write the header, after the rows: if the process dies before that, the file still contains the old array."""
         header = repr({"descr": dtype.str, "fortran_order": False, "shape": shape})
         header = header.ljust(HEADER_SIZE - len(MAGIC) - 3) + "\n"
         file.flush()
@@ -120,12 +120,12 @@ Store = MemoryStore | FileStore
 
 
 def mapped(path: Path) -> NDArray[Any]:
-    """Map the array in a file into memory, copy-on-write: changes of the array do not change the file."""
+    """Return the array in a NumPy file as a memory map, copy-on-write: changes of the array do not change the file."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
 def read(folder: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays in a folder. If a process died, arrays that belong together are cut to equal numbers of rows."""
+    """Return the arrays in a folder, by name; arrays that belong together are cut to equal numbers of rows."""
     arrays = {path.stem: mapped(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
         present = [name for name in group if name in arrays]
@@ -136,7 +136,7 @@ def read(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-PENDING = 1024  # number of states after which the intervals between them are interpolated and searched for events
+PENDING = 1024  # number of states above which the intervals between them are interpolated, and searched for events
 
 
 @dataclass(frozen=True)
@@ -146,15 +146,15 @@ class OutputRequest:
     Attributes
     ----------
     times : ndarray or None
-        Output times; None: every accepted step.
+        Output times; None: the ends of all accepted steps.
     lands : bool
-        Whether steps end at all output times, so that nothing is interpolated.
+        Whether steps end at all output times, so that no states are interpolated.
     dense : bool
         Whether the dense solution is requested.
     events : list of Event or None
-        None: no events were requested.
+        Events to be searched for; None: no events were requested.
     store : MemoryStore or FileStore
-        Where the output is stored.
+        Store to which the output is added.
     """
 
     times: Array | None
@@ -165,17 +165,17 @@ class OutputRequest:
 
     @property
     def every_step(self) -> bool:
-        """Whether the states of all steps are needed, if only temporarily."""
+        """Whether the states at the ends of all steps are needed, be it for interpolation only."""
         return self.times is None or self.between_steps
 
     @property
     def between_steps(self) -> bool:
-        """Whether states between steps are requested."""
+        """Whether states within steps are needed: for output times, the dense solution, or events."""
         return (self.times is not None and not self.lands) or self.dense or self.events is not None
 
 
 class _Between(NamedTuple):
-    """Interpolation of states between steps, for the search for events."""
+    """Interpolation in a table of states, in the form that the search for events uses."""
 
     interpolator: Interpolator
     table: Table
@@ -190,15 +190,16 @@ class _Between(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, chunk by chunk.
 
-    An interval is searched for events when all states that its polynomials go through are known, so that the output
-    does not depend on the chunks. Event functions are evaluated at least every `every` seconds.
+    The interval of a step is searched for events when all states through which its polynomials go are known, so that
+    the output does not depend on the chunks. Event functions are evaluated at least every `every` seconds.
 
     Attributes
     ----------
     search : EventSearch or None
-        The events so far.
+        Search for events, with the events found so far.
     n_steps, last_step : int, float
-        After a terminal event: the number of steps up to it, and the length of the last step up to the event, s.
+        Number of steps searched so far; after a terminal event, that of steps up to it, and the time, s, from the
+        beginning of the last step to the event.
     interrupted : bool
         Whether Ctrl-C interrupted the search for events, or the interpolation between the steps.
     """
@@ -209,10 +210,10 @@ class Recorder:
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps, self.last_step = 0, 0.0
         self.interrupted = False
-        # states of the intervals that were not searched yet, and earlier states that their polynomials go through
+        # states at the ends of intervals not yet searched for events, and earlier states of their polynomials
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
-        self._next = 0  # index of the first interval between these states that was not searched
+        self._next = 0  # index of the first interval between these states that has not been searched
         self._n_outputs = 0
         ends = request.events is not None and any(event.terminal < np.inf for event in request.events)
         self._max_pending = 0 if ends or request.store.finished else PENDING
@@ -222,9 +223,9 @@ class Recorder:
             self._store(self._t[:0], self._rows[:0, : 2 * self._n_q])
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
-        """Record the states [q, v, a, lam] at which steps ended, and the kind of interval of each step.
+        """Record times and states [q, v, a, lam] at which steps ended, and the kind of interval of each step.
 
-        There is one kind per step if states between steps are requested, else none.
+        `kinds` is empty unless states between steps are requested.
         """
         self._store_output(t, rows, kinds)
         if not self.request.between_steps:
@@ -235,12 +236,12 @@ class Recorder:
             self._search(len(self._t) - WINDOW)
 
     def correct_last_state(self, t: float, row: Array) -> None:
-        """Replace [q, v, a] of the last state, if its time is t, for the interpolation between steps."""
+        """Replace [q, v, a] of the last recorded state by `row` for interpolation, if the time of this state is t."""
         if self.request.between_steps and len(self._t) and self._t[-1] == t:
             self._rows[-1, : len(row)] = row
 
     def store_crossing(self, memory: Array) -> None:
-        """Store `memory` for the next interval if it contains a polynomial across a singular position."""
+        """Keep `memory` for the interval after the last recorded state, if its polynomial is across a singularity."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -259,32 +260,32 @@ class Recorder:
             store.add("sol_kinds", kinds)
 
     def _store(self, t: Array, rows: Array) -> None:
-        """Store rows [q, v, a, lam], or [q, v] if [a, lam] will be computed at the end."""
+        """Store times and rows [q, v, a, lam], or rows [q, v] for which [a, lam] can be computed at the end."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._with_accelerations(t, rows) if self.request.store.finished else rows)
 
     def finish(self) -> None:
-        """Search the remaining intervals at the end of the run."""
+        """Search the remaining intervals for events, and interpolate in them, at the end of the run."""
         self._search(len(self._t) - 1)
 
     @property
     def last(self) -> tuple[float, Array] | None:
-        """Time and row [q, v] of the event that ended the run."""
+        """Time and row [q, v] of the event that ended the run, or None."""
         return None if self.search is None or self.ended is None else self.search.found[self.ended[0].number][-1]
 
     @property
     def interrupted_at(self) -> float | None:
-        """Time at which the search for events was interrupted: the result ends there, as later events are unknown."""
+        """Time at which Ctrl-C interrupted the search for events, or None; the result ends at this time."""
         ended_early = self.interrupted and self.search is not None and self.ended is None
         return self.search.reached if ended_early and self.search is not None else None
 
     @property
     def ended(self) -> tuple[Event, float] | None:
-        """Event that ended the run, and its time."""
+        """Event that ended the run, and its time, or None."""
         return None if self.search is None else self.search.ended
 
     def _search(self, end: int) -> None:
-        """Search the intervals before `end` for events, and interpolate the states at output times in them."""
+        """Search the intervals before the state with index `end` for events; store states at output times in them."""
         interpolator = self.interpolator
         if interpolator is None or self.ended is not None or self.interrupted:
             return
@@ -317,7 +318,7 @@ class Recorder:
         self._next = end - drop
 
     def output(self) -> tuple[Array, Array]:
-        """Return times and rows [q, v, a, lam] of the result."""
+        """Return times and rows [q, v, a, lam] of the result, up to the event or interruption that ended the run."""
         store, end = self.request.store, self.interrupted_at if self.ended is None else self.ended[1]
         if end is not None:
             n = int(np.searchsorted(store.array("t"), end, side="right"))
@@ -331,7 +332,7 @@ class Recorder:
         return t, self._with_accelerations(t, store.array("states"))
 
     def _with_accelerations(self, times: Array, rows: Array) -> Array:
-        """Return rows [q, v, a, lam] for rows [q, v]."""
+        """Return rows [q, v, a, lam] for rows [q, v]; rows that are complete are returned unchanged."""
         if self.interpolator is None or rows.shape[1] == self._width:
             return rows
         added = np.full((len(times), self._width - rows.shape[1]), np.nan)
@@ -343,7 +344,7 @@ class Recorder:
         return np.concatenate([rows, added], axis=1)
 
     def solution(self) -> DenseSolution | None:
-        """Return the dense solution, if it is requested."""
+        """Return the dense solution, or None if it is not requested."""
         if not self.request.dense or self.interpolator is None:
             return None
         table = Table(*(self.request.store.array(f"sol_{name}") for name in ("t", "states", "kinds")))
@@ -351,7 +352,7 @@ class Recorder:
         return DenseSolution(self.interpolator, table, end if self.ended is None else self.ended[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
-        """Return times, coordinates and velocities of the events, one array for each event function."""
+        """Return times, coordinates and velocities of the events: three lists with one array per event function."""
         if self.search is None:
             return None, None, None
         n = self._n_q
@@ -361,7 +362,7 @@ class Recorder:
 
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
-Later = Callable[[str], dict[str, Any]]  # returns a deferred field, given its name, and related fields, by name
+Later = Callable[[str], dict[str, Any]]  # function of a deferred field's name: this field and related fields, by name
 
 
 class Status(IntEnum):
@@ -415,7 +416,7 @@ MEANINGS: dict[Status, str] = {
 
 
 def failure_link(status: Status) -> str:
-    """Return the sentence about docs/when_it_fails.md for the message of a failure; an empty string after success."""
+    """Return a sentence that refers to the section of docs/when_it_fails.md about a failure; "" after success."""
     return "" if status >= 0 else f" See docs/when_it_fails.md#{status.name.lower()}."
 
 
@@ -531,7 +532,7 @@ class Record:
         return np.asarray(self._known("energy")(self.t, self.q, self.v))
 
     def _known(self, what: str) -> Any:
-        """Return the energy or the drawing; if there is none, raise an error that says how to get it."""
+        """Return the attribute `what` of the description; if it is None, raise a ValueError that says how to set it."""
         value = getattr(self.description, what)
         if value is None:
             raise ValueError(
@@ -560,7 +561,7 @@ class Record:
 
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
-    """Create a record whose attributes are the dict `fields`; the constructor of a large frozen dataclass is slow."""
+    """Return a record with the attributes `fields`; the constructor, of a large frozen dataclass, would be slow."""
     instance = _new(kind)
     _set_fields(instance, fields)
     return instance
@@ -570,7 +571,7 @@ _new, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:
-    """Descriptor of a field that is computed when it is first read, by the function `later` in `vars(record)`."""
+    """Descriptor of a field of a record: if it is missing, `vars(record)["later"]` computes it at the first access."""
 
     def __init__(self, name: str):
         self.name = name
@@ -578,7 +579,7 @@ class _Deferred:
     def __get__(self, record: Any, owner: Any = None) -> Any:
         values = {} if record is None else vars(record)
         if "later" not in values:
-            raise AttributeError(self.name)  # the class has no such attribute; dataclass fields hold the defaults
+            raise AttributeError(self.name)  # the class has no such attribute; the defaults are in dataclass fields
         values.update(values["later"](self.name) | values)
         return values[self.name]
 
@@ -592,12 +593,12 @@ Integers = NDArray[np.int64]
 
 COUNT_NAMES = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 COUNTERS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
-# rejections by error, rejections by convergence and partitions before the first step, whose partition is no renewal
+# numbers of rejections by error, of rejections by convergence, and of partitions before the first step
 INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record with one row per step; update `counts`, the totals before and after the steps."""
+    """Return the fields of a record with one row per step; `counts` (totals before these steps) become those after."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -605,29 +606,29 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
 
 
 def statistics(counted: Integers, cpu: float) -> Statistics:
-    """Return the statistics of a run, from the counts of its workspace and its CPU time, s."""
+    """Return the Statistics of a run, given the array of counters of its workspace, and its CPU time, s."""
     return Statistics(**dict(zip(COUNT_NAMES, COUNTERS(counted.tolist()), strict=True)), cpu_time=cpu)
 
 
 def fields_of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
-    """Return the fields of a record for the trajectory (`table`: rows [q, v, a, lam]) and for the whole run."""
+    """Return the fields of a record for a trajectory (`table`: rows [q, v, a, lam]), and for ranks, defect and gap."""
     return {
         **state_fields(run.system.n_q, t, table),
         "rank": run.rank,
-        "redundant": run.redundant.copy(),  # runs from one start share this array
+        "redundant": run.redundant.copy(),  # copies of a run share this array
         "defect": run.defect(),
         "widest_gap": float(run.work.notes[indices.WIDEST_GAP]),
     }
 
 
 def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
-    """Return the fields of a record for a trajectory of n coordinates, from rows [q, v, a, lam] in `table`."""
+    """Return the fields t, q, v, a and lam of a record for n coordinates; `table`: rows [q, v, a, lam] at times t."""
     columns = table.T
     return {"t": t, "q": columns[:n], "v": columns[n : 2 * n], "a": columns[2 * n : 3 * n], "lam": columns[3 * n :]}
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kind of interval of each step of the run's own plan, for the dense solution."""
+    """Return the kind of interval, for the dense solution, of each step by the run's own plan; `steps`: their rows."""
     if run.plan.apart:
         return np.full(len(steps), indices.APART)
     explicit = indices.ACROSS if run.substituted else indices.ACCELERATIONS

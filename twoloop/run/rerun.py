@@ -1,4 +1,4 @@
-"""Check a finished run: compare its callbacks at states of the run, and rerun pieces of it with another method."""
+"""Check a finished run: compare its callbacks at states of the run, and rerun pieces of the run with another method."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-FIRST_FORCE = "first force"  # cache key of a compiled force at the start of a run, unless it is traced
-N_DERIVATIVES = 4  # number of states of the run at which derivatives are checked again, including the last one
+FIRST_FORCE = "first force"  # cache key of the value at the start of a compiled force that is not traced
+N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
 
 def compare_callbacks(
     run: Run, sample: Sample, end: float, check_derivatives: bool, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Return the status and the message of a run, changed if callbacks are wrong at states of its `sample`.
+    """Return status and message of a run that ended at `end`, changed if callbacks are wrong at states of `sample`.
 
-    In the region where compiled callbacks were compared before (`CheckedRegion`), they are not compared again.
+    Compiled callbacks are mostly not compared again in the region where they were compared before (`CheckedRegion`).
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
@@ -57,7 +57,7 @@ def compare_callbacks(
 
 
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
-    """Return the region in which callbacks were compared, in runs of the same system with the same checks."""
+    """Return the region in which runs of the same system, with equal traces and checks, compared callbacks."""
     if run.region is not None:
         return run.region
     what = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
@@ -73,9 +73,9 @@ def compare_callbacks_at(
     message: str,
     everywhere: bool = False,
 ) -> tuple[Status, str]:
-    """Compare callbacks at states [t, q, v], latest first; return status and message, changed if one is wrong.
+    """Compare callbacks at states [t, q, v], latest first; return status and message, changed if a callback is wrong.
 
-    `everywhere`: also at states in the checked region, which grows by the states.
+    `everywhere`: at all states; else only at those outside the region. If callbacks agree, extend the region.
     """
     first = states[-1]
     if not everywhere:
@@ -95,7 +95,10 @@ def compare_callbacks_at(
 
 
 def _check_derivatives(run: Run, states: Array, first: Array, status: Status, message: str) -> tuple[Status, str]:
-    """Return the status and the message, changed if a derivative or a constant mass is wrong at states of the run."""
+    """Return status and message, changed if a derivative, or a mass said to be constant, is wrong at states of the run.
+
+    `first`: the first state [t, q, v] of the run.
+    """
     n = run.system.n_q
     chosen = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
     compared = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
@@ -113,10 +116,7 @@ def _check_derivatives(run: Run, states: Array, first: Array, status: Status, me
 
 
 def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
-    """Describe how a force called in Python changes when it is evaluated twice at the same state; None if it does not.
-
-    `states` are rows [t, q, v].
-    """
+    """Evaluate a force called in Python twice at each of `states`, rows [t, q, v]; describe a difference, else None."""
     n, forces = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -135,12 +135,12 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
 
 
 def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
-    """Return the functions of a system that are called in Python, or None."""
+    """Return the object with a system's functions that are called in Python, or None if it has none."""
     return PythonFunctions.registry.get(float(system.functions.p[0])) if system.called_in_python else None
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return arguments and value of a compiled force at the start; clear the samples of a force called in Python."""
+    """Return arguments and value of a compiled force at the start; for a force called in Python clear its samples."""
     if functions := python_functions(system):
         functions.restart()
         return None
@@ -150,9 +150,9 @@ def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> t
 
 
 def describe_changed_force(run: Run) -> str | None:
-    """Describe how a force differs from its value earlier in the run for the same arguments; None if it does not.
+    """Describe how a force differs from an earlier value in the run for the same arguments; None if it does not.
 
-    A force may change slowly (with the clock) or once (after 1000 calls): two calls at the end do not show that.
+    A force may change slowly (with the clock) or once (after 1000 calls): two calls after the run do not show that.
     """
     system, functions = run.system, python_functions(run.system)
     if functions is None:
@@ -187,7 +187,7 @@ def _changed_value(name: str, t: float, entry: int, once: float, again: float) -
 
 
 def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[Status, str]:
-    """Return the status and the message, changed if a callback differs from its recorded trace."""
+    """Return status and message, changed if a callback differs from its trace at one of the states [t, q, v]."""
     for traced in run.traced:
         difference = traced.difference(run.system, states)
         if difference is not None:
@@ -196,30 +196,30 @@ def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[
 
 
 CHUNK = 256  # largest number of attempted steps in one call of `advance`
-FIRST_STEP = 0.1  # first step of a piece, relative to its length, unless the previous piece proposes one
-TOLERANCE_SHARE = 0.1  # tolerances of the pieces, relative to those of the run
-FINEST = 1e-13  # smallest tolerance of the pieces, relative or absolute: rounding hides smaller errors
+FIRST_STEP = 0.1  # first step size in a piece, relative to the piece's duration, unless the last piece proposes one
+TOLERANCE_FACTOR = 0.1  # ratio of the tolerances of a rerun to those of the run
+FINEST = 1e-13  # smallest tolerance of a rerun, relative or absolute: rounding hides smaller errors
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
 
 
 def tighter_tolerances(tolerance: ArrayLike) -> Array:
-    """Return the tolerances of the pieces, given those of the run."""
-    return np.minimum(tolerance, np.maximum(TOLERANCE_SHARE * np.asarray(tolerance), FINEST))
+    """Return the tolerances of a rerun, given those of the run (relative, or absolute of each coordinate)."""
+    return np.minimum(tolerance, np.maximum(TOLERANCE_FACTOR * np.asarray(tolerance), FINEST))
 
 
 def nonstiff_method() -> tuple[Method, Array]:
-    """Return the method for pieces that are not stiff, and its nodes."""
+    """Return the method for reruns of pieces that are not stiff, and the nodes of its steps."""
     return DOP853(), dop853.C
 
 
 def stiff_method(velocities: bool) -> tuple[Method, Array]:
-    """Return the method for stiff pieces, and its nodes; `velocities`: whether errors of velocities are tested, too."""
+    """Return the method for reruns of stiff pieces, and its nodes; `velocities`: whether it tests their errors, too."""
     tableau = radau_iia(7)
     return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
 
 
 class RerunPiece(NamedTuple):
-    """Result of a piece: states [q, v] at the requested times, the longest step, s, and the number of steps."""
+    """Result of a piece: states [q, v] at the requested times, the largest step size, s, and the number of steps."""
 
     states: Array
     longest: float
@@ -239,7 +239,7 @@ class IndependentRerun:
     rtol, atol : float, ndarray (n_q,)
         Tolerances.
     max_step : float
-        Largest step, s.
+        Largest step size, s.
     """
 
     def __init__(

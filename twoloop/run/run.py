@@ -36,15 +36,16 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 
 # largest number of attempts in the first chunk of a small system; after each chunk, checks in Python take 0.2 ms
 FIRST_CHUNK = 1024
-FIRST_CHUNK_IN_PYTHON = 64  # the same for callbacks that are plain Python functions, which may be slow
-SMALL = 32  # number of coordinates of a small system; the chunks of larger ones are shorter in proportion
-TRIAL_STEPS = 10  # number of first steps after which a method that needs long steps is replaced if its steps are short
+FIRST_CHUNK_IN_PYTHON = 64  # as FIRST_CHUNK, for callbacks that are called in Python, which may be slow
+SMALL = 32  # number of coordinates up to which a system is small; larger systems have proportionally smaller chunks
+# number of first steps in which a method that needs long steps is replaced if a step is short
+TRIAL_STEPS = 10
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
-CONTRADICTS = 1e-6  # relative residual of a redundant row above which it contradicts the accelerations
+CONTRADICTS = 1e-6  # relative residual of a row for the accelerations at the start above which the rows contradict
 
 
 class Run:
-    """Run at its start: plan, kit, workspace, state and controls. `IntegrationLoop` integrates it to its end.
+    """State of an integration: plan, kit, workspace, state and controls, at first at its start.
 
     Raises
     ------
@@ -79,7 +80,7 @@ class Run:
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # ranks are computed at every start: those of the last start are a guess that may save a second workspace
+        # ranks are computed at every start; those of the last start are a guess that often saves a second workspace
         self.work = self._workspace(*(system.derived.get("ranks", ()) if self.static is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -99,9 +100,9 @@ class Run:
         self.clock = np.zeros(loop_state.N_CLOCK)
         self._set_clock(t0)
         self.control_by(plan)
-        self.substituted = False  # whether the substitute plan has replaced the first one
-        self.near = singular_threshold(rtol)  # ratio of pivots below which errors of velocities are estimated
-        force_traced = any("force" in each.kinds for each in plan.traced)  # whether the force was traced
+        self.substituted = False  # whether the substitute plan has replaced the first plan
+        self.near = singular_threshold(rtol)  # ratio of pivots below which rounding errors of velocities are estimated
+        force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced), lambda: (may_be_short(system, force_traced), may_be_steep(system, force_traced))
         )
@@ -111,34 +112,34 @@ class Run:
         self.may_be_steep = steep or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
-        self.mirrored = 0.0  # length of a step that ends as far beyond the position as its base is before it, s
-        self.looser = self.tolerances  # tolerances of these steps
-        self.lengths: list[float] = []  # lengths of steps that are still to be tried, s
-        self.longer: list[float] = []  # longer lengths to try if too few nodes of a step are beyond the position, s
-        self.crossed = 0.0  # length of the last attempted step, s
+        self.mirrored = 0.0  # size of a step that ends as far beyond the position as its base is before it, s
+        self.looser = self.tolerances  # tolerances of steps across singular positions
+        self.lengths: list[float] = []  # sizes of steps that are still to be tried, s
+        self.longer: list[float] = []  # larger sizes to be tried if too few nodes of a step are beyond the position, s
+        self.crossed = 0.0  # size of the last attempted step across, s
         self.pieces: list[float] = []  # times at which the next pieces of the polynomial end
         # origins of the polynomial still to be tried: earliest time of nodes, base, whether tolerances are looser
         self.origins: list[tuple[float, tuple[float, Array] | None, bool]] = []
-        self.jumps: list[float] = []  # times at which velocities changed as by an impulse
+        self.jumps: list[float] = []  # times at which C_t or b jumped, and velocities with them
         self.compared_until = [-np.inf]  # time up to which callbacks were compared; copies of the run share the list
-        self.region: CheckedRegion | None = None  # where callbacks were compared; cached integrators share it
-        self.varied_parameters: Array | None = None  # parameters, if the run is used for several systems
+        self.region: CheckedRegion | None = None  # region in which callbacks were compared; integrators share it
+        self.varied_parameters: Array | None = None  # array of parameters, if the run is used for several systems
         self._compute_start()
         self.rank = len(self.work.rows_v)
-        self.descriptions: dict[tuple[int, ...], str] = {}  # warnings by redundant rows, written when first needed
+        self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings about redundant rows, by these rows
         self.redundant, self.rows_warning = self.redundant_rows()
         self.start_warning = self._start_warning()
 
     def copy(self) -> "Run":
-        """Copy this run, which must be at its start."""
+        """Return a copy of this run, which must be at its start."""
         other = self._copy()
         other.work = copy_of(self.work)
         return other
 
     def from_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Copy this run for another start; return None if the ranks of C_q differ there, or accelerations fail.
+        """Return a copy of this run at another start; None if the ranks of C_q differ there, or accelerations fail.
 
-        The run must not be in the static form.
+        The run must not use the static form.
         """
         other = self._copy()
         other.t0, other.compared_until = t0, [-np.inf]
@@ -153,7 +154,7 @@ class Run:
         return other
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to a state, without past steps; return the code of the accelerations' computation there."""
+        """Set the run to a state, without past steps; compute the accelerations, and return the code of this."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -162,7 +163,7 @@ class Run:
         return code
 
     def _set_clock(self, t: float) -> None:
-        """Set the clock to the start of a run at t."""
+        """Reset the array `clock` for a run that begins at t."""
         a, clock = self.a, self.clock
         clock[:] = 0.0
         clock[a.T] = clock[a.T_START] = t
@@ -185,11 +186,11 @@ class Run:
         outputs : ndarray
             Times at which steps must end.
         buffers : tuple of ndarray
-            Times, states and steps, to which rows are written.
+            Arrays that are filled with times, states, and rows of steps.
         filled : ndarray (2,)
-            Receives the number of states, and of steps.
+            Becomes the numbers of states and of steps in the buffers.
         active : (Plan, ndarray, Kit), optional
-            Plan, controls and kit of these steps. None: those of the run.
+            Plan, controls and kit for this call. None: those of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
         tolerances = self.tolerances if plan is self.plan else self.looser
@@ -222,7 +223,7 @@ class Run:
         return self.plan.lands or self.control[self.a.FIXED_STEP] > 0.0
 
     def control_by(self, plan: Plan) -> None:
-        """Set the control array for the step-size control of a plan."""
+        """Write the step-size control of a plan to the array `control`, and its first limit of steps to `clock`."""
         a, control = self.a, self.control
         control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
@@ -234,7 +235,7 @@ class Run:
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
-        """Create the workspace for the rank of C_q and that of all rows; None: full rank."""
+        """Return a new workspace for the rank of C_q and the rank of all rows; None: full rank."""
         q0 = self.state[: self.system.n_q]
         pattern = self._pattern(q0) if self.static is None else NO_PATTERN
         ranks = rank, rank_v
@@ -248,7 +249,7 @@ class Run:
         return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
     def is_lost_without_dense(self, code: int) -> bool:
-        """Return whether no step succeeded in the static form, although it may succeed in another form."""
+        """Return whether steps failed in the static form for a reason that may not apply in another form."""
         reasons = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.static is not None
@@ -257,10 +258,9 @@ class Run:
         )
 
     def change_form(self) -> None:
-        """Change the form of the linear algebra at the current state.
+        """Change the form of the linear algebra at the current state, and replace kit and workspace.
 
-        Newton's matrices are added to the static form if they are missing; otherwise the dense forms of saddle_point.py
-        replace it.
+        The new form is the static form with Newton's matrices, if these are missing, else a form of saddle_point.py.
         """
         n = self.system.n_q
         before, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
@@ -292,7 +292,7 @@ class Run:
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[indices.PIVOT])
 
     def _compute_start(self) -> None:
-        """Compute the accelerations at the start; change the workspace and the form if they fail."""
+        """Compute the accelerations at the start; if that fails, try another workspace, or another form."""
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
         if self.static is not None and code == indices.RANK_DIFFERS:
@@ -313,7 +313,7 @@ class Run:
             self.system.derived["ranks"] = ranks
             self.work = self._workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == indices.GAMMA_INACCURATE:  # let the first step report it: then the run has a result
+        if code == indices.GAMMA_INACCURATE:  # the first step will report this, so that the run has a result
             required = self.work.notes[indices.GAMMA_REQUIRED]
             self.work.notes[indices.GAMMA_REQUIRED] = np.inf
             code = start(self.kit, self.work, self.t0, self.state)
@@ -337,7 +337,7 @@ class Run:
         )
 
     def redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
-        """Return the rows of [C_q; A] (`rows`, if known) that depend on others at the start, and a warning of them."""
+        """Return the indices of dependent rows of [C_q; A] at the start, and a warning; `rows`: [C_q; A], if known."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -360,30 +360,30 @@ class Run:
         return np.array(redundant), self.descriptions[redundant_rows]
 
     def _start_warning(self) -> str:
-        """Return the warning for a start beside a singular position, or an empty string."""
+        """Return the warning for a start at or near a singular position, else ""."""
         if self.work.notes[indices.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
             return ""
         atol, q = self.tolerances[indices.ATOL :], self.state[: self.system.n_q]
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def violated_rows(self, rows: Rows) -> NDArray[np.int64]:
-        """Return the rows of [C_q; A] that the accelerations at the start violate."""
+        """Return the indices of the rows of [C_q; A] that the accelerations at the start violate."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
-        if residual.max() <= CONTRADICTS:  # no row has a smaller tolerance
+        if residual.max() <= CONTRADICTS:  # CONTRADICTS is the smallest tolerance of a row
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
     def _rows_at_start(self) -> Rows:
-        """Return C_q and A at the start."""
+        """Return [C_q; A] at the start, dense or sparse."""
         system, q = self.system, self.state[: self.system.n_q]
         if system.called_in_python or system.entries:
             return system.sparse_rows(self.t0, q)
         return mass_and_rows(system, self.t0, q)[1]
 
     def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
-        """Describe in words on which of `all_rows` the dependent `rows` (indices) depend."""
+        """Describe the dependence of the rows with the indices `rows` on the other rows of `all_rows`."""
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
         q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
@@ -395,7 +395,7 @@ class Run:
         return equations_in_words(rows, counted, shares[:, counted], norms(all_rows))
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
-        """Set the first and the largest step, s."""
+        """Set the first step size and the limits of step sizes, s; first_step None: an estimate."""
         self.max_step = max_step
         self.limit_steps()
         proposed = self.first_step(self.t0, t1, self.state, max_step)
@@ -404,28 +404,28 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first
 
     def limit_steps(self) -> None:
-        """Limit the steps, so that no hundredth of the run passes without an evaluation.
+        """Set the largest step size so that no hundredth of the run passes without an evaluation.
 
-        If forces may be steep, steps are no longer than that: a single stage within a steep force may not reveal it.
+        If forces may be steep, a step is at most as long, because a single stage in a steep force may not reveal it.
         """
         unseen = 1.0 if self.may_be_steep else self.plan.unseen
         longest = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, longest), unseen
 
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the first step from a state, s. If `longest` > 0, also limit the time between two evaluations."""
+        """Return the first step size, s, from a state; if `longest` (max_step) > 0, also limit the later step sizes."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
         first: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return first
 
     def defect(self) -> float | None:
-        """Return the largest defect of the steps, or None if it is not known for all of them."""
+        """Return the largest defect of the steps, or None if it was not evaluated in all steps."""
         notes = self.work.notes
         checked = self.work.counters[indices.N_ACCEPTED] > 0 and notes[indices.UNCHECKED] == 0.0
         return float(notes[indices.LARGEST_DEFECT]) if checked else None
 
     def passed_near_singular(self) -> bool:
-        """Return whether steps had to end so near a singular position that rounding may have changed velocities."""
+        """Return whether a step had to end so near a singular position that rounding may have changed velocities."""
         near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and checks take long
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < near)
 

@@ -1,4 +1,4 @@
-"""Integrate from one sample of a controller to the next, where parameters may change; callbacks are checked once."""
+"""Integrate from sample to sample of a controller; parameters may change at samples; callbacks are checked once."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from twoloop.run.signals import signals_of
 
 Array = NDArray[np.float64]
 
-STEPS = 1024  # number of steps that one call of the compiled loop may take
-FORCES = {"force", "force_by_q", "force_by_v"}  # callbacks whose parameters may change between samples
-CHANGED = "the parameters changed at samples"  # field `changes` of the result
+MAX_STEPS = 1024  # largest number of steps in one call of the compiled loop
+FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # callbacks that may depend on parameters that change at samples
+CHANGED = "the parameters changed at samples"  # value of the field `changes` of the result
 
 
 class SampledState(NamedTuple):
-    """State at the end of a sample: time t (s), q, v, a (n_q,) and lam (n_c + n_a,); the arrays are read-only.
+    """State at a sample: time t (s), q, v, a (n_q,) and lam (n_c + n_a,); the arrays are read-only.
 
     Examples
     --------
@@ -59,12 +59,12 @@ class SampledState(NamedTuple):
 
 
 class SampledRun:
-    """Integration from sample to sample with parameters that may change.
+    """Integration from sample to sample, with parameters of the forces that may change at samples.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        A copy for this object, which writes to its parameters.
+        A system that only this object uses: `set` changes its parameters.
     method : Method
     rtol, atol : float, ndarray (n_q,)
     max_step : float
@@ -109,12 +109,16 @@ class SampledRun:
         if self.run.start_warning:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
-        self._force_parameters: set[int] = set()  # indices of parameters that were checked to enter forces only
+        self._force_parameters: set[int] = set()  # indices of parameters on which, as checked, only forces depend
         self._changed = self._failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
-        self._buffers = np.empty(1), np.empty((1, len(self.run.state))), np.empty((STEPS, self.run.a.N_STEP_COLUMNS))
+        self._buffers = (
+            np.empty(1),
+            np.empty((1, len(self.run.state))),
+            np.empty((MAX_STEPS, self.run.a.N_STEP_COLUMNS)),
+        )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        # CPU time, s; largest time between evaluations, s, which is finite once a sample has met a short change
+        # CPU time, s; limit of the time between evaluations, s, which is finite after a short change of forces
         self.cpu, self._every = 0.0, np.inf
         self._store_sample(t0)
 
@@ -131,7 +135,7 @@ class SampledRun:
         return self.times[-1]
 
     def set(self, inputs: Any) -> None:
-        """Set parameters: `inputs` is a mapping from indices to numbers, or has all parameters."""
+        """Change parameters; `inputs`: a mapping from indices to numbers, or an array of all parameters."""
         if not self.p.size:
             raise ValueError(f"inputs are parameters, of which {self.system.name!r} has none: make it with parameters=")
         if isinstance(inputs, Mapping):
@@ -155,7 +159,7 @@ class SampledRun:
             self._write(place, float(values[place]))
 
     def step(self, dt: float) -> SampledState:
-        """Integrate by dt, store and return the state there; after a failure, continue from the last sample."""
+        """Integrate over the time dt, s, from the last sample; store and return the state at the end, a new sample."""
         if self._failed:
             self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
@@ -167,7 +171,7 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate from the last sample to `end`; repeat this with more evaluations after a short change of forces."""
+        """Integrate from the last sample to `end`; repeat it with more evaluations after a short change of forces."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
@@ -180,7 +184,7 @@ class SampledRun:
         warn_of_missed_changes(self.run)
 
     def _integrate_to(self, end: float) -> None:
-        """Integrate from the last sample to `end`."""
+        """Integrate from the last sample to the time `end`, without repetitions."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
         if self._changed or self.system.called_in_python:  # global variables of Python functions may change
@@ -188,7 +192,7 @@ class SampledRun:
         run.first_step(self.t0, end, run.state, run.max_step)
         run.control[a.APART] = min(self._every, run.control[a.APART])
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
-        run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = STEPS, np.inf
+        run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = MAX_STEPS, np.inf
         code = run.advance(self._outputs, self._buffers, self._filled)
         self.steps.append(self._buffers[2][: self._filled[1]].copy())
         if code != a.ALL_OUTPUT_DONE:
@@ -198,7 +202,7 @@ class SampledRun:
 
     @property
     def state(self) -> SampledState:
-        """State at the end of the last sample."""
+        """State at the last sample."""
         row, n = self.rows[-1], self.run.system.n_q
         return SampledState(self.times[-1], row[:n], row[n : 2 * n], row[2 * n : 3 * n], row[3 * n :])
 
@@ -210,7 +214,7 @@ class SampledRun:
         self._n_steps, self._failed = len(self.steps), False
 
     def record(self) -> Record:
-        """Return the record of all states at samples so far."""
+        """Return the record of the states at all samples so far."""
         run, a, n = self.run, self.run.a, self.run.system.n_q
         table = np.array(self.rows)
         steps = np.concatenate([np.empty((0, a.N_STEP_COLUMNS)), *self.steps[: self._n_steps]])
@@ -230,11 +234,11 @@ class SampledRun:
         )
 
     def _restart(self, t: float) -> None:
-        """Compute the accelerations with the new parameters, and restart the method without its past steps."""
+        """Compute the accelerations at t with the new parameters, and restart the method without past steps."""
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         first = 0
-        if run.plan.first is not None:  # a pair of methods: the first numbers of its memory say which is active
+        if run.plan.first is not None:  # a pair of methods: the first numbers of the memory, the active method, remain
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             first = N_SCALARS + 2 * run.system.n_q
@@ -248,7 +252,7 @@ class SampledRun:
         self._changed = False
 
     def _return_to_sample(self) -> None:
-        """Replace the run, which has gone beyond or failed, by a new one from the last sample."""
+        """Replace the run, which failed or has to be repeated, by a new one that begins at the last sample."""
         before, n = self.run, self.system.n_q
         try:
             self.run = self._run_from(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
@@ -259,7 +263,7 @@ class SampledRun:
         self._changed = False
 
     def _finish_by_loop(self, end: float) -> None:
-        """Continue if one call of the compiled loop did not reach the end: many steps, a jump, or a failure."""
+        """Integrate to `end` by IntegrationLoop (after many steps, or at a jump); raise RuntimeError if that fails."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
         request = OutputRequest(np.array([end]), True, False, None, MemoryStore())
@@ -282,11 +286,11 @@ class SampledRun:
         self._changed = True
 
     def _check_enters_forces_only(self, place: int, value: float) -> None:
-        """Refuse a parameter that enters other callbacks than forces: positions or momenta would jump with it."""
+        """Raise ValueError if other callbacks than forces depend on a parameter: positions or momenta would jump."""
         before, n = float(self.p[place]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         state = {"q": row[:n], "v": row[n : 2 * n]}
-        for kind in sorted(self.system.given.keys() - self.system.scattered - FORCES):
+        for kind in sorted(self.system.given.keys() - self.system.scattered - FORCE_KINDS):
             if not set(KINDS[kind].state) <= set(state):
                 continue
             values = []

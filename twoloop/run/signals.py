@@ -1,6 +1,6 @@
 """Propagate the exceptions of a user's signal handlers unchanged, although signals arrive during machine code."""
 
-# `signal` tries to convert each handler to an enum member, which takes 8 microseconds: `_signal` does not
+# module `signal` tries to convert each handler to an enum member, which takes 8 microseconds; `_signal` does not
 import _signal  # type: ignore[import-not-found]
 import signal
 import threading
@@ -12,26 +12,26 @@ from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.events import Event
 from twoloop.problem.system import ConstrainedSystem
 
-# code of the functions that call functions of the user
-USER_CALLERS = (PythonFunctions.call.__code__, Event.__call__.__code__)
-COMPILERS = ("numba", "llvmlite")  # packages that an exception between two of their instructions would break
-# not all of them exist on Windows
+# code objects of the functions of twoloop that call functions of the user
+CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
+COMPILERS = ("numba", "llvmlite")  # packages that exceptions between two of their instructions break
+# signals whose handlers are replaced; not all of them exist on Windows
 SIGNAL_NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")
 SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr(signal, name)]
 
 
 class SignalHandlers:
-    """Call the user's signal handlers at safe points of a run, and raise their exceptions again.
+    """Substitutes for the user's signal handlers: they call these at safe points, and raise their exceptions again.
 
-    Python runs a handler at its next instruction, which may belong to numba. Between two pieces of machine code an
-    exception becomes a `SystemError`; during compilation it breaks numba for the rest of the process. So handlers that
-    arrive in a compiler wait. Elsewhere they run at once; as their exception may be mistaken for one of a callback, it
-    is raised again by `check`, between chunks of steps, and by `leave`.
+    Python calls a handler at its next instruction, which may be one of numba. In Python code called by machine code, an
+    exception becomes a `SystemError`; during compilation, it breaks numba for the rest of the process. So the call of a
+    handler is delayed if a signal arrives in a compiler. Elsewhere the handler is called at once. As its exception may
+    be mistaken for that of a callback, `check`, between chunks of steps, and `leave` raise the exception again.
 
     Parameters
     ----------
     ctrl_c : bool
-        Whether to treat Python's own handler of Ctrl-C in the same way. Integrations replace that handler instead.
+        Whether to replace Python's own handler of Ctrl-C, too. `Interrupts` replaces that handler during integrations.
     """
 
     def __init__(self, ctrl_c: bool = False) -> None:
@@ -60,14 +60,14 @@ class SignalHandlers:
             raise
 
     def check(self) -> None:
-        """Call the waiting handlers; raise the exception of a handler, if there was one."""
+        """Call the delayed handlers; raise the exception of a handler, if there was one."""
         while self._waiting and self._raised is None:
             self._call(*self._waiting.pop(0))
         if self._raised is not None:  # not cleared, because the caller may catch a KeyboardInterrupt
             raise self._raised from None
 
     def leave(self) -> None:
-        """Restore the handlers, unless the user has set others meanwhile; then `check`. Call it once."""
+        """Restore the handlers, except those that the user has changed since; then call `check`. To be called once."""
         for number, handler in self._before.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)
@@ -83,22 +83,22 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
-    """Return a context for machine code that calls functions of the system in Python, where handlers may run."""
+    """Return a context for machine code that may call functions of the system in Python, see `SignalHandlers`."""
     return SignalHandlers(ctrl_c=True) if system.called_in_python else nullcontext()
 
 
 def within_a_users_function(frame: FrameType | None) -> bool:
-    """Return whether a frame is in a user's function that machine code or the search for events called."""
+    """Return whether a frame belongs to a call of a user's function by machine code or by the search for events."""
     while frame is not None:
-        if frame.f_code in USER_CALLERS:
+        if frame.f_code in CALLERS_OF_USER_CODE:
             return True
         frame = frame.f_back
     return False
 
 
 def within_a_compiler(frame: FrameType | None) -> bool:
-    """Return whether a frame is in a compiler, and not in a user's function that was called from there."""
-    while frame is not None and frame.f_code not in USER_CALLERS:
+    """Return whether a frame belongs to a call of a compiler, and not to a user's function called by the compiler."""
+    while frame is not None and frame.f_code not in CALLERS_OF_USER_CODE:
         if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
             return True
         frame = frame.f_back
@@ -106,7 +106,7 @@ def within_a_compiler(frame: FrameType | None) -> bool:
 
 
 def interrupted(error: BaseException) -> bool:
-    """Return whether the cause of an error, such as a `SystemError` of machine code, is a KeyboardInterrupt."""
+    """Return whether an error, such as a `SystemError` of machine code, is or was caused by a KeyboardInterrupt."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__

@@ -1,8 +1,8 @@
 """Describe singular positions: where steps crossed them, and how uncertain the motion is near them.
 
-Let s be the smallest singular value of the constraint Jacobian, and d its direction. The constraints determine q along
-d only to eps / s, for a rounding error eps. This uncertainty changes the Jacobian, so that velocities along d have
-errors of about eps / s^2.
+Let s be the smallest singular value of the constraint Jacobian, and d its right singular vector. For a rounding error
+eps, the constraints determine q along d only to eps / s. This uncertainty of q changes the Jacobian, so that velocities
+along d have errors of about eps / s^2.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,21 +19,23 @@ Array = NDArray[np.float64]
 Place = tuple[float, Array]  # time and state [q, v, ...]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
-LOST = 1e-2  # smallest over largest singular value, below which messages say that constraints lose rank
+LOST = 1e-2  # ratio of the smallest to the largest singular value below which messages say that constraints lose rank
 SAMPLES = 33  # number of positions between two states at which the ratio of singular values is evaluated
 SHOWN = 3  # largest number of singular positions that a message names
-DIFFERENCE = 1e-6  # relative length of the displacement for differences (gamma, and derivatives of the rows)
-# a row shorter than this share of its expected length (in proportion to its derivative) is short by its position only
-SHORT = 0.1
+# displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
+DIFFERENCE = 1e-6
+# smallest norm of a row, relative to the norm expected from the derivative of the row: a row with a smaller norm, which
+# is small at this position only, is scaled as if it had this norm
+MIN_ROW_NORM = 0.1
 # velocities turned if they changed by more than TURNED times the change that accelerations explain, and by more than
 # APPARENT times the tolerances
 TURNED, APPARENT = 3.0, 10.0
 
 
 def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int) -> str:
-    """Describe where steps crossed singular positions.
+    """Return sentences about the singular positions that steps crossed.
 
-    `crossings`: for each one the states before and after it; the latter may be missing if the run ended there.
+    `crossings`: states before and after each; the second is missing if the run ended between them, at the state `now`.
     """
     ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:SHOWN]}
     lost = {t: ratio for t, ratio in ratios.items() if ratio < LOST}
@@ -53,13 +55,13 @@ def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], 
 
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the smallest over the largest singular value of the `rank` independent rows; 1 if there are none."""
+    """Return the ratio of the singular value number `rank` of the rows to the largest one; 1 if there are no rows."""
     values = np.linalg.svd(system.rows(t, q), compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
 def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the smallest singular value of the `rank` independent rows; 0 if there are none."""
+    """Return the singular value number `rank`, in descending order, of the rows; 0 if there are no rows."""
     values = np.linalg.svd(system.rows(t, q), compute_uv=False)[:rank]
     return float(values[-1]) if len(values) else 0.0
 
@@ -67,7 +69,7 @@ def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: in
 def _least_ratio(
     system: ConstrainedSystem, before: Place, behind: Place, rank: int, ratio: Ratio = singular_ratio
 ) -> float:
-    """Return the smallest ratio of singular values along a cubic interpolation between two states."""
+    """Return the smallest value of `ratio` at SAMPLES positions of a cubic interpolation between two states."""
     n, (t0, first), (t1, last) = system.n_q, before, behind
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
@@ -80,9 +82,9 @@ def _least_ratio(
 def describe_turn(
     system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int, rtol: float, atol: Array
 ) -> str:
-    """Describe where velocities changed by more than accelerations explain; return "" if they did so nowhere.
+    """Describe where velocities changed by more than accelerations explain; return "" if there is no such place.
 
-    There other branches of the motion are within the tolerances, and the steps may have switched to another branch.
+    At such a place, other branches of the motion are within the tolerances, and the steps may have switched to one.
     """
     n = system.n_q
     for (t0, first), (t1, last), across in _passages(crossings, now):
@@ -113,7 +115,7 @@ def describe_turn(
 
 
 def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
-    """Return whether velocities of the last two states [q, v, a] differ by more than their accelerations explain."""
+    """Return whether velocities changed in the last step by more than accelerations explain; `rows`: [q, v, a]."""
     most = np.maximum.reduce  # array.max() makes three calls, which would slow down short repeated runs
     if times.size < 2:
         return False
@@ -123,7 +125,7 @@ def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
 
 
 def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
-    """Yield states before and after each passage, and whether steps led across; crossings may share a passage."""
+    """Yield states before and after each passage, and whether steps led across; it includes crossings that failed."""
     before: Place | None = None
     for first, *behind in crossings:
         before = first if before is None else before
@@ -156,15 +158,15 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
 
 
 def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return a ratio like `singular_ratio` that does not depend on the units of coordinates and rows."""
+    """Return the ratio of `singular_ratio` for scaled rows: it does not depend on the units of coordinates and rows."""
     values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
 def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return M and the rows, scaled to unit masses and unit lengths of rows, the lengths, and the units of coordinates.
+    """Return M and the rows, scaled to unit masses and unit norms, the divisors of rows, and the units of coordinates.
 
-    A row that is short at this position only is divided by its length at a displaced position.
+    The divisor of a row is its norm, or at least MIN_ROW_NORM times the norm expected from its derivative.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
@@ -176,7 +178,7 @@ def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
     except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
         bends = np.zeros(len(rows))
     if bends.max(initial=0.0) > 0.0:  # false for NaN
-        lengths = np.maximum(lengths, SHORT * lengths.max() * bends / bends.max())
+        lengths = np.maximum(lengths, MIN_ROW_NORM * lengths.max() * bends / bends.max())
     lengths[lengths == 0.0] = 1.0
     return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units
 
@@ -191,18 +193,19 @@ def _measured(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-WEAK = 1e-2  # relative to the largest singular value: rounding errors are estimated for smaller ones
-# ratio of pivots below which errors are always estimated, and factor from ratios of singular values to those of pivots
+WEAK = 1e-2  # singular value, relative to the largest one, up to which rounding errors along it are estimated
+# LEAST: ratio of pivots below which errors are always estimated. MARGIN: factor from ratios of singular values to
+# ratios of pivots, at most
 LEAST, MARGIN = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return the ratio of pivots below which rounding may change velocities by more than rtol allows."""
+    """Return the ratio of the smallest pivot to the largest below which rounding may change velocities beyond rtol."""
     return min(WEAK, max(LEAST, MARGIN * float(np.sqrt(ROUNDING / (UNTRUE * max(rtol, ROUNDING))))))
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
-    """Estimate the errors of velocities caused by rounding of positions, (n_q,); NaN if callbacks fail near q."""
+    """Return estimated errors (n_q,) of velocities caused by rounding of positions; NaN if callbacks fail near q."""
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
@@ -218,7 +221,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             bend = np.abs(np.subtract(*(system.rows(t, each) for each in beside)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # rows may be short at this position only: scale the rounding error of a constraint by its rows some way off
+        # a row may be small at this position only: the rounding error of its constraint is that of a displaced position
         away = np.abs(rows) + (bend * (np.abs(rows).max() / bend.max()) if bend.any() else 0.0)
         rounding = ROUNDING * np.sqrt((away * away) @ (q * q))
         errors = np.maximum(errors, np.abs(way * (u @ turn)) * np.sqrt((u * u) @ (rounding * rounding)) / value**2)
@@ -226,7 +229,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
-    """Describe a start that the tolerances do not distinguish from a singular position; return "" at other starts."""
+    """Return a warning for a start that the tolerances do not distinguish from a singular position, else ""."""
     if rank == 0 or surely_above(WEAK, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)
@@ -244,9 +247,9 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
 
 
 def _displacement_to_singular(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
-    """Estimate the displacement to the nearest singular position, (n_q,), to first order; not finite if unknown.
+    """Return an estimated displacement (n_q,) to the nearest singular position, to first order; not finite if unknown.
 
-    Among the directions that the other constraints allow, it has the one in which the smallest singular value changes
+    Its direction is the one, among those that the other constraints allow, in which the smallest singular value changes
     most.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))

@@ -1,4 +1,4 @@
-"""Set up kits and workspaces: callbacks with flags, the static form of large systems, and arrays for all kernels."""
+"""Create kits (callbacks, flags and steps), workspaces (arrays for all kernels), and static forms of large systems."""
 
 from typing import Any, NamedTuple
 
@@ -40,9 +40,9 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# displacement of coordinates and velocities, relative to max(1, |value|), that reveals which forces depend on them
+# displacement of a coordinate or velocity, relative to max(1, |value|), to find the forces that depend on it
 DISPLACEMENT = 1e-3
-# entries and operations, relative to those of dense factors, above which sparse factors of Newton's matrix do not pay
+# numbers of entries and operations, relative to those of dense factors, above which Newton's matrix is not sparse
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -55,10 +55,10 @@ def newton_form(
     bodies: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Create the program that factorizes Newton's matrix, see sparse_lu.py, and count the groups of its columns.
+    """Return the program that factorizes Newton's matrix, see sparse_lu.py, and the number of groups of its columns.
 
-    The columns of a group are computed from one difference of forces. `bodies`: coordinates of each body;
-    `stiff`: constraint rows of `_stiff_rows`. Return None if the matrix is not sparse, or has no program.
+    The columns of a group are computed from one difference of forces. `mass`, `jacobian`: indices of nonzero entries.
+    `bodies`: coordinates of each body. `stiff`: rows of `_stiff_rows`. Return None if sparse factors do not pay.
     """
     entries: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
@@ -68,7 +68,7 @@ def newton_form(
         q = q0 + share * size * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
-        except Exception:  # outside the domain of the callbacks; missed entries are found during the run
+        except Exception:  # q is outside the domain of the callbacks; entries missed here are found during the run
             continue
         if len(entries) > max_entries:
             return None
@@ -83,9 +83,9 @@ def newton_form(
 def _derivative_entries(
     system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, max_entries: float
 ) -> set[tuple[int, int]]:
-    """Return the indices of the nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv and of their transposes.
+    """Return the indices of nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and of their transposes.
 
-    The search stops when there are more than `max_entries` entries.
+    Further columns are not searched once there are more than `max_entries` entries.
     """
 
     def reaction(q: Array) -> Array:
@@ -109,33 +109,34 @@ def _derivative_entries(
     return entries
 
 
-SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
-# share of a row's length along directions without mass, above which the row makes M definite in one
-MIN_SHARE_ALONG = 1e-3
-MIN_SIZE_NEWTON = 1.6  # number of coordinates, in units of LARGE, from which on Newton's matrices are sparse
-# entries and operations, relative to those of dense factors, above which the static form does not pay
+SINGULAR = 1e-10  # eigenvalue of a body's M, relative to the largest one, up to which its direction counts as massless
+# norm of a row's component along massless directions, relative to the row's norm, above which the row gives one of them
+# a mass
+MIN_FRACTION_ALONG = 1e-3
+MIN_SIZE_NEWTON = 1.6  # number of coordinates, relative to LARGE, from which on Newton's matrices are sparse
+# numbers of entries and of operations, relative to those of dense factors, above which the static form is not used
 MAX_STATIC_SHARE = 0.05
 
 
 class StaticForm(NamedTuple):
-    """Static form of a large system: the program of its sparse factorization, and the data that a workspace needs."""
+    """Static form of a large system: the program of its sparse factorization, and data for workspaces."""
 
     program: NDArray[np.int32]
-    static: Static
-    mass: Entries
-    pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else empty
-    mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else empty
+    static: Static  # sizes of arrays in a workspace
+    mass: Entries  # row and column indices of the nonzero entries of M
+    pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else (0, n_q)
+    mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else (0, 0)
     newton_arguments: tuple[Any, ...]  # arguments of `newton_form` after t0 and q0
-    newton: NDArray[np.int32] | None = None  # program of Newton's matrix, once it is needed
-    n_groups: int = 0  # number of groups of columns of Newton's matrix, which is the number of displaced forces
+    newton: NDArray[np.int32] | None = None  # program of Newton's matrix; None until a plan needs it
+    n_groups: int = 0  # number of groups of columns of Newton's matrix, each computed from one difference of forces
 
     def matrix_cost(self) -> float:
-        """Estimate the cost of Newton's matrix and its factors, in evaluations of accelerations."""
+        """Return the estimated cost of Newton's matrix and its factors, in evaluations of accelerations."""
         assert self.newton is not None
         return self.n_groups + float(self.newton[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def n_matrices(self, matrices: int) -> int:
-        """Return the number of floats of sparse Newton's matrices, in place of `matrices` dense ones of a plan."""
+        """Return the number of floats for Newton's matrices in sparse form, given a plan's number of dense matrices."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -146,7 +147,7 @@ class StaticForm(NamedTuple):
 
 
 def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
-    """Return the static form of a system for runs by some plans; None if a plan cannot use it, or it does not pay."""
+    """Return the static form of a system for runs with `plans`; None if a plan cannot use it, or it does not pay."""
     if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
         return None
     has_gamma = "gamma" in system.given or system.functions.gamma_program.size > 0
@@ -159,7 +160,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
-    """Return a copy of `form` with the program of Newton's matrix; None if there is no program, or it does not pay."""
+    """Return a copy of `form` with the program of Newton's matrix; None if there is none, or it does not pay."""
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
     cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
@@ -193,9 +194,9 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body in space: of bodies that joints name, and of others with the same layout.
+    """Return the coordinates of each body to which a joint refers and, if these have seven each, of all bodies.
 
-    A joint names only one of its two bodies, so that some body, as at the end of a chain, may be named by no joint.
+    A joint refers to one of its two bodies only, so that no joint may refer to a body at the end of a chain.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - own[0] for j in own) for own in coordinates_by_joint}
@@ -209,7 +210,7 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, bodies: list[tuple[int, ...]]
 ) -> list[int]:
-    """Find constraint rows g of single bodies, such as the norm of Euler parameters, that make a singular M definite.
+    """Return indices of rows g of single bodies, such as the norm of Euler parameters, that make a singular M definite.
 
     g g^T may have entries only where M has entries, see sparse_ldl.py. No more rows than necessary are returned: other
     rows of single bodies, such as those of a hinge on the ground, are treated like the rows of joints.
@@ -240,14 +241,14 @@ def _stiff_rows(
             for j, value in own:
                 row[index_in_body[j]] += value
             along = free[body] @ row
-            if np.linalg.norm(along) > MIN_SHARE_ALONG * np.linalg.norm(row):
+            if np.linalg.norm(along) > MIN_FRACTION_ALONG * np.linalg.norm(row):
                 stiff_rows.append(i)
                 free[body] = np.linalg.svd(along[None, :])[2][1:] @ free[body]
     return stiff_rows
 
 
 def _without_mass(block: Array) -> Array:
-    """Return the directions along which a body has no mass, as rows; `block` is its part of M."""
+    """Return the directions along which a body has no mass, as rows of an array; `block`: the body's block of M."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)
@@ -255,12 +256,12 @@ def _without_mass(block: Array) -> Array:
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
-    """Return whether a matrix has so few entries that it pays to search for an elimination order."""
+    """Return whether a matrix of a system has so few entries that it pays to search for an order of elimination."""
     return n_entries <= MAX_STATIC_SHARE * n_q * n_q + 24 * n_q
 
 
 def _dense_work(n_q: int, n_c: int) -> float:
-    """Estimate the multiplications of one evaluation by Schur's complement."""
+    """Return the estimated number of multiplications of one evaluation by a dense Schur complement."""
     return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
 
 
@@ -270,7 +271,7 @@ def _entries_of(pattern: Array) -> Entries:
 
 
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return a matrix with 1 at the entries of M that are not zero at a position or, if M is variable, near it."""
+    """Return a matrix with 1 at entries of M that are not zero at q0 or, if M is variable, at positions near q0."""
     pattern = np.zeros((system.n_q, system.n_q))
     size = np.maximum(np.abs(q0), np.abs(q0).max())
     directions = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
@@ -283,14 +284,14 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     return pattern
 
 
-GAMMA_ACCURACY = 1e-11  # smallest relative error that a gamma computed by differences of C_q and C_t can have
-MOST_KITS = 16  # largest number of kits that are cached with a system
+GAMMA_ACCURACY = 1e-11  # smallest relative error that may be required of a gamma computed by differences of C_q and C_t
+MOST_KITS = 16  # largest number of kits in the cache of a system
 
 
 def kit_of(
     system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
 ) -> Kit:
-    """Return the kit of a system: callbacks, flags that choose the linear algebra, and the steps of a plan."""
+    """Return a kit of a system: callbacks, flags that choose the form of linear algebra, and the steps of a plan."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     if static is not None:
@@ -310,7 +311,7 @@ def kit_of(
 
 
 def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
-    """Return the kit of a system in the static form."""
+    """Return a new kit of a system for the static form."""
     from twoloop.kernels.evaluation.sparse_inner_loop import sparse_inner_loop
 
     flags = system.functions.flags.copy()
@@ -324,7 +325,7 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return the flags that choose the linear algebra at a position; the array is cached: do not change it."""
+    """Return the flags that choose the linear algebra for a start at q0; the cached array must not be changed."""
     definite = has_definite_mass(system, t0, q0)
     key = ("flags", system.functions.flags.tobytes(), definite)
     flags, sparse = system.remembered(key, lambda: _flags(system, t0, q0, definite))
@@ -338,7 +339,7 @@ def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
 
 
 def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
-    """Return flags that choose dense or banded algebra, and whether sparse factors would be faster."""
+    """Return new flags that choose dense or banded algebra, and whether sparse factors would be faster."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
         flags[DIAGONAL_MASS] = is_diagonal(system.mass(t0, q0))
@@ -352,7 +353,7 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> t
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
-    """Return whether sparse factors would be faster than dense ones; M must be definite on allowed velocities."""
+    """Return whether sparse factors would be faster than dense ones, if M is definite on the allowed velocities."""
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
@@ -362,7 +363,7 @@ def is_diagonal(mass: Array) -> bool:
 
 
 def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
-    """Return the kit for the given flags and the steps of a plan; the system caches it for the next run."""
+    """Return the kit for some flags and the steps of a plan; it is cached with the system for later runs."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     numbers = (plan.numbers, plan.own_numbers)
@@ -384,12 +385,12 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
 
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return the step of a plan, and the two steps between which `auto` switches; the second is not loaded yet."""
+    """Return the step of a plan, and the first and second step of a pair of methods; the second may not be loaded."""
     return loaded(plan.step), loaded(plan.first), without_loading(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:
-    """Copy a kit with flags of its own, which a run may change; this takes a tenth of the time of a new kit."""
+    """Return a copy of a kit with its own flags, which a run may change; a new kit would take ten times as long."""
     other, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.offsets["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
@@ -408,9 +409,9 @@ def workspace(
     static: StaticForm | None = None,
     matrices: int = 0,
 ) -> common.Work:
-    """Create a workspace for the ranks of C_q and of [C_q; A] (None: full rank).
+    """Return a new workspace for a run from q0; `ranks`: of C_q and of [C_q; A] (None: full rank).
 
-    `pattern`: 1 at the entries of [C_q; A]. `matrices`: number of dense matrices that the plan needs.
+    `pattern`: 1 at the entries of [C_q; A], else 0. `matrices`: number of dense matrices that the plan needs.
     """
     flags = kit.flags
     reduced, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
@@ -435,7 +436,7 @@ def prepare_workspace(
     reuse: float,
     static: StaticForm | None = None,
 ) -> common.Work:
-    """Reset a workspace, which may have been used by another run, for a new run; return it."""
+    """Reset a workspace, which another run may have used, for a run from q0; return the workspace."""
     given = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
@@ -447,7 +448,7 @@ def prepare_workspace(
 
 
 def _set_constants(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
-    """Set the constant parts of a workspace in the static form."""
+    """Fill those arrays of a workspace in the static form that are constant during a run."""
     work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
     work.dependent[:] = work.independent[:] = np.arange(system.n_q)
     work.counts[:] = 1.0
