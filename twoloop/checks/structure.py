@@ -76,7 +76,7 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
     """Return whether `rank` singular values certainly exceed `ratio` times the largest, by bounds, without an SVD."""
-    from twoloop.kernels.linalg.rank import singular_values_exceed, norm_of_inverse
+    from twoloop.kernels.linalg.rank import norm_of_inverse, singular_values_exceed
 
     if rank == len(rows) > 0 and entry_point(singular_values_exceed)(
         np.ascontiguousarray(rows), ratio, np.empty((rank, rank))

@@ -289,7 +289,7 @@ def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern,
       the sizes near these positions
     - shifts: displacements of q, relative to its size, at which nonzero entries of rows are also recorded
     - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
-    - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results of callbacks, and scratch
+    - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results, and scratch
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # ends of the parts of `results`
