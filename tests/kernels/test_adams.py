@@ -21,7 +21,7 @@ def test_the_nodes_integrate_what_they_must():
     s, w = adams.NODES, adams.WEIGHTS
     for power in range(2 * len(s)):
         assert abs(w @ s**power - 1.0 / (power + 1)) < 1e-15
-    np.testing.assert_allclose(adams.REST, w * (1.0 - s), rtol=1e-15)
+    np.testing.assert_allclose(adams.POSITION_WEIGHTS, w * (1.0 - s), rtol=1e-15)
 
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-10])

@@ -196,17 +196,17 @@ def add_product(work, target, x, y, sign):
 
 
 @merged
-def _larger(work, most, error, factor, one, other, atol, rtol):
-    """Return the new value of `most` in one lane, see `enlarge`; vectors are given by indices in `work`."""
-    scale = atol + rtol * max(abs(work[one]), abs(work[other]))
-    return max(work[most], abs(work[error]) * work[factor] / scale)
+def _larger(work, target, error, factor, before, after, atol, rtol):
+    """Return the new value of `target` in one lane, see `enlarge`; arguments are indices in `work`."""
+    scale = atol + rtol * max(abs(work[before]), abs(work[after]))
+    return max(work[target], abs(work[error]) * work[factor] / scale)
 
 
 @compiled
-def enlarge(work, most, error, factor, one, other, atol, rtol):
-    """Set the vector `most` to |error| factor / (atol + rtol max(|one|, |other|)) in lanes in which that is larger."""
+def enlarge(work, target, error, factor, before, after, atol, rtol):
+    """Set `target` to |error| factor / (atol + rtol max(|before|, |after|)) in lanes in which that is larger."""
     for k in range(0, LANES, 4):
-        m, e, f, x, y = most * LANES + k, error * LANES + k, factor * LANES + k, one * LANES + k, other * LANES + k
+        m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k
         m0 = _larger(work, m, e, f, x, y, atol, rtol)
         m1 = _larger(work, m + 1, e + 1, f + 1, x + 1, y + 1, atol, rtol)
         m2 = _larger(work, m + 2, e + 2, f + 2, x + 2, y + 2, atol, rtol)
@@ -245,9 +245,9 @@ def _subtract(work, target, x, y, imaginary, imaginary_y):
 
 
 @merged
-def _exchange(work, one, other, k):
-    """Exchange two vectors in lane k."""
-    i, j = one * LANES + k, other * LANES + k
+def _exchange(work, first, second, k):
+    """Exchange the numbers of two vectors in lane k."""
+    i, j = first * LANES + k, second * LANES + k
     work[i], work[j] = work[j], work[i]
 
 

@@ -306,10 +306,10 @@ def _correct(settings, method_options, s, work):
 
 
 @merged
-def _store_largest(work, most, sums, n):
-    """Set the vector `most` to the largest absolute value of n vectors in lanes in which that is larger, or NaN."""
+def _store_largest(work, target, begin, n):
+    """Set the vector `target` to the largest absolute value of the n vectors from `begin` on, if larger, or to NaN."""
     for i in range(n * LANES):
-        size, at = abs(work[sums * LANES + i]), most * LANES + i % LANES
+        size, at = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if size > work[at] or size != size:
             work[at] = size
 

@@ -31,7 +31,7 @@ RESTART_AFTER = 3  # number of successive rejected steps after which the method 
 
 # eight Gauss nodes on [0, 1] and their weights: exact for c_i and (1 - s) c_i up to i = 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
-REST = WEIGHTS * (1.0 - NODES)  # weights of c_i in the integral of (1 - s) c_i
+POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values c_i at NODES in the integral of (1 - s) c_i
 
 
 def _error_constants():
@@ -73,7 +73,7 @@ def memory_size(n_q: int) -> int:
 
 
 def _padded(n_q: int) -> int:
-    """Return the next multiple of 4."""
+    """Return n_q, rounded up to a multiple of 4."""
     return (n_q + 3) // 4 * 4
 
 
@@ -150,13 +150,13 @@ def _compute_coefficients(memory, h, k):
         beta[i + 1] *= beta[i]
     for m in range(8):
         c[m] = 1.0
-    before = 0.0  # psi_0
+    before = 0.0  # psi_i(n), at first psi_0 = 0
     for i in range(k + 2):
         velocity_integral = 0.0
         position_integral = 0.0
         for m in range(8):
             velocity_integral += WEIGHTS[m] * c[m]
-            position_integral += REST[m] * c[m]
+            position_integral += POSITION_WEIGHTS[m] * c[m]
         g[i], G[i] = velocity_integral, position_integral
         inverse = 1.0 / new_psi[i]
         for m in range(8):
@@ -166,7 +166,7 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
-    """Store the predicted state in q1 and v1, and in the table `new` the differences for an exact prediction."""
+    """Store the predicted state in q1 and v1, and in `new` the differences that follow if the prediction is exact."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
@@ -291,7 +291,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     old, new = _table(memory, n, memory[WHICH]), _table(memory, n, 1.0 - memory[WHICH])
     _compute_coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
-    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # the next order if an evaluation fails
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # order of the next attempt if an evaluation in this attempt fails
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

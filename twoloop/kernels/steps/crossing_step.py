@@ -222,7 +222,7 @@ def _choose_partition_at_end(f, w, t, q, pivot, near):
 
 @compiled
 def _weights_to_start(b, c, c0, weights_v, weights_q):
-    """Store the weights (S) of accelerations in their integral, weights_v, and double integral, weights_q, to c0."""
+    """Store weights (S) of the accelerations in their integral (weights_v) and double integral (weights_q) to c0."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):
@@ -375,7 +375,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(state[2 * n : 3 * n], a[j])
     left_out[:] = 0.0
     change_before, converged, moved, n_kept = np.inf, False, 0.0, S
-    last_0, last_1, last_2 = -1, -1, -1  # nodes from which the first sweep extrapolates
+    last_0, last_1, last_2 = -1, -1, -1  # the last evaluated nodes, from which the first sweep extrapolates; -1: none
     for sweep in range(MAX_SWEEPS):
         change, moved = 0.0, 0.0
         chooses = sweep in (0, 2, FEW_SWEEPS)  # whether to choose anew which nodes are left out

@@ -192,7 +192,7 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
 
 MAX_ITERATIONS = 8  # number of Newton iterations after which a stage has failed
 GROWTH = 2.0  # largest ratio of successive corrections with which Newton's method goes on
-LINEAR_FACTOR = 0.01  # factor on the tolerance of Newton's method with derivatives by differences: linear convergence
+LINEAR_FACTOR = 0.01  # factor on the tolerance of Newton's method if derivatives by differences make it converge slowly
 MAX_CONTRACTION = 0.1  # largest ratio of successive corrections with which derivatives by differences are reused
 VELOCITY_WEIGHT = 0.1  # weight of the position error that a correction of velocities causes, in the convergence test
 
@@ -338,8 +338,8 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
 # method is unstable for vibrations, see tests/kernels/test_diagonal.py
 N_FILTERS = 3
 
-# sum of `lower` times the stage accelerations, relative to the range of these accelerations, above which
-# `_error_at_jumps` does not reduce its estimate; largest value at a jump
+# largest value, for a jump of the accelerations, of the sum of `lower` times the stage accelerations, relative to the
+# range of these accelerations; from this value on, `_error_at_jumps` does not reduce its estimate
 MAX_JUMP_RATIO = 0.174
 
 
@@ -522,7 +522,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[DIAGONAL_OFFSET])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # F at this state would contain the stiffness times Newton's residual
+        copy(A_stage[s - 1], a_end)  # not F at this state, which contains the stiffness times Newton's residual
         memory[at.FRESH] = 0.0
 
 

@@ -64,7 +64,7 @@ from twoloop.kernels.linalg.dense import copy
 # short forces, and the defect is evaluated between nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
-START_CONTRACTION = 0.12  # target of the contraction rho in the first step, within the limits of collocation_code.py
+START_CONTRACTION = 0.12  # contraction rho for which another first step size is guessed, if a guess is not accepted
 MAX_STARTS = 4  # largest number of guesses of the first step size
 DIVERGED_FACTOR = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size that the error allows
@@ -82,7 +82,7 @@ CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evalua
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
-LEAST_TREND = 0.4  # smallest ratio of the step sizes that the errors of two successive steps allow, in extrapolations
+LEAST_TREND = 0.4  # lower bound of the trend, the ratio of the step sizes that the errors of successive steps allow
 MAX_EXTRAPOLATION = 3.0  # largest ratio of the step size that the error allows to the actual step size
 _places = merged(places)
 
@@ -159,7 +159,7 @@ def _collocate(f, w, options, data, tolerances, t, h, state):
     limited = data[field.CURVED] < MIN_CURVED and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if limited else -1.0))
     factor = data[field.FACTOR]
-    # extrapolate the step size that the error allows: its ratio from step to step mostly changes little
+    # extrapolate the step size that the error allows: its trend mostly changes little from step to step
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVED] >= MIN_CURVED:
         trend = 1.0 if first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)

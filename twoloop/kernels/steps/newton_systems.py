@@ -277,7 +277,7 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
         for row in range(m):
             i = w.independent[row]
             Jq[row, column] = (a_new[i] - a[i]) / displacement
-    # displace all velocities at once: if nothing changes, no differences are needed
+    # displace all velocities at once: if no acceleration changes, J_v is zero
     copy(q, q_moved)
     for column in range(m):
         j = w.independent[column]
@@ -308,7 +308,7 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense(w, memory, s, which, z, matrix):
-    """Store the factors of I - z^2 J_q - z J_v in `matrix`, and its pivots at `which` of `pivots_of`; return a code."""
+    """Store the factors of I - z^2 J_q - z J_v in `matrix`; return a code. `which`: argument k of `pivots_of`."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
     damped = memory[DAMPED] == 1.0
@@ -447,7 +447,7 @@ def _banded_derivatives(f, w, memory, s, t, q, v):
     code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(matrix_storage(w, n, BY_Q), n, b))
     if code != DONE:
         return code
-    # displace all velocities at once: if nothing changes, no differences are needed
+    # displace all velocities at once: if the residual does not change, D is zero
     for j in range(n):
         moved[j] = displace_unequally(v[j], j)
     _banded_residual(f, w, t, q, moved)
@@ -521,7 +521,7 @@ def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
 def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
     """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0.
 
-    The vectors are the first n_dof numbers of the arrays e_q and e_v (n_q).
+    These vectors are the first n_dof numbers of the arrays e_q and e_v (n_q).
     """
     n = w.Q.size
     b = f.flags[BANDWIDTH]
@@ -778,7 +778,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def _factor_system(f, w, memory, s, k, z):
-    """Factor the complex system of eigenvalue number k, l, for z = h l; return a code."""
+    """Factor the complex system for z, the step size times eigenvalue number k of A; return a code."""
     n = w.Q.size
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:

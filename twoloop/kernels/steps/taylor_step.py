@@ -120,7 +120,7 @@ def series_of(memory, order, n, which):
 
 
 @merged
-def interior(X, Y, K, total):
+def sum_of_products(X, Y, K, total):
     """Store the sum of X[j, m] Y[K - j, m] over 0 < j < K in total[m], for eight m at once."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
@@ -158,7 +158,7 @@ def _gather(options, sums, groups, g, more, values, out):
 
 @merged
 def _sum(options, sums, scale, values, out):
-    """Store `scale` times all sums of `values` in a list, without their constants, in `out` at the indices PLACES."""
+    """Store `scale` times each sum of a list, without its constant, in `out` at its index in PLACES."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     places = _integers(options, sums + PLACES)
     for o in range(column.size):
@@ -296,7 +296,7 @@ def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
 
 
 @merged
-def take_order(K, unit, N, series, a):
+def integrate_coefficients(K, unit, N, series, a):
     """Store the coefficients of order K of v and K + 1 of q, computed from those of order K - 1 of accelerations, a."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
@@ -333,13 +333,13 @@ def expand(f, w, options, memory, t, state, unit):
         K = k + 1
         if K > 1:
             N[K, 0] = 0.0
-        interior(X1, Y1, K, total1)
+        sum_of_products(X1, Y1, K, total1)
         _next_coefficients(options, EARLY, K, N[K], N[K, first:], X1[K], Y1[K], X1[0], Y1[0], total1)
         _sum(options, ROWS, -K / unit, N[K], c)
         if k == 0:
             begin_operations(options, LATE, N[0], N[0, second:], X2[0], Y2[0])
         else:
-            interior(X2, Y2, k, total2)
+            sum_of_products(X2, Y2, k, total2)
             _next_coefficients(options, LATE, k, N[k], N[k, second:], X2[k], Y2[k], X2[0], Y2[0], total2)
         _sum(options, BALANCE, 1.0, N[k], r)
         if k == 0:
@@ -352,7 +352,7 @@ def expand(f, w, options, memory, t, state, unit):
             f.inner(f, w, SOLVE, t, r, c, 0.0, a, lam)
         else:
             solve_both(f, w, r, c, a, lam)
-        take_order(K, unit, N, series, a)
+        integrate_coefficients(K, unit, N, series, a)
         _complete(options, EARLY, N[K], Y1[K])
         _complete(options, LATE, N[k], Y2[k])
     return end_series(w, order, series)
@@ -364,13 +364,13 @@ TARGET_DISTANCE = 0.3
 # a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
 # times the defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
-NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step, within which no force changes
+NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to its size, that is too short for a force to change
 GOLDEN = 0.6180339887498949  # fractional parts of its multiples are evenly distributed between 0 and 1
 MAX_DEFECT = 1e300  # replaces an infinite defect, in a step within which a function has no value
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
 GROWTH = 5.0  # largest ratio of successive step sizes: the unit of the coefficients is the previous step size
-MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that no power of it overflows
-TOO_SHORT = 2.0  # error that rejects a first step because the series allows a longer one
+MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of it do not overflow
+TOO_SHORT = 2.0  # error that is returned to reject a first step, because the series allows a much longer step
 
 
 @merged
@@ -397,7 +397,7 @@ def _allowed_step(tolerances, series, unit, order, n):
         of_v = 1.0 / (atol * unit + rtol * abs(series[n + j]))
         last = max(last, abs(series[row + j]) * max(of_q, order * of_v))
         before = max(before, abs(series[row_before + j]) * max(of_q, (order - 1) * of_v))
-    least = -np.inf  # logarithm of 1 / length
+    least = -np.inf  # logarithm of the reciprocal of the result
     if last > 0.0:
         least = np.log(last) / order
     if before > 0.0:
