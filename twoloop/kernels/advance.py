@@ -66,8 +66,7 @@ from twoloop.kernels.linalg.dense import copy
 # error of a rejected step, in tolerances, above which a force is assumed to change suddenly within the step
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
-# smallest number of accepted steps after which a short next step ends the trial of a method: one is too few, because
-# the first step size is a guess
+# smallest number of accepted steps after which a short next step ends the trial of a method: the first size is a guess
 FIRST_JUDGED = 2
 
 

@@ -113,10 +113,7 @@ def _limit_steps(control, tolerances, span, longest, within):
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
 def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longest, within):
-    """Return the first step size (s) of a run from `state` at t to t1; if `longest` > 0, also store limits.
-
-    The limits are those of `_limit_steps`. `smallest` is an argument of `_first_step`.
-    """
+    """Return the first step size from `state` at t, s, by `_first_step`; if `longest` > 0, also call `_limit_steps`."""
     if longest > 0.0:
         _limit_steps(control, tolerances, t1 - t, longest, within)
     return _first_step(state, n, t, t1 - t, smallest)
@@ -354,8 +351,7 @@ def _velocities_jumped(b, k, n):
 def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     """Store the report, times and steps in b.report; return n_steps if nothing needs a check, else UNUSUAL.
 
-    The run has n_rows states after the first, and n_steps steps. `region`: bounds of the states for IN_CHECKED_REGION,
-    see `_all_within`.
+    The run has n_rows states after the first, and n_steps steps; `region` are the bounds for IN_CHECKED_REGION.
     """
     jumped = n_rows > 0 and _velocities_jumped(b, n_rows, w.Q.size)
     inside = region.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, region)
@@ -383,8 +379,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consi
     """Start a run from t to t1, and take the first steps; return the number of steps, REFUSED, IN_DOUBT or UNUSUAL.
 
     If a start is repeated bit for bit, the second run still checks the start, and then saves the data of the started
-    run. From the third run on, these data are restored without a check. For other arguments see `_start_run` and
-    `_write_report`.
+    run. From the third run on, these data are restored without a check.
     """
     f.flags[FORM] = int(b.constants[EQUATION_FORM])  # the run before may have changed the form
     same, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]

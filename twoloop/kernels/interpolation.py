@@ -40,12 +40,8 @@ RESIDUAL, WEAK_PIVOT = 10.0, 0.05
 
 @merged
 def _window(low, high, i, last):
-    """Return the indices of the first and last state that the polynomial for the interval from state i interpolates.
-
-    The interval is in the middle of these states, except near the states `low` and `high`, which limit them. If `fill`
-    has computed states within the interval, the polynomial interpolates the states i to `last`.
-    """
-    if last > i + 1:  # `fill` has computed interior states of the interval
+    """Return the first and last state of the polynomial for the interval from state i: centred, within low and high."""
+    if last > i + 1:  # `fill` has computed interior states of the interval: the polynomial interpolates these alone
         return i, last
     size = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - size // 2, high + 1 - size))
@@ -84,8 +80,8 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
     """Store in q and v the values at t[i] + s h of the polynomials of an interval of duration h, by Horner's scheme.
 
-    (z, c, size) are nodes, coefficients and number of coefficients of the polynomial for q, (z_v, c_v, size_v) those of
-    the polynomial for v, which is used if `kind` is APART; otherwise v is the derivative of q.
+    (z, c, size) are the nodes, coefficients and number of coefficients for q; (z_v, c_v, size_v) are those for v if
+    `kind` is APART. Otherwise v is the derivative of q.
     """
     n = q.size
     for m in range(n):
@@ -128,9 +124,8 @@ def _change(tolerances, v_before, v):
 def _is_singular(f, w, t, states, i, last, time, q, change):
     """Return whether q at `time`, within an interval, is so near a singular position that rounding explains `change`.
 
-    `change` is the change of velocities by the projection, in tolerances. Rounding causes this change if the smallest
-    pivot at q is very small, or small relative to the pivots at the ends of the interval, or if the polynomials'
-    velocities nearly satisfy the constraints.
+    `change` is the change of velocities by the projection, in tolerances. Rounding explains it if the smallest pivot at
+    q is very small, in itself or relative to those at the ends of the interval, or if velocities nearly fit the rows.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):
@@ -147,8 +142,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
     A projection fails if dependent coordinates cannot be determined, or if rounding determines the projected velocities
     near a singular position: row p then has the values of the polynomials. `groups` is the table of intervals described
-    in data/indices.py; `z` (nodes) and `coefficients` of two polynomials are scratch. `tolerance` is that of the
-    projection, `tolerances` are those of the run.
+    in data/indices.py; `z` (nodes) and `coefficients` are scratch; `tolerance` is that of the projection.
     """
     n = w.Q.size
     half = z.size // 2

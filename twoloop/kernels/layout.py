@@ -260,10 +260,7 @@ def _layout(
 
 
 def _array_ranges(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Return (first offset, end, shape) of each array, and the length of their memory, counted in numbers.
-
-    Each array begins at the start of a cache line.
-    """
+    """Return (first offset, end, shape) of each array, at the start of a cache line, and the length of the memory."""
     ranges, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)

@@ -1,8 +1,7 @@
 """Detect sudden changes of forces, C_t and b ahead of a step, such as gusts, blows and switches.
 
 A step evaluates the equations at its stages only, and may pass over a force that acts between two stages. So forces,
-C_t and b are sampled at times ahead of the step. A sample calls single callbacks, and costs less than an evaluation of
-the equations.
+C_t and b are sampled ahead of the step, at less cost than by evaluations of the equations.
 
 - A force, C_t or b is smooth if the second differences of its samples are small relative to the range of the samples
   (after the straight line from the first to the last sample is subtracted). A change within one or two samples makes
@@ -13,15 +12,13 @@ the equations.
 - All other samples are samples in time alone, at the state at which the step begins. Their spacing is also limited to a
   fraction of the step size.
 - Two durations are recorded: the shortest time between two changes, and the shortest time during which a value differs
-  from the values before and after. If the spacing of samples exceeded this time, equally short changes may have been
-  missed, and a message says so.
+  from the values before and after. With a wider spacing, equally short changes may be missed: a message says so.
 
 A jump of C_t or b, as at the end of a ramp in a drive, changes velocities as an impulse does. Methods that restore the
 dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So if velocities
 change in a step by more than accelerations explain, C_t and b are sampled at thirteen times within the step. The
 twelfth difference of these samples is almost zero if C_t and b are smooth on the scale of the step, and falls by 2^12
-when the interval is halved. If C_t or b jumps, the twelfth difference stays as large as the jump in one half of the
-interval, however short the interval is.
+when the interval is halved. If C_t or b jumps, the difference stays as large as the jump in one half of the interval.
 """
 
 import numpy as np
@@ -176,8 +173,7 @@ SOONEST = 5e-5
 STEEPER = 2.0  # smallest ratio of a sudden change to the changes before and after; in a smooth slope it is smaller
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_IN_SHORT = 4  # number of samples within a short step
-# change of an acceleration while a velocity changes by its tolerance, relative to the largest acceleration, above which
-# accelerations count as decaying
+# change of an acceleration, relative to the largest, while a velocity changes by its tolerance, that counts as decay
 DECAYED = 0.5
 AT_CHANGE = 0.01  # largest distance of a step's beginning from a change at which it begins, in spacings of samples
 LARGEST = N_SAMPLES + 1  # index in w.changes of the largest absolute values so far; the rows before are samples

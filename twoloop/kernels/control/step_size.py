@@ -13,9 +13,8 @@ Errors that the embedded formula does not show are measured in two ways:
   sign, as along a motion only at a singular position. So if the sign changes in a step, the prediction must be nearly
   exact, as in short steps through a singular position.
 - `defect_ratio` is the defect of a Taylor step: the difference between the accelerations of the series and those of the
-  equations at the same states. A series contains the forces at the beginning of the step, to all orders, but no later
-  sudden change of the forces. So the equations are evaluated at the end of the step, and within the step at times that
-  are at most tolerances[LOOK] apart.
+  equations at the same states. A series contains the forces at the beginning of the step, but no later sudden change.
+  So the equations are evaluated at the end of the step, and within it at times at most tolerances[LOOK] apart.
 """
 
 import numpy as np
@@ -214,9 +213,8 @@ ROUNDING = 1e-13  # largest defect that counts as a rounding error, relative to 
 def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the defect |predicted - a| at the end of a step of size h, relative to the largest allowed defect.
 
-    The tolerances of q and v determine the allowed defect. The result is infinite if a defect is not finite. The defect
-    of a series of order `order` grows as the highest power of the time: its integral over the step is h / order times
-    its value at the end.
+    The tolerances of q and v determine the allowed defect. The defect of a series of order `order` grows as the highest
+    power of the time: its integral over the step is h / order times its value at the end. Infinity: it is not finite.
     """
     rtol, share, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

@@ -8,8 +8,7 @@ errors count tenfold, and replaces the explicit method if it costs less per seco
 
 A trial also begins at smaller h rho if
 
-- rho is far above the rates that the motion shows: a component that decays at the rate rho may limit steps through the
-  error estimate;
+- rho is far above the rates that the motion shows: the error of a component that decays at this rate may limit steps;
 - all components that could vibrate at the rate rho have velocities of a few tolerances: steps at the stability limit
   excite such components;
 - the whole run is expected to cost a thousand times as much as a trial.
@@ -85,9 +84,7 @@ SHARE_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts
 # after one trial, triples after two, and so on
 COST_OF_ANY_TRIAL = 100.0
 HIDDEN_RATIO = 30.0  # ratio of rho to the rates that the motion shows above which rho is a hidden rate
-# size of an oscillation, in tolerances of velocities, that an explicit method at its stability limit leaves in decaying
-# components
-QUIET_FACTOR = 10.0
+QUIET_FACTOR = 10.0  # velocities, in tolerances, that an explicit method at its stability limit leaves as oscillations
 HIDDEN_FROM = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
 INSTANT = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
@@ -232,10 +229,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the largest relative rate of change of velocities or accelerations, 1/s; infinity if it is unknown.
-
-    `rate` is rho, 1/s; (Q, V, A) is scratch.
-    """
+    """Return the largest relative rate of change of velocities or accelerations, 1/s; infinity if it is unknown."""
     n = Q.size
     dt = INSTANT / rate
     fastest = largest = change = 0.0
@@ -255,10 +249,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Return whether a vibration of angular frequency `rate` with the accelerations of `state` has small velocities.
-
-    Velocities are small up to QUIET_FACTOR tolerances.
-    """
+    """Return whether velocities of a vibration of angular frequency `rate` are at most QUIET_FACTOR tolerances."""
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]

@@ -46,10 +46,7 @@ def _clear_recorded_entries(w):
 
 @merged
 def clear_rows(f, w):
-    """Set w.G to zero; in the augmented form, only where its rows are known to have entries, see w.places.
-
-    The task VERIFY_PATTERN detects new entries after a step.
-    """
+    """Set w.G to zero; in the augmented form only the recorded entries (VERIFY_PATTERN detects others after a step)."""
     if f.flags[FORM] == AUGMENTED:
         _clear_recorded_entries(w)
     else:
@@ -117,8 +114,7 @@ ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0
 # rounding error of Gamma if the terms of G v cancel, relative to the largest term over largest_difference_step
 ROUNDING_OF_TERMS = 1e-14
-# change of Gamma from one difference step to the next, relative to the required accuracy, that ends the search for e
-CONVERGED_CHANGE = 0.01
+CONVERGED_CHANGE = 0.01  # change of Gamma between difference steps, over the required accuracy, that ends the search
 
 
 @exact
@@ -152,8 +148,7 @@ def _one_sided_direction(notes, t, e):
 def _differences(f, w, t, q, v, e, first, last):
     """Store Gamma[first:last], by differences with the steps e and 2 e, in w.Gamma; return three maxima.
 
-    They are the largest entry of Gamma, the largest disagreement of both differences, and the largest term of G v. The
-    first two are NaN if Gamma is not finite.
+    They are those of |Gamma|, of the disagreement of both differences (both NaN if not finite), and of |terms of G v|.
     """
     Gamma_twice = w.Gamma_tried[0]
     side = _one_sided_direction(w.notes, t, e)

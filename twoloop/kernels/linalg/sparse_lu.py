@@ -46,8 +46,7 @@ def newton_program(
 ) -> NDArray[np.int32] | None:
     """Return the program that factors Newton's matrix; None if it would have too many updates.
 
-    `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`. For other arguments see
-    `factorization_program`.
+    `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
     begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
@@ -114,8 +113,7 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
 def factor(program, counts, values, sizes):
     """Replace `values` by the factors, with 1/pivot on the diagonal; return whether all pivots are large enough.
 
-    Factors of redundant rows, for which `counts` is 0, become zeros, which removes these rows from solutions. `sizes`
-    is scratch: the sum of |terms| of each pivot.
+    Factors of redundant rows (0 in `counts`) become zeros, which removes these rows from solutions; `sizes` is scratch.
     """
     n_q, n, off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF]
     order, runs = order_of(program), runs_of(program)

@@ -271,7 +271,7 @@ def program_in_order(
 ) -> NDArray[np.int32] | None:
     """Return the program for an order of elimination; None if it would have too many updates.
 
-    With `both` it is for unsymmetric factors: the slot of an entry of U is that of the entry of L plus N_OFF.
+    With `both`, factors are unsymmetric: the slot of an entry of U is that of the entry of L plus N_OFF.
     """
     n = len(order)
     position = np.empty(n, dtype=np.int64)
