@@ -16,9 +16,9 @@ from twoloop.kernels.data.indices import (
     GAMMA_INACCURATE,
     GAMMA_REQUIRED,
     NULL_SPACE,
+    REPORTED_ERROR,
     RTOL,
     SINGULAR,
-    UNTRUE,
 )
 from twoloop.kernels.evaluation.inner_loop import accelerations, find_tangents, renew_partition, restore
 from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
@@ -29,7 +29,8 @@ CHECKED_AT = (0.3, 0.7)  # times at which polynomials are checked, as fractions 
 N_CHECKED = len(CHECKED_AT)
 EPS = 2.0**-52
 MAX_GAP_RATIO = 8.0  # largest ratio of the longest to the shortest of neighbouring steps that count as equally long
-NOISY = 10.0  # rounding of q over the size of the interval, in tolerances of v, above which v gets its own polynomial
+# rounding error of q divided by the size of the interval, in tolerances of v, above which v gets its own polynomial
+MAX_VELOCITY_ROUNDING = 10.0
 # largest pivot of a singular position within an interval, relative to the larger of the pivots at the interval's ends
 SINGULAR_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5  # a position with a smaller pivot is singular; for the pivot see least_pivot in partition.py
@@ -100,11 +101,11 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
 
 @merged
 def _kind_by_length(kind, tolerances, h, states, i):
-    """Return `kind`, or APART if the interval is so short that rounding of q would spoil velocities, see NOISY."""
+    """Return `kind`, or APART if the interval is so short that rounding of q would spoil velocities."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
-        if EPS * abs(states[i, m]) > NOISY * h * (atol + rtol * abs(states[i, n + m])):
+        if EPS * abs(states[i, m]) > MAX_VELOCITY_ROUNDING * h * (atol + rtol * abs(states[i, n + m])):
             return kinds.APART
     return kind
 
@@ -176,7 +177,9 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
             if code == DONE:
                 code = restore(f, w, times[p], q, v, tolerance)
             has_partition = (
-                code == DONE and not (reduced and partition_is_poor(w)) and _change(tolerances, v_0, v) <= UNTRUE
+                code == DONE
+                and not (reduced and partition_is_poor(w))
+                and _change(tolerances, v_0, v) <= REPORTED_ERROR
             )
             if not has_partition:
                 copy(q_0, q)
@@ -185,7 +188,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
                 if code == DONE:
                     code = restore(f, w, times[p], q, v, tolerance)
                 change = _change(tolerances, v_0, v) if code == DONE else 0.0
-                if not change <= UNTRUE and _is_singular(f, w, t, states, i, last, times[p], q, change):
+                if not change <= REPORTED_ERROR and _is_singular(f, w, t, states, i, last, times[p], q, change):
                     code = SINGULAR
             if code != DONE:
                 failures += 1

@@ -402,7 +402,7 @@ def warn_of_singular_end(run: "Run") -> str:
         )
     else:
         excess = _velocity_error_ratio(run, t, q, v)
-        if excess <= indices.UNTRUE:
+        if excess <= indices.REPORTED_ERROR:
             return ""
         text = (
             f"the run ends where the constraints nearly lose rank ({_ratio_text(run, t, q)}): rounding of positions "

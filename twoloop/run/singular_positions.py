@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.scales import signs
 from twoloop.checks.structure import surely_above
-from twoloop.kernels.data.indices import UNTRUE
+from twoloop.kernels.data.indices import REPORTED_ERROR
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -201,7 +201,7 @@ LEAST, MARGIN = 1e-5, 30.0
 
 def singular_threshold(rtol: float) -> float:
     """Return the ratio of the smallest pivot to the largest below which rounding may change velocities beyond rtol."""
-    return min(WEAK, max(LEAST, MARGIN * float(np.sqrt(ROUNDING / (UNTRUE * max(rtol, ROUNDING))))))
+    return min(WEAK, max(LEAST, MARGIN * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING))))))
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:

@@ -174,7 +174,7 @@ STEEPER = 2.0  # smallest ratio of a sudden change to the changes before and aft
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_IN_SHORT = 4  # number of samples within a short step
 # change of an acceleration, relative to the largest, while a velocity changes by its tolerance, that counts as decay
-DECAYED = 0.5
+MAX_LASTING_CHANGE = 0.5
 AT_CHANGE = 0.01  # largest distance of a step's beginning from a change at which it begins, in spacings of samples
 LARGEST = N_SAMPLES + 1  # index in w.changes of the largest absolute values so far; the rows before are samples
 MIDDLE = N_SAMPLES + 2  # index in w.changes of values between two samples
@@ -360,7 +360,7 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
-    """Return whether accelerations hardly change (see DECAYED) while a velocity changes by its tolerance.
+    """Return whether accelerations hardly change (see MAX_LASTING_CHANGE) while a velocity changes by its tolerance.
 
     They change much if stiff friction keeps a body at rest: the acceleration of the body is then a rounding error of
     balanced forces, and a parabola with this acceleration would lead far from the state of rest. (Q, V, A) is scratch.
@@ -378,7 +378,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
         return True
     for m in range(n):
         change = max(change, abs(A[m] - a[m]))
-    return not change > DECAYED * largest
+    return not change > MAX_LASTING_CHANGE * largest
 
 
 @compiled

@@ -161,13 +161,13 @@ def record_pivot_at_output(f, w, clock, state):
 
 
 @merged
-def check_partition(f, w, control, clock, size, lands, state):
+def check_partition(f, w, control, clock, size, at_output, state):
     """Renew a poor partition, and check how near a singular position is; return CONTINUE or an end code.
 
-    `size` is the size of the last step, s; `lands` is true if this step ended at an output time. A new partition needs
-    no conversion of the state, which contains all coordinates.
+    `size` is the size of the last step, s; `at_output` is true if this step ended at an output time. The state contains
+    all coordinates, so that a new partition needs no conversion.
     """
-    short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not lands
+    short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
     if f.flags[FORM] == STATIC:
         clock[at.PIVOT_HERE] = w.notes[PIVOT]
         clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
@@ -181,10 +181,10 @@ def check_partition(f, w, control, clock, size, lands, state):
         every += w.independent_v.size // FREEDOMS_PER_CHECK
     if straight:
         every = CHECK_INTERVAL
-    looked = w.counters[N_ACCEPTED] % every == 0
-    if looked and (straight or f.flags[FORM] != NULL_SPACE):
+    is_checked = w.counters[N_ACCEPTED] % every == 0
+    if is_checked and (straight or f.flags[FORM] != NULL_SPACE):
         find_tangents(f, w, clock[at.T], state[:n])
-    if looked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
+    if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     # steps of generated code do not use the partition: only a new one shows whether a singular position is still near
     if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:

@@ -187,14 +187,14 @@ def departure(w, tolerances, h, q, v, q1):
     motion = 0.0
     for m in range(q.size):
         motion = max(motion, h * abs(v[m]), abs(q1[m] - q[m]))
-    share, floor = SHARE_OF_MOTION, FLOOR
+    fraction, floor = SHARE_OF_MOTION, FLOOR
     if w.notes[ORIENTATION] * w.notes[ORIENTATION_NEW] < 0.0:
-        share, floor = SHARE_THROUGH_ZERO, 0.0
+        fraction, floor = SHARE_THROUGH_ZERO, 0.0
     largest = 0.0
     for k in range(w.dependent.size):
         m = w.dependent[k]
         scale = allowed(tolerances, m, q[m], q1[m])
-        largest = max(largest, abs(w.predicted[k] - q1[m]) / max(min(scale, share * motion + floor * scale), LEAST))
+        largest = max(largest, abs(w.predicted[k] - q1[m]) / max(min(scale, fraction * motion + floor * scale), LEAST))
     return largest
 
 
@@ -216,14 +216,14 @@ def defect_ratio(tolerances, h, order, predicted, a, q, v):
     The tolerances of q and v determine the allowed defect. The defect of a series of order `order` grows as the highest
     power of the time: its integral over the step is h / order times its value at the end. Infinity: it is not finite.
     """
-    rtol, share, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
+    rtol, duration, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):
         largest = max(largest, abs(a[j]))
     for j in range(a.size):
         defect = abs(predicted[j] - a[j])
         if not np.isfinite(defect):
             return np.inf
-        defect = (defect - ROUNDING * largest) * share
+        defect = (defect - ROUNDING * largest) * duration
         atol = tolerances[ATOL + j]
-        worst = max(worst, defect / (atol + rtol * abs(v[j])), defect * share / (atol + rtol * abs(q[j])))
+        worst = max(worst, defect / (atol + rtol * abs(v[j])), defect * duration / (atol + rtol * abs(q[j])))
     return worst

@@ -69,7 +69,7 @@ from twoloop.kernels.linalg.dense import copy
 
 # number of evaluations before the first estimate of rho, and between two estimates, which take about eight evaluations
 # each; these numbers are multiplied by COST_RATIO while the explicit method is used
-EARLY, INTERVAL = 100.0, 600.0
+FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 ITERATIONS = 4  # largest number of power iterations for dF/dq in one estimate, and for dF/dv
 NEGLIGIBLE = 1e-3  # largest eigenvalue of dF/dv times step size below which no further iteration for dF/dv is needed
 SEED = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
@@ -86,7 +86,7 @@ COST_OF_ANY_TRIAL = 100.0
 HIDDEN_RATIO = 30.0  # ratio of rho to the rates that the motion shows above which rho is a hidden rate
 QUIET_FACTOR = 10.0  # velocities, in tolerances, that an explicit method at its stability limit leaves as oscillations
 HIDDEN_FROM = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
-INSTANT = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
+DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method
 TRIAL_ERROR_FACTOR = 10.0
@@ -231,7 +231,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 def _motion_rate(f, w, t, state, rate, Q, V, A):
     """Return the largest relative rate of change of velocities or accelerations, 1/s; infinity if it is unknown."""
     n = Q.size
-    dt = INSTANT / rate
+    dt = DIFFERENCE_STEP / rate
     fastest = largest = change = 0.0
     for m in range(n):
         Q[m] = state[m] + dt * state[n + m]
@@ -273,8 +273,8 @@ def _cost_per_second(w, options, memory, t):
 
 @compiled
 def _evaluations_between_estimates(options, memory):
-    """Return the number of evaluations between two estimates of rho by the method in use, see INTERVAL."""
-    return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
+    """Return the number of evaluations between two estimates of rho by the method in use, see BETWEEN_ESTIMATES."""
+    return BETWEEN_ESTIMATES * options[COST_RATIO] if _is_explicit(memory) else BETWEEN_ESTIMATES
 
 
 @compiled
@@ -385,7 +385,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     first, second = _memories(memory, n)
     if np.isnan(memory[T_BEGIN]):  # this is the first step of a run, or the first after a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-        memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + EARLY * options[COST_RATIO]
+        memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + FIRST_ESTIMATE * options[COST_RATIO]
     if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:
         phase = -1
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:

@@ -50,7 +50,7 @@ from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates, gamma_by_differences, kinematics, row_residual
 from twoloop.kernels.evaluation.operations import gamma_by_program
 from twoloop.kernels.evaluation.partition import (
-    AMPLIFIED,
+    AMPLIFICATION,
     CONTRACTION,
     MAX_ITERATIONS,
     MIN_CORRECTION,
@@ -247,7 +247,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
             break
         if moved > CONTRACTION * before:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            if not (moved <= limit or (moved <= AMPLIFIED * limit and rows_hold(w, q))):
+            if not (moved <= limit or (moved <= AMPLIFICATION * limit and rows_hold(w, q))):
                 return INNER_DIVERGED
             break
         before = max(moved, theta)

@@ -382,8 +382,8 @@ CONTRACTION = 0.5  # largest ratio of a correction to the one before in a conver
 ROUNDING_OF_CORRECTIONS = 1e-12  # correction, relative to the largest coordinate, that may not decrease, by rounding
 # factor on ROUNDING_OF_CORRECTIONS if all rows are satisfied up to rounding: the rounding of a position of 1 m turns a
 # rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
-AMPLIFIED = 1e3
-CLOSED = 2e-15  # largest violation of a row that counts as a rounding error, relative to the largest term of the row
+AMPLIFICATION = 1e3
+ROUNDING_OF_ROWS = 2e-15  # largest violation of a row that counts as a rounding error, relative to its largest term
 MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.notes[ROUNDED], the rounding of positions
 MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
 
@@ -424,12 +424,12 @@ def factor_dependent(f, w, t, q):
 
 @compiled
 def rows_hold(w, q):
-    """Return whether all C_i in w.C are rounding errors, that is, at most CLOSED times the largest |G_ij q_j|."""
+    """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
     for i in range(w.C.size):
         size = 0.0
         for p in range(w.places[i], w.places[i + 1]):
             size = max(size, abs(w.G[i, w.places[p]] * q[w.places[p]]))
-        if not abs(w.C[i]) <= CLOSED * size:
+        if not abs(w.C[i]) <= ROUNDING_OF_ROWS * size:
             return False
     return True
 
@@ -473,7 +473,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
             # accept a correction that is due to rounding; otherwise Newton's method has left its region of convergence,
             # and could converge to another assembly of the mechanism
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            converged = correction <= limit or (correction <= AMPLIFIED * limit and rows_hold(w, q))
+            converged = correction <= limit or (correction <= AMPLIFICATION * limit and rows_hold(w, q))
             if not converged:
                 return INNER_DIVERGED
         last_correction = correction

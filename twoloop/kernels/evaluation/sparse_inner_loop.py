@@ -64,13 +64,13 @@ from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.operations import gamma_by_program, jacobian_by_program
 from twoloop.kernels.evaluation.partition import (
-    AMPLIFIED,
-    CLOSED,
+    AMPLIFICATION,
     CONTRACTION,
     MAX_ITERATIONS,
     MAX_VIOLATION,
     MIN_CORRECTION,
     ROUNDING_OF_CORRECTIONS,
+    ROUNDING_OF_ROWS,
 )
 from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
 from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
@@ -415,7 +415,7 @@ def _move(f, w, x):
 
 @compiled
 def _rows_hold(f, w, q):
-    """Return whether all C_i in w.C are rounding errors, that is, at most CLOSED times the largest |G_ij q_j|."""
+    """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
     rows, columns, _ = jacobian_of(f.static_program)
     size = w.solutions[: w.g.size]
     size[:] = 0.0
@@ -423,7 +423,7 @@ def _rows_hold(f, w, q):
         size[rows[k]] = max(size[rows[k]], abs(w.jacobian_values[k] * q[columns[k]]))
     held = True
     for i in range(size.size):
-        held = held and abs(w.C[i]) <= CLOSED * size[i]
+        held = held and abs(w.C[i]) <= ROUNDING_OF_ROWS * size[i]
     return held
 
 
@@ -458,7 +458,9 @@ def _to_constraints(f, w, t, q, v, theta):
             return DONE
         if moved > CONTRACTION * before:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            return DONE if moved <= limit or (moved <= AMPLIFIED * limit and _rows_hold(f, w, q)) else INNER_DIVERGED
+            return (
+                DONE if moved <= limit or (moved <= AMPLIFICATION * limit and _rows_hold(f, w, q)) else INNER_DIVERGED
+            )
         before = max(moved, theta)
     return INNER_DIVERGED
 

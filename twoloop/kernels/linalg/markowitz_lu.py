@@ -307,7 +307,7 @@ def _store_program(index, counts, lists):
     return True
 
 
-GROWTH = 1e3  # multiplier above which the order of elimination is chosen again
+MAX_MULTIPLIER = 1e3  # multiplier above which the order of elimination is chosen again
 
 
 @compiled
@@ -344,9 +344,9 @@ def make_program(G, pattern, rows, columns, index, values):
 def factor(entries, index, values):
     """Store in `values` the factors of G[rows][:, columns], with 1/pivot on the diagonal.
 
-    `entries` is G as a vector, whose last row is zero. Returns the ratio of the smallest to the largest pivot. The
-    result is negative (0 from dense factors) if a pivot is zero or not finite, or a multiplier exceeds GROWTH: the
-    order must then be chosen again.
+    `entries` is G as a vector, whose last row is zero. Returns the ratio of the smallest to the largest pivot. If this
+    is negative (0 from dense factors), a pivot is zero or not finite, or a multiplier exceeds MAX_MULTIPLIER: the order
+    must be chosen again.
     """
     r = index[SIZE]
     if index[DENSE] == 1:
@@ -385,7 +385,7 @@ def run_program(index, values):
         smallest = min(smallest, size)
         largest = max(largest, size)
         values[i] = 1.0 / values[i]
-    if not growth <= GROWTH:
+    if not growth <= MAX_MULTIPLIER:
         return -1.0
     in_row = begin_entries(r)
     for u in range(r, index[FIRST_LOWER]):  # divide U by its diagonal, which makes solutions faster

@@ -107,20 +107,20 @@ def factor(program, counts, values, sizes, least):
         inverse = 1.0 / pivot
         values[k] = inverse
         for s in range(first, last):
-            share = values[s] * inverse
+            multiplier = values[s] * inverse
             if not of_row:
-                sizes[row_of[s - n]] += share * values[s]
-            values[row_of[s - n]] -= share * values[s]
+                sizes[row_of[s - n]] += multiplier * values[s]
+            values[row_of[s - n]] -= multiplier * values[s]
             r = s + 1
             while r < last:
                 size = runs[u]
-                if share != 0.0:  # two thirds of the numbers of planar mechanisms in space are zero
+                if multiplier != 0.0:  # two thirds of the numbers of planar mechanisms in space are zero
                     into, own = values[runs[u + 1] : runs[u + 1] + size], values[r : r + size]
                     for i in range(size):
-                        into[i] -= share * own[i]
+                        into[i] -= multiplier * own[i]
                 r += size
                 u += 2
-            values[s] = share
+            values[s] = multiplier
     return smallest
 
 
@@ -134,9 +134,9 @@ def solve(program, values, stiffness, x, y):
     for k in range(n):
         y[k] = x[order[k]]
     for k in range(n):
-        share = y[k]
+        y_k = y[k]
         for s in range(begin[k], begin[k + 1]):
-            y[row_of[s]] -= values[n + s] * share
+            y[row_of[s]] -= values[n + s] * y_k
     for k in range(n - 1, -1, -1):
         total = y[k] * values[k]
         for s in range(begin[k], begin[k + 1]):

@@ -168,9 +168,9 @@ def solve(program, values, x, y):
     for k in range(n):
         y[k] = x[order[k]]
     for k in range(n):
-        share = y[k]
+        y_k = y[k]
         for s in range(begin[k], begin[k + 1]):
-            y[row_of[s]] -= values[n + s] * share
+            y[row_of[s]] -= values[n + s] * y_k
     for k in range(n - 1, -1, -1):
         total = y[k]
         for s in range(begin[k], begin[k + 1]):
