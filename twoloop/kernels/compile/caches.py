@@ -187,13 +187,13 @@ class CodeFiles:
         """Write the data for a key to its file, which replaces the previous file for this key."""
         content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
         path = self._path(key)
-        unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
+        temporary_path = path.with_suffix(f".{uuid.uuid4().hex}")
         make_trusted_folder(self.folder)
         try:
-            write_trusted(unfinished, hashlib.sha256(content).digest() + content)
-            unfinished.replace(path)
+            write_trusted(temporary_path, hashlib.sha256(content).digest() + content)
+            temporary_path.replace(path)
         finally:
-            unfinished.unlink(missing_ok=True)
+            temporary_path.unlink(missing_ok=True)
         if self.limited:
             for old in sorted(self._all_files(), key=_time_written)[:-MAX_ON_DISK]:
                 old.unlink(missing_ok=True)
@@ -287,12 +287,12 @@ def compile_cached(
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
     """Suspend garbage collection, which takes a sixth of the compile time: numba's objects are never garbage."""
-    collecting = gc.isenabled()
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if collecting:
+        if was_enabled:
             gc.enable()
 
 

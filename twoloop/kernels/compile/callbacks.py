@@ -180,8 +180,8 @@ class Kind:
 
     def _signature(self, input_type: Any) -> Any:
         """Return the signature in which all arrays except for the outputs have the type `input_type`."""
-        filled = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
-        return numba.types.void(f8, *[input_type] * len(self.state), input_type, *filled)
+        output_types = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
+        return numba.types.void(f8, *[input_type] * len(self.state), input_type, *output_types)
 
     @property
     def size(self) -> str:

@@ -109,8 +109,8 @@ def _element_address(
     if kind.layout != "C" or not is_element or options.get("boundscheck"):
         return _numba_indexing(context, builder, kind, array, index_types, indices, **options)
     sizes = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
-    given = zip(index_types, indices, sizes, strict=True)
-    resolved = [arrayobj.fix_integer_index(context, builder, *each) for each in given]
+    index_arguments = zip(index_types, indices, sizes, strict=True)
+    resolved = [arrayobj.fix_integer_index(context, builder, *each) for each in index_arguments]
     return cgutils.get_item_pointer2(context, builder, array.data, sizes, None, "C", resolved), [], []
 
 

@@ -196,9 +196,9 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
     for name, value in fields.items():  # the structure remains in registers; numba's helper would store it to memory
-        at = model.get_field_position(name)
-        element = ir.Constant(array.type.elements[at], None) if value is None else value
-        array = builder.insert_value(array, element, at)
+        index = model.get_field_position(name)
+        element = ir.Constant(array.type.elements[index], None) if value is None else value
+        array = builder.insert_value(array, element, index)
     return array
 
 

@@ -331,8 +331,8 @@ def project_lanes(code, order, control, work):
     code.approach(order, control, work)
     for _ in range(MAX_PASSES):
         code.refine(order, control, work)
-        left = 0.0
+        n_left = 0.0
         for k in range(LANES):
-            left += work[LEFT_TO_MOVE * LANES + k]
-        if left == 0.0:
+            n_left += work[LEFT_TO_MOVE * LANES + k]
+        if n_left == 0.0:
             break

@@ -44,7 +44,7 @@ from twoloop.kernels.lanes.layout import (
     table,
     vectors,
 )
-from twoloop.kernels.steps.newton_systems import DIFFERENCE, MAX_ITERATIONS, STAGNATION
+from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import (
     GAMMA0,
     MAX_STEP_RATIO,
@@ -171,7 +171,7 @@ def find_derivatives(code, settings, control, c, work):
         copy_vectors(work, middle, new, 2 * n)
         for k in range(LANES):
             at = (new + column) * LANES + k
-            work[at] += DIFFERENCE * max(1.0, abs(work[at]))
+            work[at] += RELATIVE_DISPLACEMENT * max(1.0, abs(work[at]))
         code.accelerate(order, control, work)
         matrix = matrix_at(memory, n, s, BY_Q if column < n else BY_V) + column % n
         for k in range(LANES):
@@ -334,12 +334,12 @@ def _largest_corrections(settings, A, A2, work):
 def _end_iteration(options, work, memory, iteration, k):
     """Set DONE to 1 if the iteration of lane k has converged, otherwise to 0; return whether the iteration ends."""
     x, tolerance = work[X * LANES + k], options[N_HEAD + OUTER_TOL]
-    floor = STAGNATION * options[LEAST]
-    fast = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
-    far = x * x * work[(memory + LARGEST_Q) * LANES + k] / work[(memory + SCALE_Q) * LANES + k]
-    change, before = max(fast, far), work[(memory + CHANGE_BEFORE) * LANES + k]
+    floor = MAX_ROUNDING_CORRECTION * options[LEAST]
+    change_v = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
+    change_q = x * x * work[(memory + LARGEST_Q) * LANES + k] / work[(memory + SCALE_Q) * LANES + k]
+    change, before = max(change_v, change_q), work[(memory + CHANGE_BEFORE) * LANES + k]
     work[(memory + CHANGE_BEFORE) * LANES + k] = change
-    if not np.isfinite(fast + far) or work[FINE * LANES + k] == 0.0:
+    if not np.isfinite(change_v + change_q) or work[FINE * LANES + k] == 0.0:
         return True
     n_left = MAX_ITERATIONS - 1 - iteration
     contraction = change / before if iteration > 0 and before > 0.0 else 0.0

@@ -238,14 +238,14 @@ def places_of_starts(n, n_rows, n_entries, n_redundant):
     G = 2 * n_rows
     x = G + n_entries
     change = x + n_rows
-    found = change + n
-    correction = found + n
+    nearest = change + n
+    correction = nearest + n
     weakest = correction + n
     displacement = weakest + n
     row = displacement + n
     at_found = row + n
     size = n_entries + n_rows * (1 + n_rows + n_redundant) + 1
-    return G, x, change, found, correction, weakest, displacement, row, at_found, at_found + size, at_found + 2 * size
+    return G, x, change, nearest, correction, weakest, displacement, row, at_found, at_found + size, at_found + 2 * size
 
 
 _places = merged(places_of_starts)
@@ -361,16 +361,16 @@ def _compare_with_other_starts(code, settings, control, pattern, moves, work):
     """Clear RUNNING in lanes in which the projection of another guess differs much from its prediction by C_q."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    _, x, change, found, correction, weakest, displacement, _, at_found, _, _ = _places(
+    _, x, change, nearest, correction, weakest, displacement, _, at_found, _, _ = _places(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
-    x, change, found, correction = memory + x, memory + change, memory + found, memory + correction
+    x, change, nearest, correction = memory + x, memory + change, memory + nearest, memory + correction
     weakest, displacement, factors = memory + weakest, memory + displacement, memory + at_found
     _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest)
     for own, other in OTHER_GUESSES:
         for j in range(n * LANES):
-            off = own * work[correction * LANES + j] + other * work[weakest * LANES + j]
-            work[displacement * LANES + j], work[new * LANES + j] = off, work[found * LANES + j] + off
+            shift = own * work[correction * LANES + j] + other * work[weakest * LANES + j]
+            work[displacement * LANES + j], work[new * LANES + j] = shift, work[nearest * LANES + j] + shift
         _gauss_newton(code, settings, control, pattern, moves, work)
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
@@ -378,10 +378,10 @@ def _compare_with_other_starts(code, settings, control, pattern, moves, work):
         # the component of the displacement that is normal to the constraints
         along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
-            apart, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest(work, found, n, k)
+            apart, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest(work, nearest, n, k)
             for j in range(n):
                 m = j * LANES + k
-                expected = work[found * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
+                expected = work[nearest * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
                 apart = max(apart, abs(work[new * LANES + m] - expected))
             if not apart <= MAX_CURVATURE * _largest(work, displacement, n, k) + rounding:
                 work[RUNNING * LANES + k] = 0.0
@@ -399,7 +399,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])
-    _, _, _, found, correction, _, _, row, _, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    _, _, _, nearest, correction, _, _, row, _, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     fill_field(work, AHEAD, control[T0])
     for j in range(n):
         fill_field(work, memory + row + j, 0.0)
@@ -413,7 +413,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
                 work[(own + i) * LANES + k] = numbers[run, i]
         _gauss_newton(code, settings, control, pattern, moves, work)
         _change_velocities(code, settings, control, pattern, moves, work)
-        copy_vectors(work, new, memory + found, n)
+        copy_vectors(work, new, memory + nearest, n)
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
             for j in range(n):
@@ -422,7 +422,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
         for k in range(min(LANES, n_runs - first)):
             fine[first + k] = int(work[RUNNING * LANES + k])
             for j in range(n):
-                q[first + k, j] = work[(memory + found + j) * LANES + k]
+                q[first + k, j] = work[(memory + nearest + j) * LANES + k]
                 v[first + k, j] = work[(new + n + j) * LANES + k]
 
 

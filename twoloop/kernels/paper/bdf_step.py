@@ -164,7 +164,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     copy(prediction, new_state[: 2 * n])  # entries of dependent coordinates: start values of Newton's method
     copy(rate[n:], a1)
-    before = np.inf
+    last_change = np.inf
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for m in w.independent:
@@ -180,14 +180,14 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
         # the first iteration only evaluates the prediction, which is never accepted: extrapolation alone is unstable
-        if iteration > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
+        if iteration > 0 and (change <= options[OUTER_TOL] or (change >= last_change and change <= rounding_floor(q1))):
             for k in range(w.dependent.size):
                 m = w.dependent[k]
                 w.predicted[k] = prediction[m] + c * (prediction[n + m] + c * (a1[m] - rate[n + m]) - rate[m])
             return DONE
-        if not change <= before:
+        if not change <= last_change:
             return OUTER_DIVERGED
-        before = change
+        last_change = change
     return OUTER_DIVERGED
 
 

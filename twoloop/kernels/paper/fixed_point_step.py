@@ -13,8 +13,8 @@ from twoloop.kernels.paper.iterations import (
     estimate_and_extrapolate,
     iterate_accelerations,
     iterate_first_order,
-    rests_of,
-    store_rest,
+    rounding_errors_of,
+    store_rounding_errors,
     vector,
 )
 from twoloop.kernels.steps.stages import (
@@ -39,7 +39,7 @@ def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
             copy(trial[j], previous[j])
         memory[at.H_PREVIOUS] = memory[at.H_TRIAL]
         memory[at.HAS_PREVIOUS] = 1.0
-        store_rest(rests_of(memory, s, n, tolerances))
+        store_rounding_errors(rounding_errors_of(memory, s, n, tolerances))
     memory[at.HAS_TRIAL] = 0.0
 
 
@@ -64,7 +64,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q_full, v_full = vector(memory, s, n, at.Q_FULL), vector(memory, s, n, at.V_FULL)
     q_mid, v_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID)
     weights = memory[memory.size - s :]
-    rest = rests_of(memory, s, n, tolerances)
+    rest = rounding_errors_of(memory, s, n, tolerances)
     ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
     for j in range(s):
         if ratio <= MAX_STEP_RATIO:

@@ -16,15 +16,15 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_fl
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
-# number of rows of REST, the rounding errors in the compensated sums of steps of fixed size: of q and v at the last
+# number of rows of ROUNDING, rounding errors of the compensated sums in steps of fixed size: of q and v at the last
 # accepted step, then of q and v in this attempt. Without compensation, the energy of a symmetric method drifts with the
 # number of steps
-N_RESTS = 4
+N_ROUNDING = 4
 
 # indices of the scalars, of the stage blocks (s, n_q), and of the vectors (n_q) in `memory`, in this order
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, REST, N_VECTORS = (*range(8), 7 + N_RESTS)
+Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
 
 
 def memory_size(s: int, n_q: int) -> int:
@@ -47,17 +47,17 @@ def vector(memory, s, n, which):
 
 
 @inlined
-def rests_of(memory, s, n, tolerances):
-    """Return a view (N_RESTS, n) of REST; (0, n) under step-size control, with which rounding errors do not matter."""
-    start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n, N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
+def rounding_errors_of(memory, s, n, tolerances):
+    """Return a view (N_ROUNDING, n) of ROUNDING, or (0, n) under step-size control, where it is not needed."""
+    start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + ROUNDING) * n, N_ROUNDING if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
 
 @merged
-def store_rest(rest):
-    """Copy the rows of `rest` for this attempt, which was accepted, to the rows for the last accepted step."""
-    for i in range(rest.shape[0] // 2):
-        copy(rest[rest.shape[0] // 2 + i], rest[i])
+def store_rounding_errors(rounding):
+    """Copy the rows of `rounding` for this attempt, which was accepted, to its rows for the last accepted step."""
+    for i in range(rounding.shape[0] // 2):
+        copy(rounding[rounding.shape[0] // 2 + i], rounding[i])
 
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
@@ -70,16 +70,16 @@ UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
 @merged
-def _test_convergence(change, before, first, iteration, tolerance, q):
+def _test_convergence(change, last_change, first_change, iteration, tolerance, q):
     """Return UNDECIDED, CONVERGED or DIVERGED, from the latest, the previous and the first change in an iteration.
 
     Changes that no longer decrease, and are not larger than rounding errors of q, mean convergence.
     """
     if change <= tolerance:
         return CONVERGED
-    if not change <= MAX_GROWTH * first:
+    if not change <= MAX_GROWTH * first_change:
         return DIVERGED
-    if change >= before:
+    if change >= last_change:
         if change <= rounding_floor(q):
             return CONVERGED
         if iteration >= MIN_ITERATIONS:
@@ -88,29 +88,29 @@ def _test_convergence(change, before, first, iteration, tolerance, q):
 
 
 @exact
-def _compensated_sum(x, rest, increment):
-    """Return x + (rest + increment), and the rounding error of this sum (W. Kahan, Commun. ACM 8 (1965), 40)."""
-    increment += rest
+def _compensated_sum(x, rounding, increment):
+    """Return x + (rounding + increment), and the rounding error of this sum (W. Kahan, Commun. ACM 8 (1965), 40)."""
+    increment += rounding
     total = x + increment
     return total, increment - (total - x)
 
 
 @merged
-def _clear_rests(coordinates, rest):
+def _clear_rounding_errors(coordinates, rounding):
     """Set the rounding errors of this attempt to zero for `coordinates`, which the constraints determine."""
-    for i in range(N_RESTS // 2, rest.shape[0]):
+    for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
-            rest[i, m] = 0.0
+            rounding[i, m] = 0.0
 
 
 @compiled
-def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rest):
+def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
     """Take a step of size h from (q, v) by fixed-point iteration on the stage accelerations; return code, departure.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
     the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
     then satisfy (17). For undamped systems, the contraction per iteration is the square of that of the first-order
-    iteration. Sums are compensated if `rest` has rows. For the departure, see `departure` in step_size.py.
+    iteration. Sums are compensated if `rounding` has rows. For the departure, see `departure` in step_size.py.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -121,8 +121,8 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             for k in range(s):
                 total += A2[j, k] * A_stage[k, m]
             Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * total
-    first = 0.0
-    before = np.inf
+    first_change = 0.0
+    last_change = np.inf
     result = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
@@ -147,11 +147,11 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
                 change = max(change, h * difference / max(abs(Q_stage[j, m]), 1.0))
             copy(q1, A_stage[j])
         if iteration == 0:
-            first = change
-        result = _test_convergence(change, before, first, iteration, options[OUTER_TOL], q)
+            first_change = change
+        result = _test_convergence(change, last_change, first_change, iteration, options[OUTER_TOL], q)
         if result != UNDECIDED:
             break
-        before = change
+        last_change = change
     if result != CONVERGED:
         return OUTER_DIVERGED, 0.0
     for m in range(n):
@@ -160,13 +160,13 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
         for k in range(s):
             sum_q += bA[k] * A_stage[k, m]
             sum_v += b[k] * A_stage[k, m]
-        if rest.shape[0] == 0:
+        if rounding.shape[0] == 0:
             q1[m] = q[m] + h * v[m] + h * h * sum_q
             v1[m] = v[m] + h * sum_v
         else:
-            q1[m], rest[2, m] = _compensated_sum(q[m], rest[0, m], h * v[m] + h * h * sum_q)
-            v1[m], rest[3, m] = _compensated_sum(v[m], rest[1, m], h * sum_v)
-    _clear_rests(w.dependent, rest)
+            q1[m], rounding[2, m] = _compensated_sum(q[m], rounding[0, m], h * v[m] + h * h * sum_q)
+            v1[m], rounding[3, m] = _compensated_sum(v[m], rounding[1, m], h * sum_v)
+    _clear_rounding_errors(w.dependent, rounding)
     return project_prediction(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 

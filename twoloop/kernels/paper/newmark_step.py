@@ -11,7 +11,7 @@ from twoloop.kernels.linalg.dense import copy
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
 # ratio of the largest coordinate so far after a step to that before the step, above which the coordinates count as
 # caused by this step
-GROWN = 2.0
+GROWTH_AFTER_REST = 2.0
 TINY = 1e-300  # added to the tolerance, which is zero for a mechanism at rest at the origin
 
 # indices of the scalars in `memory`: largest coordinate, velocity and acceleration so far. The scalars are followed by
@@ -45,7 +45,7 @@ def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
     if size == 0.0:
         return 0.0
     rate = max(_largest_abs(v1, memory[SPEED]) / size, np.sqrt(_largest_abs(a1, memory[ACCELERATION]) / size))
-    return min(rate, 1.0 / gap) if size > GROWN * memory[SIZE] else rate
+    return min(rate, 1.0 / gap) if size > GROWTH_AFTER_REST * memory[SIZE] else rate
 
 
 @compiled
@@ -77,7 +77,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     for m in range(n):
         a1[m] = a[m]
         q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # start values of Newton's method for dependent coordinates
-    before = np.inf
+    last_change = np.inf
     for _ in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for m in w.independent:
@@ -92,7 +92,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             change = max(change, gamma * difference / max(abs(v1[m]), 1.0))
             change = max(change, beta * h * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        if change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q)):
+        if change <= options[OUTER_TOL] or (change >= last_change and change <= rounding_floor(q)):
             error = 0.0
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
@@ -103,9 +103,9 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
                         w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
                     error = max(error, departure(w, tolerances, h, q, v, q1))
             return Attempt(DONE, error, 0.0)
-        if not change <= before:
+        if not change <= last_change:
             break
-        before = change
+        last_change = change
     return Attempt(OUTER_DIVERGED, np.inf, 0.0)
 
 

@@ -115,9 +115,9 @@ def piece_ends(memory, c, t):
     left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] == 1.0
     least, ends = (t - stored[BEGIN]) / stored[DURATION], []
     for j in range(1, S - 1):
-        since = c[j] - (ends[-1] if ends else least)
-        beside = left_out[j - 1] or left_out[j + 1] or since > LONGEST_PIECE
-        if not left_out[j] and beside and since > SHORTEST_PIECE and 1.0 - c[j] > SHORTEST_PIECE:
+        length = c[j] - (ends[-1] if ends else least)
+        may_end = left_out[j - 1] or left_out[j + 1] or length > LONGEST_PIECE
+        if not left_out[j] and may_end and length > SHORTEST_PIECE and 1.0 - c[j] > SHORTEST_PIECE:
             ends.append(c[j])
     return [float(stored[BEGIN] + end * stored[DURATION]) for end in ends] + [float(stored[END])]
 
@@ -138,8 +138,8 @@ def _weight(tolerances, m, n, h, state):
     if tolerances[ESTIMATE] == 0.0:
         return 1.0 / (ROUNDING * (1.0 + v))
     atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
-    of_v = atol + rtol * max(v, 0.5 * h * abs(state[2 * n + m]))
-    return 1.0 / max(min(of_v, (atol + rtol * max(q, 0.5 * h * v)) / h), TINY)
+    allowed_v = atol + rtol * max(v, 0.5 * h * abs(state[2 * n + m]))
+    return 1.0 / max(min(allowed_v, (atol + rtol * max(q, 0.5 * h * v)) / h), TINY)
 
 
 @compiled
@@ -378,8 +378,8 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     last_0, last_1, last_2 = -1, -1, -1  # the last evaluated nodes, from which the first sweep extrapolates; -1: none
     for sweep in range(MAX_SWEEPS):
         change, moved = 0.0, 0.0
-        chooses = sweep in (0, 2, FEW_SWEEPS)  # whether to choose anew which nodes are left out
-        if estimated and chooses and sweep == FEW_SWEEPS:
+        chooses_nodes = sweep in (0, 2, FEW_SWEEPS)  # whether to choose anew which nodes are left out
+        if estimated and chooses_nodes and sweep == FEW_SWEEPS:
             near = min(DISTANCE_FACTOR * near, NEAR_MOST)
         for i in range(S):
             # nodes in both directions from the state `base`, first backwards in time
@@ -398,28 +398,28 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             _set_base(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
             _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
             code = DONE
-            renews = not generated or chooses
-            if chooses:
+            renews_partition = not generated or chooses_nodes
+            if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
                 left_out[j] = 0.0
                 if code == DONE:  # in a run that begins near the position, earlier pivots may all be small
                     largest_pivot = max(largest_pivot, w.notes[PIVOT])
                 if estimated and (code != DONE or w.notes[PIVOT] < near * largest_pivot):
                     left_out[j], code = 1.0, DONE
-            elif renews and left_out[j] == 0.0:
+            elif renews_partition and left_out[j] == 0.0:
                 code = renew_partition(f, w, time, q_stage)
             if left_out[j] == 1.0:
-                if not chooses:
+                if not chooses_nodes:
                     _interpolate(j, c, left_out, a)
                 continue
             while True:
                 if code == DONE:
                     code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
-                if renews or w.notes[BY_GENERAL] == 0.0:
+                if renews_partition or w.notes[BY_GENERAL] == 0.0:
                     break
                 # pivots of the generated code were too small, and the general code used the partition of another
                 # stage: repeat the projection with a partition chosen at this stage
-                renews, generated = True, False
+                renews_partition, generated = True, False
                 _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
                 code = renew_partition(f, w, time, q_stage)
             if code != DONE:
@@ -433,7 +433,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             last_0, last_1, last_2 = j, last_0, last_1
         if not np.isfinite(change):
             return Attempt(OUTER_DIVERGED, np.inf, 0.0)
-        if chooses:
+        if chooses_nodes:
             n_kept = S - int(left_out.sum())
             if n_kept < S - MAX_LEFT_OUT:
                 return Attempt(SINGULAR, np.inf, 0.0)

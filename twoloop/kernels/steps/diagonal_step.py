@@ -43,7 +43,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find
 from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import (
-    SAME_STEP,
+    EQUAL_STEP_TOLERANCE,
     correct,
     derivatives_at,
     factor_filter,
@@ -262,7 +262,7 @@ def _prepare(f, w, options, memory, t, h, Q, V, F):
         code = derivatives_at(f, w, options, memory, one_stage_of(options), t, Q, V, F)
         if code != DONE:
             return code
-    if abs(memory[at.H_FACTORED] - h) > SAME_STEP * h:
+    if abs(memory[at.H_FACTORED] - h) > EQUAL_STEP_TOLERANCE * h:
         return factor_systems(f, w, options, memory, one_stage_of(options), h)
     return DONE
 
@@ -281,7 +281,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     residual = block(memory, 1, n, at.RESIDUAL)
     a = A_stage[0]
     tangents_given = f.flags[FORCE_BY_Q_GIVEN] == 1
-    before = 0.0
+    last_change = 0.0
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         _set_stage_state(z, q_bar, v_bar, a, Q, V)
@@ -312,8 +312,8 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if not np.isfinite(change):
             return OUTER_DIVERGED
         contraction = 0.0
-        if iteration > 0 and before > 0.0:
-            contraction = change / before
+        if iteration > 0 and last_change > 0.0:
+            contraction = change / last_change
             memory[at.CONTRACTION] = contraction
         if tangents_given and change <= options[OUTER_TOL]:
             break
@@ -327,7 +327,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
                 memory[at.HAS_JACOBIAN] = 0.0
         if iteration == MAX_ITERATIONS - 1:
             return OUTER_DIVERGED
-        before = change
+        last_change = change
     for m in w.independent:
         V[m] = v_bar[m] + z * a[m]
         Q[m] = q_bar[m] + z * V[m]

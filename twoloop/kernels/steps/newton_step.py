@@ -20,9 +20,9 @@ from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multi
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import (
+    EQUAL_STEP_TOLERANCE,
     MAX_ITERATIONS,
-    SAME_STEP,
-    STAGNATION,
+    MAX_ROUNDING_CORRECTION,
     correct,
     derivatives_at,
     factor_filter,
@@ -46,7 +46,7 @@ from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_veloc
 # ratio of the last two corrections of Newton's method above which the next step computes new derivatives
 SLOW_CONTRACTION = 0.05
 # largest correction that counts as a rounding error in steps of fixed size, relative to max(1, |value|)
-STAGNATION_FIXED = 1e-9
+MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
 @compiled
@@ -62,9 +62,9 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     Q_stage, V_stage = block(memory, s, n, at.Q_STAGE), block(memory, s, n, at.V_STAGE)
     a_new = vector(memory, s, n, at.A_NEW)
     previous_change = 0.0
-    floor = STAGNATION_FIXED
+    floor = MAX_ROUNDING_CORRECTION_FIXED
     if tolerances[ESTIMATE] == 1.0:
-        floor = STAGNATION * tolerances[LEAST]
+        floor = MAX_ROUNDING_CORRECTION * tolerances[LEAST]
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for j in range(s):
@@ -255,7 +255,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             memory[at.HAS_JACOBIAN] = 1.0
             memory[at.FRESH] = 1.0
             memory[at.H_FACTORED] = 0.0
-        if abs(memory[at.H_FACTORED] - h) > SAME_STEP * h:
+        if abs(memory[at.H_FACTORED] - h) > EQUAL_STEP_TOLERANCE * h:
             code = factor_systems(f, w, options, memory, s, h)
             if code != DONE:
                 memory[at.HAS_JACOBIAN] = 0.0

@@ -94,14 +94,14 @@ from twoloop.kernels.steps.stages import (
 
 MAX_ITERATIONS = 15  # number of Newton iterations after which a step has failed
 # relative difference up to which step sizes count as equal: they are differences of times, with rounding errors
-SAME_STEP = 1e-9
+EQUAL_STEP_TOLERANCE = 1e-9
 # largest correction that counts as a rounding error once corrections no longer decrease, in units of the smallest
 # tolerance
-STAGNATION = 0.1
+MAX_ROUNDING_CORRECTION = 0.1
 
-DIFFERENCE = 1e-7  # displacement of a coordinate or velocity for finite differences, relative to max(1, |value|)
-# displacements of all coordinates at once are DIFFERENCE (1 + UNEQUAL (i mod N_UNEQUAL)) for coordinate i, because the
-# effects of equal displacements might cancel
+RELATIVE_DISPLACEMENT = 1e-7  # of a coordinate or velocity, for finite differences, relative to max(1, |value|)
+# if all coordinates are displaced at once, the displacement of coordinate i is multiplied by 1 + UNEQUAL (i mod
+# N_UNEQUAL), because the effects of equal displacements might cancel
 UNEQUAL, N_UNEQUAL = 0.37, 7
 
 # --- tangents K and D, of which only the band |i - j| <= b is computed and read
@@ -110,7 +110,7 @@ UNEQUAL, N_UNEQUAL = 0.37, 7
 @inlined
 def displace_unequally(value, index):
     """Return a coordinate or velocity, `value`, displaced by an amount that depends on its `index`, see UNEQUAL."""
-    return value + DIFFERENCE * max(1.0, abs(value)) * (1.0 + UNEQUAL * (index % N_UNEQUAL))
+    return value + RELATIVE_DISPLACEMENT * max(1.0, abs(value)) * (1.0 + UNEQUAL * (index % N_UNEQUAL))
 
 
 @compiled
@@ -159,7 +159,7 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
     for group in range(width):
         copy(q, moved)
         for j in range(group, n, width):
-            moved[j] += DIFFERENCE * max(1.0, abs(q[j]))
+            moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(q[j]))
         if not _jacobian_differs(f, w, t, moved):
             continue
         for j in range(group, n, width):
@@ -269,7 +269,7 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
         j = w.independent[column]
         copy(q, q_moved)
         copy(v, v_moved)
-        q_moved[j] += DIFFERENCE * max(1.0, abs(q[j]))
+        q_moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(q[j]))
         displacement = q_moved[j] - q[j]
         code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
         if code != DONE:
@@ -295,7 +295,7 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
         j = w.independent[column]
         copy(q, q_moved)
         copy(v, v_moved)
-        v_moved[j] += DIFFERENCE * max(1.0, abs(v[j]))
+        v_moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(v[j]))
         displacement = v_moved[j] - v[j]
         code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
         if code != DONE:
@@ -386,7 +386,7 @@ def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
     for group in range(2 * b + 1):
         copy(base_point, moved)
         for j in range(group, n, 2 * b + 1):
-            moved[j] += DIFFERENCE * max(1.0, abs(base_point[j]))
+            moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
         if by_v:
             _banded_residual(f, w, t, q, moved)
         else:
@@ -638,7 +638,7 @@ def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
         first, last = begins[group], begins[group + 1]
         for k in range(first, last):
             j = columns[k]
-            moved[j] = base_point[j] + DIFFERENCE * max(1.0, abs(base_point[j]))
+            moved[j] = base_point[j] + RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
         if by_v:
             _sparse_residual(f, w, t, q, moved, False, other)
         else:

@@ -287,7 +287,7 @@ def system_storage(w, n, k):
 
 
 @inlined
-def _tail(memory, s, n, k):
+def _after_vectors(memory, s, n, k):
     """Return a view (2 n) of `memory` that begins k n numbers after the end of its vectors."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
@@ -296,13 +296,13 @@ def _tail(memory, s, n, k):
 @inlined
 def pivots_of(memory, s, n, k):
     """Return a view of the pivots (n integers) of the filter (k = 0), or of the system of eigenvalue number k - 1."""
-    return _tail(memory, s, n, k)[:n].view(np.int64)
+    return _after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 
 @inlined
 def complex_vector(memory, s, n, n_eigen, which):
     """Return a view of complex scratch vector `which` (n), 0 or 1, of `memory`."""
-    return _tail(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)
+    return _after_vectors(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)
 
 
 @kernel(ATTEMPT)

@@ -62,7 +62,7 @@ ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # indices of the arrays of a table of operations, and of a list of sums, see `Sums` in twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-PLACES = N_SUMS  # index of the array, after those of a list of sums, with the indices at which the sums are stored
+SUM_INDICES = N_SUMS  # index of the array, after those of a list of sums, with the indices at which the sums are stored
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
@@ -158,11 +158,11 @@ def _gather(options, sums, groups, g, more, values, out):
 
 @merged
 def _sum(options, sums, scale, values, out):
-    """Store `scale` times each sum of a list, without its constant, in `out` at its index in PLACES."""
+    """Store `scale` times each sum of a list, without its constant, in `out` at its index in SUM_INDICES."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
-    places = _integers(options, sums + PLACES)
+    indices = _integers(options, sums + SUM_INDICES)
     for o in range(column.size):
-        out[places[o]] = scale * coefficient[o] * values[column[o]]
+        out[indices[o]] = scale * coefficient[o] * values[column[o]]
     row, column = _integers(options, sums + ROW), _integers(options, sums + MORE_COLUMN)
     coefficient = _numbers(options, sums + MORE_COEFFICIENT)
     for e in range(row.size):
@@ -326,7 +326,7 @@ def expand(f, w, options, memory, t, state, unit):
     A, LAM = 1 + 2 * n, 1 + 3 * n
     first = LAM + n_rows
     second = first + _integers(options, EARLY + FIRST + COLUMN).size
-    places, constant = _integers(options, BALANCE + PLACES), _numbers(options, BALANCE + CONSTANT)
+    indices, constant = _integers(options, BALANCE + SUM_INDICES), _numbers(options, BALANCE + CONSTANT)
 
     begin_series(options, t, unit, state, N, series, first, X1[0], Y1[0], r, c)
     for k in range(order - 1):
@@ -343,8 +343,8 @@ def expand(f, w, options, memory, t, state, unit):
             _next_coefficients(options, LATE, k, N[k], N[k, second:], X2[k], Y2[k], X2[0], Y2[0], total2)
         _sum(options, BALANCE, 1.0, N[k], r)
         if k == 0:
-            for o in range(places.size):
-                r[places[o]] += constant[o]
+            for o in range(indices.size):
+                r[indices[o]] += constant[o]
         a, lam = N[k, A : A + n], N[k, LAM : LAM + n_rows]
         if w.rows_v.size < n_rows:
             lam[:] = 0.0
@@ -393,16 +393,16 @@ def _allowed_step(tolerances, series, unit, order, n):
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
         atol = tolerances[ATOL + j]
-        of_q = 1.0 / (atol + rtol * abs(series[j]))
-        of_v = 1.0 / (atol * unit + rtol * abs(series[n + j]))
-        last = max(last, abs(series[row + j]) * max(of_q, order * of_v))
-        before = max(before, abs(series[row_before + j]) * max(of_q, (order - 1) * of_v))
-    least = -np.inf  # logarithm of the reciprocal of the result
+        weight_q = 1.0 / (atol + rtol * abs(series[j]))
+        weight_v = 1.0 / (atol * unit + rtol * abs(series[n + j]))
+        last = max(last, abs(series[row + j]) * max(weight_q, order * weight_v))
+        before = max(before, abs(series[row_before + j]) * max(weight_q, (order - 1) * weight_v))
+    log_inverse = -np.inf  # logarithm of the reciprocal of the result
     if last > 0.0:
-        least = np.log(last) / order
+        log_inverse = np.log(last) / order
     if before > 0.0:
-        least = max(least, np.log(before) / (order - 1))
-    return np.exp(-least)
+        log_inverse = max(log_inverse, np.log(before) / (order - 1))
+    return np.exp(-log_inverse)
 
 
 @merged
@@ -412,7 +412,7 @@ def _evaluate(series, unit, order, x, q, v, a):
     Four or two coordinates are evaluated at once. The recurrence for the second derivative yields half of it.
     """
     n, per_unit = q.size, 1.0 / unit
-    twice = 2.0 * per_unit * per_unit
+    a_factor = 2.0 * per_unit * per_unit
     for first in range(0, n if n > 3 else 0, 4):
         j = min(first, n - 4)
         m = order * n + j
@@ -426,7 +426,7 @@ def _evaluate(series, unit, order, x, q, v, a):
             q2, q3 = q2 * x + series[m + 2], q3 * x + series[m + 3]
         q[j], q[j + 1], q[j + 2], q[j + 3] = q0, q1, q2, q3
         v[j], v[j + 1], v[j + 2], v[j + 3] = v0 * per_unit, v1 * per_unit, v2 * per_unit, v3 * per_unit
-        a[j], a[j + 1], a[j + 2], a[j + 3] = a0 * twice, a1 * twice, a2 * twice, a3 * twice
+        a[j], a[j + 1], a[j + 2], a[j + 3] = a0 * a_factor, a1 * a_factor, a2 * a_factor, a3 * a_factor
     for first in range(0, n if n < 4 else 0, 2):
         j = max(min(first, n - 2), 0)
         k = min(j + 1, n - 1)
@@ -437,7 +437,7 @@ def _evaluate(series, unit, order, x, q, v, a):
             v0, v1 = v0 * x + q0, v1 * x + q1
             q0, q1 = q0 * x + series[m + j], q1 * x + series[m + k]
         q[j], q[k], v[j], v[k] = q0, q1, v0 * per_unit, v1 * per_unit
-        a[j], a[k] = a0 * twice, a1 * twice
+        a[j], a[k] = a0 * a_factor, a1 * a_factor
 
 
 @compiled
@@ -467,10 +467,10 @@ def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
-    look, shift = tolerances[LOOK], memory[ATTEMPTS] * GOLDEN % 1.0
+    max_gap, shift = tolerances[LOOK], memory[ATTEMPTS] * GOLDEN % 1.0
     n_points = 0
-    if h > look:
-        n_points = int(np.ceil(h / look))
+    if h > max_gap:
+        n_points = int(np.ceil(h / max_gap))
     for k in range(-1, n_points):
         s = (k + shift) / n_points if k >= 0 else (memory[SUSPECT] - t) / h
         if k < 0 and not (memory[SUSPECTED] == 1.0 and 0.0 < s < 1.0):

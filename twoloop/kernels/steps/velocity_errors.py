@@ -17,7 +17,7 @@ from twoloop.kernels.data.indices import DONE, GAP
 from twoloop.kernels.evaluation.inner_loop import evaluate
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import stages as at
-from twoloop.kernels.steps.newton_systems import DIFFERENCE
+from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
 # largest factor on the duration of a velocity error that changes as slowly as the motion: such an error is no
@@ -127,7 +127,7 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_
         size = max(size, abs(V[w.independent[i]]))
     if largest == 0.0:
         return True
-    factor = max(1.0, DIFFERENCE * size / largest)
+    factor = max(1.0, RELATIVE_DISPLACEMENT * size / largest)
     copy(q1, Q)
     copy(v1, V)
     for i in range(w.independent.size):
