@@ -50,9 +50,7 @@ N = 9  # number of nodes
 
 
 class Tables(NamedTuple):
-    """Linear maps of the polynomial through values at the nodes c_0 = 0 < ... < c_8 = 1.
-
-    A table (9, 8) maps values at the nodes to 8 results: its row k is multiplied by the value at node k.
+    """Linear maps from values at the nodes c_0 = 0 < ... < c_8 = 1; row k of a map multiplies the value at node k.
 
     Attributes
     ----------
@@ -139,12 +137,8 @@ STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
 # the iteration; its contraction rho is the ratio of the changes of velocities in two successive sweeps
-# error at which the iteration stops, relative to the tolerance: with this value, total errors are no larger than those
-# of DOP853
-KAPPA = 0.02
-# number of sweeps for which the step size is chosen; one more if the prediction has degree 6, two more from degree 7
-# on, because such steps are long
-TARGET_SWEEPS = 6.0
+KAPPA = 0.02  # error at which the iteration stops, relative to the tolerance: total errors are at most those of DOP853
+TARGET_SWEEPS = 6.0  # number of sweeps for which the step size is chosen; larger with predictions of degree 6 and more
 EXTRA_SWEEPS = 7  # number of sweeps beyond the target at which a step that has not converged is rejected
 MAX_CONTRACTION = 0.8  # contraction from which on a step is rejected in its fourth sweep, or later
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # lower and upper bound that replace a measured contraction outside of them
@@ -152,7 +146,7 @@ MIN_RHO, MAX_RHO = 1e-3, 0.9  # lower and upper bound that replace a measured co
 FAST_START, SLOW_START = 0.04, 0.3
 # contraction from which on the changes are rounding errors if they are below NOISE, relative to the values
 STAGNATION_RATIO = 0.5
-# in steps of fixed size these replace KAPPA, NOISE (as forces may have rounding errors), and the limit of sweeps
+# in steps of fixed size, values of KAPPA, of NOISE (as forces may have rounding errors), and of the limit of sweeps
 KAPPA_OF_FIXED, NOISE_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 LEAST_CHANGE = 1e-30  # added to the ratio of the iteration's error to KAPPA before its logarithm is computed
 ERROR_WEIGHT = 0.5  # factor of the error estimate
@@ -179,8 +173,6 @@ class CollocationCode:
     ----------
     iterated : list of int
         Coordinates on whose positions or velocities the accelerations depend.
-    others : list of int
-        The other coordinates.
     numbers : Coefficients
         Coefficients that the functions read.
     structure : str
@@ -311,8 +303,8 @@ class CollocationCode:
     def _begin_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
         """Store WEIGHTS, STRICTER, SIZE and POWERS, and predicted positions and velocities at the nodes.
 
-        The size to which rtol applies is that of the position (or velocity) at the beginning, or its change in half a
-        step if that is larger. In steps of fixed size, which have no error estimate, rtol = atol = 1.
+        rtol applies to the position (or velocity) at the beginning, or to its change in half a step if that is larger.
+        In steps of fixed size, which have no error estimate, rtol = atol = 1.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
@@ -512,10 +504,9 @@ class CollocationCode:
         one.store(builder.extract(factors, 1), work, at.FACTOR_OF_ERROR)
 
     def audit(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Return the largest defect of the accelerations at the midpoints between nodes, relative to its limit.
+        """Return the largest defect at the midpoints between nodes, relative to its limit, or FAILED.
 
-        Return FAILED if these accelerations are invalid. Store FACTOR_OF_DEFECT, the largest ratio of the next step
-        size to this one that the defect allows.
+        Store FACTOR_OF_DEFECT, the largest ratio of the next step size to this one that the defect allows.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers

@@ -78,8 +78,7 @@ def call_accelerations(
 ) -> Value:
     """Write a call that fills the array `filled` with the accelerations at `inputs`; return whether they are valid.
 
-    `inputs`: [t, q, v]. `index`: index of a program in `equations.accelerations`: 0: the one with the fewest
-    operations; -1: the one that eliminates M first.
+    `index` of the program in `equations.accelerations`: 0: that with the fewest operations; -1: that eliminating M.
     """
     array = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
@@ -166,9 +165,8 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
-# numbers of operations above which equations are split into functions, which halves the time to compile.
-# SPLIT_PROJECTIONS: if there is a reduced program for the accelerations, which is not split. SPLIT_ALL: if there is
-# none; it is larger, because split accelerations take 50 % longer to run
+# numbers of operations above which equations are split into functions, which halves the time to compile. SPLIT_ALL: if
+# there is no reduced program for the accelerations, which is never split; split accelerations take 50 % longer to run
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
@@ -395,20 +393,14 @@ class SharedCode:
     ----------
     equations : Elimination
     cache : TraceCache
-        Cache of the traces from which `equations` were generated.
 
     Attributes
     ----------
-    parts : SplitFunctions or None
-        Generator of the functions into which the equations are split; None: they are not split.
-    outputs : dict
-        Programs by names of functions, for those functions that are not split.
     numbers : Coefficients
         Coefficients that the functions read.
     digest : str
         Digest of everything that the functions depend on, except the values of coefficients.
     functions : GeneratedFunctions
-        The compiled functions.
     """
 
     def __init__(self, equations: Elimination, cache: TraceCache):

@@ -91,10 +91,7 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return, by kind of missing callback, a dict of expressions by their flat indices in the callback's array.
-
-    Both gammas are rows of one array: `gamma` stands for both.
-    """
+    """Return, by kind of missing callback (`gamma` for both), expressions by flat indices in the callback's array."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -109,8 +106,7 @@ def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int,
 Array = NDArray[np.float64]
 
 MOST_ENTRIES = 50_000  # largest number of entries of C_q for which derivatives are compared with exact ones
-# displacements of states from the start at which derivatives are compared: of coordinates, relative to their sizes, and
-# of the time, relative to FIRST_TIME_SCALE
+# displacements from the start at which derivatives are compared, relative to sizes of coordinates and FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
@@ -167,10 +163,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return states, as rows [t, q, v], with their velocities replaced by random ones that are not zero.
-
-    The random velocities are proportional to the sizes of the coordinates, and about as large as those of the states.
-    """
+    """Return states as rows [t, q, v] with other velocities, random but not zero, about as large as the given ones."""
     times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
     generic = np.array([sizes(q) for q in positions]) * _factors(*positions.shape)
     speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic).max()))

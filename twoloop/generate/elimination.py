@@ -13,7 +13,7 @@ necessary.
   generated code then reports that its results are invalid.
 - The same factors are used to compute the nearest position and velocity on the constraints, in the metric of M.
 - If M is singular, rows g of G are added to it: M + g^T g. This changes neither accelerations nor projections.
-- If rows of G are redundant, the equations contain only independent rows, as many as the rank of G.
+- If rows of G are redundant, the equations contain independent rows only.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,11 +49,10 @@ N_FEW = 24  # largest number of coordinates for which FEW_FROM applies
 # to N_FEW coordinates (pivots below 1e-3). FEW_SINGULAR_FROM: the same if M is singular, as Euler parameters lose two
 # digits in sound models. MANY_FROM: for more than N_FEW coordinates, as added rows make their code much longer.
 FEW_FROM, FEW_SINGULAR_FROM, MANY_FROM = 4, 5, 6
-ADDED_SIZE = 16.0  # largest entry of s G^T G, which is added to M, relative to the largest entry of M
-# decrease of the index in BOUNDS that added rows must achieve; otherwise the rows of G are nearly dependent for any M
-MIN_GAIN = 2
-# ratio of rows of G to coordinates from which on dependent coordinates are expressed by independent ones; with fewer
-# rows, the linear system for the multipliers is smaller
+ADDED_SIZE = 16.0  # size of s G^T G, which is added to M, relative to the largest entry of M
+MIN_GAIN = 2  # smallest decrease of the index in BOUNDS by added rows; else rows are nearly dependent for any M
+# number of rows of G per coordinate from which on dependent coordinates are eliminated; with fewer rows, the linear
+# system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
 
 Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]

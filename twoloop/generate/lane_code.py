@@ -43,10 +43,8 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-# error of predicted positions, relative to its limit, for which the next step is chosen after one was rejected by it
-TARGET_ERROR = 0.3
-# ratio of the next step size to the last one: smallest value, safety factor, largest value
-MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0
+TARGET_ERROR = 0.3  # error of predicted positions, over its limit, for which a step is chosen after a rejection by it
+MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
 MAX_REJECTIONS = 10  # largest number of successive rejections; after more, a lane fails
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
 # a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q), or RELATIVE_CORRECTION times
@@ -80,10 +78,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Store and return UNIT, the unit of time of the series, s; it changes in new runs and after accepted steps.
-
-        Reset LONGEST and SHIFT in new runs.
-        """
+        """Store and return UNIT, the unit of time of the series, s, which changes in new runs and accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
         span = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))

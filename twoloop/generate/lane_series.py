@@ -1,10 +1,10 @@
-"""Emit code for SIMD lanes, where every number is a vector, and for the recurrences of a Taylor series in lanes.
+"""Write code for SIMD lanes, where every number is a vector, and for the recurrences of a Taylor series in lanes.
 
-The recurrences compute the coefficients of one order from those of lower orders. Factors of products are stored in
-rows, one row for each order; a factor that several products share is stored once.
+The recurrences compute the coefficients of one order from those of lower orders. The Taylor coefficients of the factors
+of products are stored in rows, one row for each order; a factor that several products share is stored once.
 
-Usually each lane has its own run. In collocation steps each lane has a stage of one run; for these, `load_lanes` and
-`store_lanes` take indices that count numbers instead of vectors.
+Usually each lane has its own run. In collocation steps each lane has a stage of one run; for such vectors, `load_lanes`
+and `store_lanes` have indices that count numbers instead of vectors.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,11 +29,11 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.kernels.lanes.layout import LANES
 
-# log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at Chebyshev points. Their errors, 2e-06 and 1e-07,
-# suffice for step sizes.
+# coefficients of polynomials, lowest power first, for log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at
+# Chebyshev points. Their errors, 2e-06 and 1e-07, are small enough for step sizes.
 LOG2 = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
 EXP2 = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
-LARGEST_POWER, SMALLEST = 1000.0, 1e-300  # limits of the arguments of 2^x and log2, against overflow
+LARGEST_POWER, SMALLEST = 1000.0, 1e-300  # largest |x| in 2^x, and smallest argument of log2, against overflow
 
 
 class LaneEmitter(Emitter):
@@ -62,18 +62,18 @@ class LaneEmitter(Emitter):
         return self.splat(super().far(value))
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal, or load a coefficient: one value for each lane if it varies, else one for all lanes."""
+        """Return a literal, or a Coefficient loaded from memory: a vector if it varies, else one value in all lanes."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         place = self.builder.gep(self.constants, integer(number.place))
         return self.splat(self.builder.load(place, constant=True))
 
     def number(self, whole: Value) -> Value:
-        """Convert an integer to a vector with that number in all lanes."""
+        """Return a vector of doubles with an integer in all lanes."""
         return self.splat(super().number(whole))
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
-        """Return a pointer advanced by a number of vectors."""
+        """Return the pointer `base` advanced by the sum of `places`, counted in vectors."""
         for place in places:
             scaled = (
                 integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
@@ -91,7 +91,7 @@ class LaneEmitter(Emitter):
         self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*"))
 
     def function(self, name: str, x: Value) -> Value:
-        """Apply an LLVM intrinsic to all lanes at once, or a function of libm lane by lane."""
+        """Return f(x) in each lane, by one LLVM intrinsic for all lanes, or by a function of libm lane by lane."""
         if name in INTRINSICS:
             return super().function(name, x)
         result, one = undefined(self.double), Emitter(self.builder)
@@ -100,7 +100,7 @@ class LaneEmitter(Emitter):
         return result
 
     def largest_lane(self, x: Value) -> Value:
-        """Return the largest number of all lanes; the reduction of LLVM would be sequential, to treat NaN exactly."""
+        """Return the largest number of all lanes; LLVM's reduction, which treats NaN exactly, would be sequential."""
         width = self.lanes
         while width > 2:
             width //= 2
@@ -131,31 +131,31 @@ class LaneEmitter(Emitter):
         )
 
     def smallest_of(self, a: Value, b: Value) -> Value:
-        """Return the smaller of two numbers, or the first one if either is NaN: so a NaN in the first is kept."""
+        """Return the smaller of two numbers, or `a` if one of them is NaN; so the result is NaN if `a` is."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def largest_of(self, a: Value, b: Value) -> Value:
-        """Return the larger of two numbers, or the first one if either is NaN: so a NaN in the first is kept."""
+        """Return the larger of two numbers, or `a` if one of them is NaN; so the result is NaN if `a` is."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
 
 def vector_index(emit: LaneEmitter, k: Value) -> Value:
-    """Return the index at which vector k begins, counted in numbers."""
+    """Return the index, counted in numbers, at which vector k of an array of vectors begins."""
     return emit.builder.mul(k, integer(STAGES))
 
 
 def load_lanes(emit: LaneEmitter, base: Value, place: int = 0) -> Value:
-    """Load a vector of stages at an index that counts numbers."""
+    """Return the vector of STAGES numbers at `place`, an index that counts numbers."""
     return Emitter(emit.builder).load_vector(base, place, STAGES)
 
 
 def store_lanes(emit: LaneEmitter, value: Value, base: Value, place: int = 0) -> None:
-    """Store a vector of stages at an index that counts numbers."""
+    """Store a vector of STAGES numbers at `place`, an index that counts numbers."""
     Emitter(emit.builder).store_vector(value, base, place)
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """Return the sum over the lanes of each of two vectors; both sums take the instructions of one."""
+    """Return the sum of the lanes of a, and that of b; the two sums share their instructions."""
     builder, half = emit.builder, STAGES // 2
     lower, upper = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
     total = emit.add(builder.shuffle(a, b, lower), builder.shuffle(a, b, upper))
@@ -165,7 +165,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return a vector with the elements that some vectors have in one lane."""
+    """Return a vector whose elements are those of `vectors` in one lane (for a single vector, this element)."""
     builder, places = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -180,7 +180,7 @@ def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
 def loop_over(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Write a loop over some coordinates: yield the count, the coordinate, and the lists of `Emitter.loop`."""
+    """Return a context for the body of a loop: it yields a count, a coordinate, and the two lists of `Emitter.loop`."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
@@ -188,26 +188,26 @@ def loop_over(
         yield k, i, values, new
 
 
-ZEROS = -1  # index of a row of zeros, before the row of order 0
-# number of sums that one loop computes: the totals of more sums would not fit into 32 (or 16) registers
+ZEROS = -1  # index of the row of factors that is zero: it is stored before the row of order 0
+# largest number of sums in one loop: the totals of more sums would not fit into 32 (or 16) registers
 SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
 class Operation(NamedTuple):
-    """Operation in the program of a series; sine and cosine are one operation with two results."""
+    """Operation in the program of a series; sine and cosine of an angle are one operation with two results."""
 
     kind: int
-    results: tuple[int, ...]
-    first: tuple[Terms, float]
-    second: tuple[Terms, float]
+    results: tuple[int, ...]  # quantities
+    first: tuple[Terms, float]  # terms and constant of the first argument
+    second: tuple[Terms, float]  # terms and constant of the second argument
 
 
 class LaneSeries:
     """Generator of the code for the recurrences of a program.
 
-    `scratch` holds, as lane vectors: the factors of the linear equations; their right-hand side r; the reciprocal
-    divisors of inverse functions; sums that are carried to the next order; a row of zeros; and one row of factors for
-    each order from 0 on.
+    `scratch` contains, in this order, as vectors: the factors of the linear equations; their right-hand side r; the
+    reciprocal divisors in recurrences of roots, logarithms and arctangents; sums that are carried over to the next
+    order; a row of zeros; and one row of factors for each order from 0 on.
     """
 
     def __init__(self, program: SeriesProgram, solution: Solution, numbers: Coefficients, n: int, n_rows: int):
@@ -219,7 +219,8 @@ class LaneSeries:
         self.late = self._operations(program.late, first + len(program.early.first.column))
         self.rows = self._rows(program.rows, program.row_places)
         self.balance = self._rows(program.balance, program.balance_places)
-        self._carried: dict[int, tuple[int, int]] = {}  # see _shared_sums
+        # factors of the carried sum, by product; empty at first, because `_shared_sums` calls `_factors`
+        self._carried: dict[int, tuple[int, int]] = {}
         self._carried |= self._shared_sums()
         self.sums_ahead = sorted(set(self._carried.values()))
         for operation in (*self.early, *self.late):
@@ -234,7 +235,7 @@ class LaneSeries:
         self.table = self.zeros + self.width
 
     def scratch_size(self, order: int) -> int:
-        """Return the length of `scratch`, in vectors."""
+        """Return the length of `scratch`, in vectors, for a series of the given order."""
         return self.table + self.width * (order + 1)
 
     @property
@@ -266,14 +267,14 @@ class LaneSeries:
         return operations
 
     def _slot(self, *key: Any) -> int:
-        """Return the index of a factor in a row; the factor is a form, or ("scaled", form): a form times the order."""
+        """Return the index of a factor in a row; key: terms and constant; after "scaled", times the order."""
         return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Map products (cos x) x' and (sin x) x' to the factors that the recurrences of sin x and cos x sum up.
+        """Return, by product (cos x) x' or (sin x) x', the factors of the sum in the recurrence of sin x or cos x.
 
         (cos x) x' is the derivative of sin x. So the part of the product's coefficient that is known before an order is
-        solved is the sum for the sine of the next order, divided by the unit of time.
+        solved is the sum in the recurrence of the sine for the next order, divided by the unit of time.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -287,7 +288,7 @@ class LaneSeries:
         return {result: pair for result, pair in known.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return, for each result, the indices of the factors X and Y whose products the recurrence sums up."""
+        """Return the indices in a row of the factors X and Y whose products the recurrence of each result sums up."""
         kind, results, first, second = operation
         if results[0] in self._carried:
             return []
@@ -304,7 +305,7 @@ class LaneSeries:
         return [(x, own[1]), (x, own[0])] if kind == SINE else [(x, own[0])]
 
     def begin(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Emit order 0 at t, q and v; the factors of the linear equations are in `scratch` already."""
+        """Write code for order 0 at `inputs`, [t, q, v]; the factors of the linear equations are stored already."""
         for place in (*range(self.r, self.divisors), *range(self.carried, self.table)):
             emit.store(emit.constant(0.0), scratch, place)
         row = _Row(self, emit, emit.pointer(scratch, self.table))
@@ -315,7 +316,7 @@ class LaneSeries:
             emit.store(known.sum(*form), scratch, self.r + place)
 
     def order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Emit one order of the series: velocities of this order, positions of the next."""
+        """Write code for order k > 0: velocities of order k, positions of order k + 1 in `out`; `unit`: of time, s."""
         builder, n = emit.builder, self.n
         following = builder.add(k, integer(1))
         q = emit.pointer(out, builder.mul(k, integer(n)))
@@ -345,7 +346,7 @@ class LaneSeries:
         solution = self.solution
         _, (a, lam) = lower(emit, solution.solved, [*r, *c, *kept], self.numbers)
         per_v, per_q = emit.multiply(unit, inverse), emit.divide(unit, emit.number(following))
-        before = Quantities(emit, lambda i: zero)  # a and lam of the previous order
+        before = Quantities(emit, lambda i: zero)  # a and lam of order k - 1
         for j in range(n):
             v = emit.multiply(per_v, a[j])
             known.define(1 + n + j, v)
@@ -367,7 +368,7 @@ class LaneSeries:
     def _begin(
         self, emit: LaneEmitter, known: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Emit order 0 of some operations; factors of pending products are stored as far as they are known."""
+        """Write code for order 0 of operations: store their factors, as far as they are known, and define results."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -403,7 +404,7 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Sum X[j] Y[k - j] over 1 < j < k for pairs of factors; for the pairs in `sums_ahead`, sum X[j] Y[k + 1 - j].
+        """Return sums over 1 < j < k: X[j] Y[k - j] by (factors, False), and X[j] Y[k + 1 - j] by (factors, True).
 
         `_Edges` adds the first and last terms when they are known. So one loop computes several sums, does not wait for
         the previous order, and loads each row once.
@@ -412,7 +413,7 @@ class LaneSeries:
         wanted = [(pair, True) for pair in self.sums_ahead]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
         wanted += [(pair, False) for pair in pairs - set(self.sums_ahead)]
-        wanted.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours in this order share a row
+        wanted.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours often share a factor
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
         following = builder.add(k, integer(1))
         for begin in range(0, len(wanted), SUMS_IN_LOOP):
@@ -441,7 +442,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Emit the operations for an order above 0; for pending products, the part that is known already."""
+        """Write code for order k > 0 of operations: store factors, define results (if pending, as far as known)."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:
@@ -490,14 +491,14 @@ class LaneSeries:
 
 
 class _Row:
-    """Row of the factors of one order; values that were stored are kept, so that they are not loaded again."""
+    """Row of the factors of one order in memory; values that were stored by this object are not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store a factor at its index; with `when` = "if used", factors without an index are skipped."""
+        """Store the value of a factor at its index; if `when` is "if used", skip factors without an index."""
         place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
         if place is not None and place not in self._stored:
             self._stored[place] = value
@@ -509,20 +510,20 @@ class _Row:
 
 
 class _Edges(NamedTuple):
-    """First and last terms of the sums of order k; `first` is the row of order 1, or zeros if k is 1."""
+    """Sums of order k without their first and last terms, and the rows with the factors of these terms."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]
-    first: Value
-    one: Value  # the row of order 1
-    before: _Row  # the row of order k - 1
+    sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._sums`
+    first: Value  # pointer to the row of order 1, or to zeros if k is 1
+    one: Value  # pointer to the row of order 1
+    before: _Row  # row of order k - 1
 
     def now(self, pair: tuple[int, int]) -> Value:
-        """Return the sum of X[j] Y[k - j] over 0 < j < k."""
+        """Return the sum of X[j] Y[k - j] over 0 < j < k for the factors (X, Y) = `pair`."""
         emit, (x, y) = self.before.emit, pair
         return emit.add(self.sums[pair, False], emit.multiply(emit.load(self.first, x), self.before.load(y)))
 
     def next_sum(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k, from the row of order k."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k for (X, Y) = `pair`; `row` has the factors of order k."""
         emit, (x, y) = self.before.emit, pair
         total = emit.add(self.sums[pair, True], emit.multiply(row.load(x), emit.load(self.first, y)))
         return emit.add(total, emit.multiply(emit.load(self.one, x), row.load(y)))

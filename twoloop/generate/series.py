@@ -1,8 +1,8 @@
 """Write the program for the Taylor series of a mechanism's motion.
 
-Each order needs G = [C_q; A] and its rates, M and Q, see taylor_step.py. Operations on time and coordinates only, as
-those of G and M, are called early; the others, which depend on velocities, are called late. G v and G^T lam + M a are
-written with few products: terms that share a factor become one product.
+Each order needs G = [C_q; A], its rates, M and Q, see taylor_step.py. Operations on time and coordinates only, such as
+those for G and M, are called early; operations that depend on velocities are called late. G v and G^T lam + M a are
+computed with few products: terms that share a factor become one product.
 """
 
 from collections.abc import Container, Sequence
@@ -23,33 +23,34 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-# largest number of entries of M and C_q for which a series is traced, unless the user asks for it
+# largest number of entries of M and [C_q; A] for which a series is traced, unless the user chooses the Taylor method
 MOST_ENTRIES = 200_000
 
 READ = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
 
 
 class Sums(NamedTuple):
-    """Affine expressions as arrays: one array for the first terms of all expressions, others for further terms."""
+    """Affine expressions as arrays: first terms and constants, one per expression, and all further terms."""
 
-    column: Integers  # quantity of the first term
-    coefficient: Array
+    column: Integers  # quantity in the first term of each expression
+    coefficient: Array  # coefficient of the first term of each expression
     constant: Array
-    row: Integers  # expression to which a further term belongs
-    more_column: Integers
+    row: Integers  # index of the expression to which each further term belongs
+    more_column: Integers  # quantity in each further term
     more_coefficient: Array
 
 
 @dataclass(frozen=True)
 class Table:
-    """Table of operations in an order of computation; their results are consecutive quantities.
+    """Table of operations in the order of their computation; their results are consecutive quantities.
 
     Attributes
     ----------
     groups : ndarray (n, 7)
-        One row for each group of independent operations of a kind: the kind, and first and end index of the operations,
-        of the further terms of their first arguments, and of those of their second arguments. A group of sines includes
-        the cosines of the same angles. The last group has the products that need the solution of the linear system.
+        One row for each group of independent operations of one kind: the kind, and first and end index of the
+        operations, of the further terms in their first arguments, and of the further terms in their second arguments.
+        A group of sines includes the cosines of the same angles. The last group contains the products whose second
+        factors depend on the solution of the linear system.
     first, second : Sums
         Arguments of the operations.
     """
@@ -61,21 +62,21 @@ class Table:
 
 @dataclass(frozen=True)
 class SeriesProgram:
-    """Program of a series, on the quantities t, q, v, a, lam, results of `early`, results of `late`.
+    """Program of a series; its quantities are, in this order, t, q, v, a, lam, results of `early`, results of `late`.
 
     Attributes
     ----------
     n_q, n_rows : int
     early : Table
-        Early operations; the last are the products of G v.
+        Early operations; the last ones are the products in G v.
     late : Table
-        Late operations; the last are the products of G^T lam + M a.
+        Late operations; the last ones are the products in G^T lam + M a.
     rows, row_places : Sums, ndarray
-        G v + G_t without multiples of v: the rows that are not zero, and their indices.
+        G v + G_t without terms c v_i: the rows that are not zero, and their indices.
     balance, balance_places : Sums, ndarray
-        Q - G^T lam - M a without multiples of lam and a: the entries that are not zero, and their indices.
+        Q - G^T lam - M a without terms c lam_i and c a_i: the entries that are not zero, and their indices.
     traced : Traced or None
-        The traced callbacks.
+        Traces of the callbacks.
     """
 
     n_q: int
@@ -94,7 +95,7 @@ class SeriesProgram:
         return len(self.early.first.column) + len(self.late.first.column)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
-        """Return the program with coefficients for the parameters of one system."""
+        """Return a copy of the program with coefficients for the parameters of one system."""
 
         def sums(given: Sums) -> Sums:
             coefficient, constant = evaluate(given.coefficient), evaluate(given.constant)
@@ -119,12 +120,12 @@ class SeriesProgram:
 
 
 def is_quick(system: ConstrainedSystem) -> bool:
-    """Return whether a series is traced within about a second; matrices are traced as full matrices."""
+    """Return whether tracing a series takes about a second at most: all entries of matrices are traced."""
     return system.n_q * (system.n_q + system.n_c + system.n_a) <= MOST_ENTRIES
 
 
 def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesProgram:
-    """Return the cached program of a system; `check` raises if calls of callbacks differ from their traces.
+    """Return the cached series program of a system; `check` raises if calls of callbacks differ from their traces.
 
     Raises
     ------
@@ -142,9 +143,9 @@ def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesPro
 def series_program(
     system: ConstrainedSystem, equations: Equations | None = None, independent: Container[int] | None = None
 ) -> SeriesProgram:
-    """Trace the callbacks of a system and return its program.
+    """Trace the callbacks of a system and return its series program.
 
-    `independent`: the rows of G that the program contains; None: all rows.
+    `equations`: traces to be extended; None: new ones. `independent`: rows of G in the program; None: all rows.
 
     Raises
     ------
@@ -178,7 +179,7 @@ def series_program(
 
 
 def _sums_of(graph: Graph) -> dict[int, Affine]:
-    """Return the expression of each quantity that is a sum, to be substituted: sums need no recurrence of their own."""
+    """Return a dict from quantities that are sums to their expressions, which replace them: sums need no recurrence."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -187,7 +188,7 @@ def _sums_of(graph: Graph) -> dict[int, Affine]:
 
 
 def _without_sums(sums: dict[int, Affine], form: Affine) -> Affine:
-    """Replace the quantities of an expression that are sums by their terms."""
+    """Return an expression in which quantities that are sums are replaced by their terms."""
     named = [i for i in form.terms if i in sums]
     if not named:
         return form
@@ -205,10 +206,10 @@ def _sum_of_products(
     products: dict[Any, Any],
     of_rates: bool,
 ) -> Affine:
-    """Return rest + sum_i factors[i] multipliers[i] with few products, which are added to `products`.
+    """Return rest + sum_i factors[i] multipliers[i], with few products; add these to the dict `products`.
 
-    Terms are collected by factors, or by the quantities in the factors, whichever gives fewer products. If both give
-    the same number, rates are collected by quantities: (cos x) x' is the derivative of sin x.
+    Terms are collected by factors, or by the quantities in the factors, whichever needs fewer products. If both need
+    the same number, rates (`of_rates`) are collected by quantities: (cos x) x' is the derivative of sin x.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -235,7 +236,7 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Normalize a product; return its key, its scale, and both factors."""
+    """Return the key of a product, its constant factor, and both factors; the second one is normalized."""
     scale, multiplier = multiplier.normalised()
     return (factor.key, multiplier.key), scale, factor, multiplier
 
@@ -293,7 +294,7 @@ def _assemble(
 
 
 def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
-    """Return the operations that expressions need; if the sine of an angle is needed, so is the cosine."""
+    """Return quantities and operations that expressions need; with the sine of an angle, the cosine is needed, too."""
     needed = set(graph.needed_by(forms))
     pairs = (SINE, COSINE)
     angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in pairs}
@@ -305,7 +306,7 @@ def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions and their indices."""
+    """Return those of some expressions that are not zero, as Sums, and their indices; `place`: index by quantity."""
     kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
     sums = _sums([forms[k] for k in kept], place)
     places = np.array(kept, dtype=np.int64)
@@ -313,12 +314,12 @@ def _nonzero_sums(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Int
 
 
 def _without(form: Affine, inputs: Container[int]) -> Affine:
-    """Return an expression without its terms in some quantities."""
+    """Return an expression without its terms in the quantities `inputs`."""
     return Affine(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
 
 
 def _groups(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Group operations by kind, so that a group depends only on the groups before it; return kinds and groups."""
+    """Return groups of operations of one kind, as (kind, operations); a group depends only on the groups before it."""
     nodes = {node for node, *_ in operations}
     level: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}

@@ -31,8 +31,7 @@ SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations whose results have no short 
 MAX_DEGREE = 8
 MAX_DEGREE_OF_STATE = 32  # largest degree of polynomials in q and v, and of their roots, without short pulses
 MAX_DEGREE_OF_DIVISOR = 4  # largest total degree, in q and v, of the divisors of a quotient without short pulses
-# exponent of the fastest decay, for large x = q or v, of quotients without short pulses: 1 / (1 + (x / w)**2) has none,
-# its square may have one
+# exponent of the fastest decay, for large x, of quotients without short pulses, such as 1 / (1 + (x / w)**2)
 FASTEST_DECAY = -2.0
 # largest derivative of the argument of a sine, rad per unit of a coordinate or velocity, that long steps resolve
 MAX_RATE = 4.0
@@ -65,7 +64,7 @@ def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForc
     """Return whether forces, C_t or b may act for a short time; True for callbacks that cannot be traced.
 
     Functions called in Python may store their arguments: they are traced only if the force was traced before
-    (`force_was_traced`). With more than MAX_COORDINATES coordinates, pulses by state are not considered.
+    (`force_was_traced`).
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -156,10 +155,7 @@ class Growth(Degrees):
 
 
 class Divisors(Degrees):
-    """Algebra of divisors: a value is the total degree of divisors in a quantity, and of arguments of arctangents.
-
-    The derivative of an arctangent is a quotient. `degrees`: the degrees of all quantities.
-    """
+    """Algebra of divisors: a value is the total degree of divisors in a quantity, and of arguments of arctangents."""
 
     def __init__(self, degrees: Degrees):
         super().__init__()

@@ -10,8 +10,8 @@ missing callbacks. Series, eliminations, references and derived callbacks are ge
 `TraceCache` stores traces for all systems that share their callbacks: coefficients are expressions in the parameters.
 
 - Parameters that are whole numbers are constants in the traces: they may be counts, indices or switches, and zeros and
-  ones save operations. Parameters of equal magnitude are one variable. So the systems of one cache have the same whole
-  numbers, and the same parameters of equal magnitude.
+  ones save operations. Parameters of equal magnitude are one variable. So in the systems of one cache the same
+  parameters are whole numbers, with the same values, and the same parameters have equal magnitudes.
 - A callback that branches on its parameters, or rounds them, is traced for each system.
 """
 
@@ -387,10 +387,7 @@ class Equations:
         return symbols(by_t.of(form) for form in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return -(dG/dt v + dG_t/dt), the right-hand side of G a = gamma, with total derivatives at constant v.
-
-        `rows`, `rates`: kinds of the callbacks for G and for G_t.
-        """
+        """Return -(dG/dt v + dG_t/dt), total derivatives at constant v; `rows`, `rates`: callbacks for G and G_t."""
         moving = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         along = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **moving})
         gamma = self.of(rates)
@@ -425,8 +422,7 @@ def only_quantity(form: Affine) -> int:
 
 
 Array = NDArray[np.float64]
-# scales, indices, products: the entry with index i of an array of expressions is scales[i] * products[indices[i]]
-ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]
+ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]  # entry i is scales[i] * products[indices[i]]
 Evaluator = Callable[[Any], Array]  # evaluates an array of expressions for the parameters of one system
 
 # smallest and largest random value of a parameter in traces: similar sizes, so that rounding hides no term of a sum

@@ -31,23 +31,16 @@ KINDS = (
 )
 N_NEARBY = 8  # number of random states near the start at which calls and traces are compared, besides the start
 TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
-# largest distance of the coordinates of a random state from the start, relative to the sizes of the coordinates
-DISTANCE = 0.3
-# approximate largest number of states at which calls and traces are compared. MAX_OF_CHUNK: in one chunk of a run.
-# MAX_STATES: in a run. MAX_IN_PYTHON: in a run whose callbacks are called in Python.
+DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
+# approximate largest number of compared states: in a chunk of a run, in a run, in a run with callbacks called in Python
 MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
-# approximate largest number of entries compared in a run, counted at all states: large systems have fewer states
-MAX_ENTRIES = 20_000
-# difference between call and trace that counts as a rounding error, relative to the largest term of any entry that the
-# callback returns
+MAX_ENTRIES = 20_000  # approximate largest number of entries compared at all states of a run: large systems have fewer
+# largest difference between call and trace that is a rounding error, relative to the largest term in the callback
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-# relative difference, as for ROUNDING_DIFFERENCE, above which a trace is wrong; a smaller one must be about the same at
-# neighbouring states
-CLEAR_DIFFERENCE = 1e-6
-PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # relative distance of neighbouring states, at most, and their number
+CLEAR_DIFFERENCE = 1e-6  # smaller differences, relative to the same, count only if about equal at neighbouring states
+PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
 MARGIN = 0.01  # margin of a CheckedRegion, relative to its sides: small compared with the steps of a run
-# additional margin, relative to the longest side except time, because coordinates at rest have a side of length 0
-MARGIN_AT_REST = 1e-9
+MARGIN_AT_REST = 1e-9  # further margin, relative to the longest side except time, as coordinates at rest have no side
 
 
 class Traced:
@@ -60,11 +53,6 @@ class Traced:
         The graph of the trace, whose first inputs are t, q and v.
     forms : mapping or None
         Arrays of expressions by kind of callback. None: `graph.traced`, for the callbacks that the system has.
-
-    Attributes
-    ----------
-    trusted : bool
-        Whether calls and traces agreed near a start, and callbacks are compiled, so that they cannot change.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, forms: Mapping[str, Any] | None = None):

@@ -82,14 +82,11 @@ class StallDetector:
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
 LAST_STEPS = 8  # number of steps before a sampled state whose median is the step size at this state
 ITERATIONS = 6  # number of power iterations at each sampled state
-# factor of `initial_direction` when it is added to the directions of the previous sample: it restores coordinates that
-# became zero
-INITIAL_FACTOR = 0.1
+INITIAL_FACTOR = 0.1  # factor of `initial_direction` when added to eigenvectors: it restores coordinates that are zero
 # the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -ALIGNED
 ALIGNED = 0.9
 MIN_STEPS = 200  # number of accepted steps below which a message does not mention stiffness
-# step size times rate, relative to the stability limit, from which on stability limits the steps (median of the sampled
-# states); in smooth motion it is below 0.4
+# median of step size times rate over the stability limit from which on stability limits the steps; 0.4 in smooth motion
 MIN_STABILITY_RATIO = 0.45
 
 

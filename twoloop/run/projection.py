@@ -32,8 +32,7 @@ Array = NDArray[np.float64]
 MIN_SINE = 1e-5  # sine of the angle of a row to the other rows below which a position may be near a dead centre
 # largest number of Newton iterations; largest correction, relative to the largest coordinate, at which they stop
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# largest difference between the projection of a displaced position and its prediction by C_q, relative to the
-# displacement, if both are on the same assembly
+# largest distance of a projection from its prediction by C_q, relative to the displacement, on the same assembly
 MAX_NONLINEARITY = 0.5
 
 

@@ -24,9 +24,7 @@ SAMPLES = 33  # number of positions between two states at which the ratio of sin
 SHOWN = 3  # largest number of singular positions that a message names
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DIFFERENCE = 1e-6
-# smallest norm of a row, relative to the norm expected from the derivative of the row: a row with a smaller norm, which
-# is small at this position only, is scaled as if it had this norm
-MIN_ROW_NORM = 0.1
+MIN_ROW_NORM = 0.1  # norm, relative to that expected from its derivative, below which a row is small at a position only
 # velocities turned if they changed by more than TURNED times the change that accelerations explain, and by more than
 # APPARENT times the tolerances
 TURNED, APPARENT = 3.0, 10.0
@@ -194,8 +192,7 @@ def _measured(ratios: dict[float, float]) -> str:
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
 WEAK = 1e-2  # singular value, relative to the largest one, up to which rounding errors along it are estimated
-# LEAST: ratio of pivots below which errors are always estimated. MARGIN: factor from ratios of singular values to
-# ratios of pivots, at most
+# ratio of pivots below which errors are always estimated; factor from ratios of singular values to ratios of pivots
 LEAST, MARGIN = 1e-5, 30.0
 
 
