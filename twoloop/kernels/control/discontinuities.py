@@ -157,7 +157,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of sampling intervals in one set of samples
 LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-SUDDEN_SHARE = 0.1  # smallest second difference of a sudden change, relative to the range: a bell four spacings wide
+SUDDEN_SHARE = 0.1  # least second difference of a sudden change over the range of samples: a bell four spacings wide
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
 # absolute lower bound of the range of samples that matters, whatever the units: squares of smaller values underflow,
 # and subnormal numbers are too coarsely spaced to look smooth
@@ -166,7 +166,7 @@ N_IN_STEP = 8.0  # number of samples in a step: a force shorter than a quarter o
 RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one below which samples ahead are taken again
 LEAST_APART = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 HALVINGS = 20  # number of bisections that locate the change of a value between two samples
-SAME_CHANGE = 1e-5  # largest distance of changes that count as one change, relative to the widest spacing of samples
+SAME_CHANGE = 1e-5  # largest time between two changes that count as one, relative to the widest spacing of samples
 # time after the start, relative to GAP, before which changes are not recorded: a force that begins at zero, such as
 # 1 - cos(t), changes at the start by rounding
 SOONEST = 5e-5
@@ -175,7 +175,7 @@ SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below 
 N_IN_SHORT = 4  # number of samples within a short step
 # change of an acceleration, relative to the largest, while a velocity changes by its tolerance, that counts as decay
 MAX_LASTING_CHANGE = 0.5
-AT_CHANGE = 0.01  # largest distance of a step's beginning from a change at which it begins, in spacings of samples
+AT_CHANGE = 0.01  # time from a step's beginning, in spacings of samples, within which a change counts as passed
 LARGEST = N_SAMPLES + 1  # index in w.changes of the largest absolute values so far; the rows before are samples
 MIDDLE = N_SAMPLES + 2  # index in w.changes of values between two samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
@@ -194,7 +194,7 @@ def _sample(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _largest(values):
-    """Return the largest of the values, at least 0: the scale of all components, as those that are zero have none."""
+    """Return the largest of the values, at least 0: the common scale of all components, as some may be always zero."""
     largest = 0.0
     for x in values:
         largest = max(largest, x)
@@ -250,7 +250,7 @@ def _first_sudden_bend(values, n, along, least):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return whether values change by more than `limit` between the second and third of four samples, and suddenly."""
+    """Return whether the second and third of four samples differ by more than `limit`, and far more than neighbours."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     beside = max(sign * (first_value - previous), sign * (following - second_value))
@@ -410,7 +410,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
-    """Return the time of the next sudden change in samples in time alone, or `next_change` if that is earlier."""
+    """Return the time of the next sudden change found by samples in time alone, or `next_change` if it is earlier."""
     every = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
     # closer samples are not needed in multistep methods (ROUGH = 1), whose error estimates show a jump, and not if C_t
     # or b may jump (DRIVEN = 1), because such steps are checked for jumps

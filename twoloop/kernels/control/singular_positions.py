@@ -23,22 +23,22 @@ from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a singular position is suspected
 COLLAPSED = 0.2  # step size, relative to the longest of the last steps, after which the pivots of C_q are renewed
-# smallest pivot of C_q, relative to its largest value so far, below which a singular position is near
+# ratio of the smallest pivot of C_q to its largest value so far below which a singular position is near
 SINGULAR_PIVOT = 0.2
 STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
-# smallest pivot, relative to its largest value so far, below which a rejected step of the static form is repeated with
-# projected stages
+# ratio of the smallest pivot to its largest value so far below which a rejected step of the static form is repeated
+# with projected stages
 REPEAT_BELOW = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
 GIVE_UP_BELOW = 0.001  # smallest step size near a singular position, relative to the longest of the last steps
-# pivot, relative to its largest value so far, below which rounding determines accelerations: short steps must stop
+# ratio of the smallest pivot to its largest value so far below which rounding determines accelerations, and a run ends
 UNDETERMINED = 1e-6
 CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that steps do not use
 # a partition is checked every k + 1 steps if there are k times this number of freedoms, because T is a full matrix
 FREEDOMS_PER_CHECK = 32
 N_CHECKED = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
 CHECKED_BELOW = 0.5  # pivot at an end of a step, relative to its largest value so far, below which the step is checked
-# smallest pivot within a step, relative to its largest change between samples, below which it passes through zero
+# ratio of the smallest pivot within a step to its largest change between samples below which it passes through zero
 PASSED_SHARE = 0.6
 # numbers in near_share: its smallest and its largest result, allowed rounding errors in tolerances, unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53

@@ -29,7 +29,7 @@ INTEGERS = types.int64[::1]
 PLACES = types.int32[::1]  # type of long programs: 32-bit integers, so that a program fits in the processor's cache
 
 # names of the programs in `Functions`: programs that replace missing callbacks (evaluation/operations.py), and programs
-# for sparse factors of large systems (linalg/symbolic_factorization.py, sparse_lu.py). A program may have size 0: none
+# for sparse factors of large systems (linalg/symbolic_factorization.py, sparse_lu.py). A missing program has size 0
 PROGRAMS = (
     "jacobian_program",
     "jacobian_numbers",

@@ -133,7 +133,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # state satisfies the constraints up to rounding. DEFINITE, INDEFINITE: M varies, and is positive definite, or not
 # positive definite, by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # largest distance from a stored position at which its sizes of coordinates apply, relative to them
+NEAR_SHARE = 0.5  # distance from a stored position, relative to the sizes stored with it, up to which these apply
 ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
 EIGENVALUE_MARGIN = 2.0  # factor on the limit of zero eigenvalues, larger than that by which rounding changes them
 

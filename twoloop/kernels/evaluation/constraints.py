@@ -196,9 +196,9 @@ def _max_disagreement(notes):
 
 @compiled
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
-    """Store Gamma in w.Gamma by that of ever smaller difference steps at which Gamma changes least; return a code.
+    """Store Gamma in w.Gamma, by the difference step, among ever smaller ones, at which Gamma changes least.
 
-    Stores the step as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if this change is too large, else DONE.
+    Stores this step as GAMMA_STEP_RATIO. Returns GAMMA_INACCURATE if the change at this step is too large, else DONE.
     """
     least_change = np.inf
     step_ratio = 1.0

@@ -262,7 +262,7 @@ ROUNDING_OF_Q = 2e-14  # about a hundred times the rounding error of q, relative
 
 @merged
 def _verify_pattern(w):
-    """Return DONE if the Jacobian has no new entry; else write new programs and return a failure: results lack it."""
+    """Return DONE if the Jacobian has no new entry; else write new programs, and return a failure of the evaluation."""
     if not record_entries(w):
         return DONE
     return INNER_DIVERGED if write_programs(w) else SINGULAR

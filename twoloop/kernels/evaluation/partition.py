@@ -379,7 +379,7 @@ def partition_is_poor(w):
 
 MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # largest ratio of a correction to the one before in a converging iteration
-ROUNDING_OF_CORRECTIONS = 1e-12  # correction, relative to the largest coordinate, that may not decrease, by rounding
+ROUNDING_OF_CORRECTIONS = 1e-12  # largest correction due to rounding alone, relative to the largest coordinate
 # factor on ROUNDING_OF_CORRECTIONS if all rows are satisfied up to rounding: the rounding of a position of 1 m turns a
 # rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
 AMPLIFICATION = 1e3

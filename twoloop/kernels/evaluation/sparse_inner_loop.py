@@ -81,7 +81,7 @@ SUSPECT_PIVOT = 1e-6
 MIN_PIVOT = 1e-10  # smallest pivot, relative to the size of its row, with which factors by 1-by-1 pivots are accurate
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows, see _sine, is at most this
 PROJECT_STAGES = 2.0  # value of NEARLY_SINGULAR near a singular position, where stages must be projected
-# smallest pivot, relative to the size of its row, below which solutions are refined once, and twice
+# ratios of the smallest pivot to the size of its row below which solutions are refined once, and twice
 REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7
 
 

@@ -168,7 +168,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Move `chosen` to position k of `order`; return the sign of the permutation: -1, or 1 if it is already there."""
+    """Exchange `chosen` and the number at position k of `order`; return -1, or 1 if `chosen` is already there."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous

@@ -103,8 +103,8 @@ def norm_of_inverse(factors, n, column):
 def express_other_rows(rows, order, min_share, chosen_rows, basis, factors, kept, coefficients, lengths):
     """Return whether the first n of `rows` in `order` are independent, and if so, express all others by these rows.
 
-    `chosen_rows`, (n, n_q), becomes the first n rows in `order`, coefficients[i] those of these rows in row n + i of
-    `order`, by least squares; `lengths` become the norms of all `rows`. For other arguments see `select_rows`.
+    `chosen_rows`, (n, n_q), becomes the first n rows in `order`; row i of `coefficients` becomes their coefficients in
+    row n + i in `order`, by least squares; `lengths` become the norms of all `rows`. Other arguments: `select_rows`.
     """
     n = len(chosen_rows)
     for i in range(len(rows)):
@@ -188,7 +188,7 @@ MAX_COEFFICIENT = 1.5
 
 
 def workspace_size(n_rows: int, n: int) -> int:
-    """Return the length of the scratch `workspace` of `choose_rows`."""
+    """Return the number of floats that the argument `workspace` of `choose_rows` must have."""
     n_max = min(n_rows, n) + 1
     return n_max * (n + n_max) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
 

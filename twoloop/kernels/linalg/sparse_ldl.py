@@ -114,7 +114,7 @@ def factor(program, counts, values, sizes, least):
             r = s + 1
             while r < last:
                 size = runs[u]
-                if multiplier != 0.0:  # two thirds of the numbers of planar mechanisms in space are zero
+                if multiplier != 0.0:  # two thirds are zero if a planar mechanism is modelled in space
                     into, own = values[runs[u + 1] : runs[u + 1] + size], values[r : r + size]
                     for i in range(size):
                         into[i] -= multiplier * own[i]
@@ -128,8 +128,8 @@ def factor(program, counts, values, sizes, least):
 def solve(program, values, stiffness, x, y):
     """Replace x, the right-hand side [r, c], by the solution [a, lam], by the factors `values`; y is scratch."""
     n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
-    # M + s g g^T replaces M, with r + s g c on the right. As g a = c, r alone gives the same accelerations, and a
-    # multiplier that is less by s c, which is added at the end
+    # with M + s g g^T in place of M, the right-hand side should be r + s g c. With r alone, accelerations are the same,
+    # because g a = c, and the multiplier of g is smaller by s c, which is added at the end
     begin, row_of = columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]

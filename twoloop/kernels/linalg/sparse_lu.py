@@ -32,7 +32,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     stiffened_of,
 )
 
-MIN_PIVOT = 1e-11  # smallest pivot, relative to the sum of its terms, below which the pivot may be a rounding error
+MIN_PIVOT = 1e-11  # ratio of a pivot to the sum of its |terms| below which the pivot may be a rounding error
 
 
 def newton_program(
