@@ -255,8 +255,7 @@ def _has_all_entries(b):
 def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
     """Prepare a run from t to t1 with the choices of the previous run; return 0, REFUSED or IN_DOUBT.
 
-    `checked_kit` has the callbacks that are checked at the start; for `sizes` see `evaluate_start`. `is_consistent`:
-    the initial state is already known to satisfy the constraints.
+    `checked_kit` has the callbacks that are checked at the start; `is_consistent`: the state satisfies the constraints.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):

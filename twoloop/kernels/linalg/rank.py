@@ -85,8 +85,7 @@ def _find_coefficients(n, basis, factors, row, coefficients):
 def norm_of_inverse(factors, n, column):
     """Return the Frobenius norm of the inverse of the lower triangle `factors`, of n rows; `column` is scratch.
 
-    If `factors` are those of the independent rows of G, the result times the norm of b bounds the solution of least
-    norm of G x = b.
+    With the factors of independent rows of G, the result times |b| bounds the solution of least norm of G x = b.
     """
     total = 0.0
     for j in range(n):

@@ -180,8 +180,7 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
     """Replace x, the right-hand side [r, c], by the solution [a, lam], refined `times` times.
 
-    Returns the largest acceleration in the last correction, relative to the largest one in the solution; 0 without a
-    refinement. `right`, `residual` and `y` are scratch.
+    Returns max|a| of the last correction, relative to max|a|; 0 without refinement. The last three are scratch.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):
