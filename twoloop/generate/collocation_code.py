@@ -205,7 +205,7 @@ class CollocationCode:
         inputs = {i for form in forms for i in form.terms if graph.operations[i] is None}
         return sorted({(i - 1) % self.n for i in inputs if i > 0})
 
-    # the functions
+    # methods that write the functions
 
     def attempt(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
         """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
@@ -248,9 +248,9 @@ class CollocationCode:
             return iterate_mass_first()
 
         if self.has_reduced:
-            left = one.load(work, at.CAREFUL)
-            with self._returning_if(emit, builder.compare("fcmp ogt", left, llvm_code.ZERO)):
-                one.store(one.subtract(left, llvm_code.ONE), work, at.CAREFUL)
+            remaining = one.load(work, at.CAREFUL)
+            with self._returning_if(emit, builder.compare("fcmp ogt", remaining, llvm_code.ZERO)):
+                one.store(one.subtract(remaining, llvm_code.ONE), work, at.CAREFUL)
                 builder.ret(iterate_mass_first())
         self._call(emit, "begin_nodes", self._begin_nodes, [work, state, tolerances])
         return self._iterate(emit, work, state, tolerances, evaluate, otherwise)
@@ -511,7 +511,7 @@ class CollocationCode:
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
         t, h = emit.splat(one.load(work, at.T)), emit.splat(one.load(work, at.H))
-        length = emit.multiply(h, constants(tables().between))
+        elapsed = emit.multiply(h, constants(tables().between))
         zero = emit.constant(0.0)
         q, v = [zero] * n, [zero] * n
         for i in self.iterated:
@@ -519,16 +519,16 @@ class CollocationCode:
             of_v = self._weighted_rows(emit, tables().velocities_between, a0, work, integer(i))
             of_q = self._weighted_rows(emit, tables().positions_between, a0, work, integer(i))
             v[i] = emit.fused(h, of_v, emit.splat(v0))
-            q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
-        inputs, filled = [emit.add(t, length), *q, *v], builder.room(DOUBLE, LANES * n)
+            q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(elapsed, emit.splat(v0), emit.splat(q0)))
+        inputs, filled = [emit.add(t, elapsed), *q, *v], builder.room(DOUBLE, LANES * n)
         holds = call_accelerations(emit, self.equations, -1, inputs, self.numbers, filled)
         a = [emit.load(filled, i) for i in range(n)]
         worst = largest = zero
         for i, value in enumerate(a):
             a0 = one.load(state, 2 * n + i)
-            off = emit.subtract(value, self._weighted_rows(emit, tables().values_between, a0, work, integer(i)))
+            difference = emit.subtract(value, self._weighted_rows(emit, tables().values_between, a0, work, integer(i)))
             weight = emit.splat(one.load(work, at.WEIGHTS + i))
-            worst = emit.larger(emit.multiply(emit.function("fabs", off), weight), worst)
+            worst = emit.larger(emit.multiply(emit.function("fabs", difference), weight), worst)
             largest = emit.larger(emit.multiply(emit.function("fabs", value), weight), largest)
         beyond_noise = emit.fused(emit.constant(-at.NOISE), largest, worst)
         scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED_DEFECT)))
@@ -572,9 +572,9 @@ class CollocationCode:
             for distance in (1, 2, 4):  # partial sums of all terms up to each degree
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
                 sums = emit.add(sums, builder.shuffle(sums, zero, shifted))
-            off = emit.add(sums, emit.splat(one.subtract(a0, a1)))
+            errors = emit.add(sums, emit.splat(one.subtract(a0, a1)))
             weight = emit.splat(one.load(one.pointer(work, i), at.WEIGHTS))
-            carried.append(emit.larger(emit.multiply(emit.function("fabs", off), weight), worst))
+            carried.append(emit.larger(emit.multiply(emit.function("fabs", errors), weight), worst))
             store_lanes(
                 emit, self._weighted_rows(emit, tables().end, a0, work, i), one.pointer(new, vector_index(emit, k))
             )
@@ -621,7 +621,7 @@ class CollocationCode:
         else:
             self._project_in_parts(emit, work, numbers, self.parts.project, ("a", "moved", "q", "v", "lam"))
 
-    # parts of the functions
+    # methods that write parts of the functions
 
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, outputs: Program) -> None:
         emit.numbers = emit.constants = numbers
@@ -685,8 +685,8 @@ class CollocationCode:
     def _at_nodes(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
         """Return the accelerations of coordinate i at all nodes: `first` at the first node, and eight loaded values."""
         one = Emitter(emit.builder)
-        place = one.pointer(work, vector_index(emit, i))
-        return [first, *(one.load(place, self.a + node) for node in range(LANES))]
+        memory = one.pointer(work, vector_index(emit, i))
+        return [first, *(one.load(memory, self.a + node) for node in range(LANES))]
 
     def _weighted_rows(self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value) -> Value:
         """Return the sum of the rows of a table, multiplied by the accelerations of coordinate i (see `_at_nodes`)."""
@@ -704,8 +704,8 @@ class CollocationCode:
         builder, one = emit.builder, Emitter(emit.builder)
         second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(work, at.WHICH), llvm_code.ZERO)
         size = LANES * len(self.iterated)
-        place = builder.select(second, integer(self.polynomials + size), integer(self.polynomials))
-        return one.pointer(work, place)
+        offset = builder.select(second, integer(self.polynomials + size), integer(self.polynomials))
+        return one.pointer(work, offset)
 
 
 class Collocation(NamedTuple):

@@ -226,7 +226,7 @@ class SplitFunctions:
             llvm_code.write(module, name, kinds(name), emit)
         return list(functions)
 
-    # functions for the parts
+    # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
         """Write calls (name, arguments) of parts, and parts that are missing; return whether all results are valid."""
@@ -273,7 +273,7 @@ class SplitFunctions:
                 emit.store(value, array, j)
         return lowering.holds(program, results[0])
 
-    # functions for kernels, and for code in SIMD lanes
+    # methods that write functions for kernels, or code in SIMD lanes
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         """Write code that stores the accelerations at (t, q, v) in `a`; return whether they are valid."""

@@ -298,14 +298,14 @@ class Elimination:
 
     def _redundant_rows(self, rates: Any) -> Program:
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
-        off = self._values_of("constraint")
+        violations = self._values_of("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
         size, speed = (sum((x * x for x in state), unit) for state in (self.q, self.v))
         for k in redundant:
             row, rate = self.all_rows[k], rates[k]
             faster = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
             allowed = sum((entry * entry for entry in row), self.zero).times(MAX_VIOLATION**2)
-            for what, scale in ((off[k], size), (faster, speed)):
+            for what, scale in ((violations[k], size), (faster, speed)):
                 conditions.append((allowed * scale, what * what))
         return Program(self.graph, {"": []}, conditions)
 
@@ -320,9 +320,9 @@ class Elimination:
                     f"mass of {name!r} is not symmetric: its entry {(j, i)} is zero, and its entry {(i, j)} is not"
                 )
         for k in self.choice.added:
-            places = [i for i in range(n) if not is_zero(self.all_rows[k, i])]
-            for i in places:
-                for j in places:
+            columns = [i for i in range(n) if not is_zero(self.all_rows[k, i])]
+            for i in columns:
+                for j in columns:
                     term = (self.all_rows[k, i] * self.all_rows[k, j]).times(self.choice.scale)
                     matrix[i, j] = matrix[i, j] + term if (i, j) in matrix else term
         for k, row in enumerate(self.rows):
@@ -394,8 +394,8 @@ class Elimination:
     @cached_property
     def position_errors(self) -> Program:
         """Return the program `position_errors` (see the class)."""
-        off = [*(-each for each in self._values_of("constraint")), *[self.zero] * self.system.n_a]
-        return Program(self.graph, {"c": self._on_all_rows([off[k] for k in self.choice.rows])})
+        errors = [*(-each for each in self._values_of("constraint")), *[self.zero] * self.system.n_a]
+        return Program(self.graph, {"c": self._on_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:

@@ -43,7 +43,7 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-TARGET_ERROR = 0.3  # error of predicted positions, over its limit, for which a step is chosen after a rejection by it
+TARGET_ERROR = 0.3  # error of predicted positions, over its limit, for which a shorter step is chosen if it exceeds 1
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
 MAX_REJECTIONS = 10  # largest number of successive rejections; after more, a lane fails
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
@@ -204,7 +204,7 @@ class LaneSteps:
         def difference(one: Value, other: Value, place: int) -> Value:
             return emit.function("fabs", emit.subtract(emit.load(one, place), emit.load(other, place)))
 
-        motion = off = emit.constant(0.0)
+        motion = error = emit.constant(0.0)
         for j in range(n):
             distance = emit.larger(emit.multiply(h, size(at.state, n + j)), difference(at.new, at.state, j))
             motion = emit.larger(distance, motion)
@@ -217,8 +217,8 @@ class LaneSteps:
             if turned is not None:
                 allowed = emit.builder.select(turned, emit.smaller(scale, least), allowed)
             allowed = emit.larger(allowed, emit.constant(LEAST))
-            off = emit.largest_of(emit.divide(difference(at.predicted, at.new, j), allowed), off)
-        emit.store(off, work, lanes.OFF)
+            error = emit.largest_of(emit.divide(difference(at.predicted, at.new, j), allowed), error)
+        emit.store(error, work, lanes.OFF)
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
         """Return a mask of the lanes that may have passed a singular position in this step, or None: not checked."""
@@ -308,7 +308,7 @@ def clear_fine_unless(emit: LaneEmitter, work: Value, holds: Value) -> None:
 Rows = list[dict[int, Value]]  # the nonzero entries of each row, by column
 
 
-def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
+def mask_of_changed_orientation(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
     """Return a mask of the lanes in which a step may have passed a singular position: det G1 G0^T is not positive.
 
     G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula
@@ -378,18 +378,20 @@ class LaneStages:
             stage_time = emit.add(t, emit.multiply(emit.constant(c[i]), x))
             emit.store(stage_time, work, lanes.AHEAD)
             with emit.loop(integer(0), integer(self.n), []) as (j, _, _):
-                own = _Coordinate(self, emit, at, j, i)
-                own.move(A[i], A[i] @ A, x)
+                coordinate = _Coordinate(self, emit, at, j, i)
+                coordinate.move(A[i], A[i] @ A, x)
             emit.builder.run("accelerate", arguments)
         rtol, zero = broadcast_entry(emit, control, lanes.RTOL), emit.constant(0.0)
         with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
-            own = _Coordinate(self, emit, at, j, len(b))
-            new_state = own.move(b, b @ A, x)
-            place = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
-            atol = emit.splat(emit.builder.load(place))
-            error_weights = [own.error_weight(atol, rtol, *each) for each in zip(own.before, new_state, strict=True)]
+            coordinate = _Coordinate(self, emit, at, j, len(b))
+            new_state = coordinate.move(b, b @ A, x)
+            pointer = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
+            atol = emit.splat(emit.builder.load(pointer))
+            error_weights = [
+                coordinate.error_weight(atol, rtol, *each) for each in zip(coordinate.before, new_state, strict=True)
+            ]
             for largest, weights in ((e, fine), (d, coarse)):
-                of_q, of_v = emit.multiply(x, own.sum(weights @ A)), own.sum(weights)
+                of_q, of_v = emit.multiply(x, coordinate.sum(weights @ A)), coordinate.sum(weights)
                 for off, weight in zip((of_q, of_v), error_weights, strict=True):
                     largest = emit.larger(emit.multiply(emit.function("fabs", off), weight), largest)
                     total = emit.add(total, emit.multiply(zero, off))
@@ -449,7 +451,7 @@ class _Coordinate:
 
 
 GOLDEN = 0.6180339887498949  # golden section: its multiples modulo 1 are spread evenly on [0, 1]
-MOST_PARTS = 1000.0  # largest number of parts into which times divide a step at which the defect is checked
+MOST_PARTS = 1000.0  # largest number of parts into which a step is divided; the defect is checked between the parts
 MOST_OPERATIONS = 1500  # largest number of operations of a series: as many take some seconds to compile
 
 
@@ -542,7 +544,7 @@ class LaneCode(LaneSteps):
             description += list(numbers.structure(self.solution.solved))
         return hashlib.sha256(repr(description).encode()).hexdigest()
 
-    # the generated functions
+    # methods that write the generated functions
 
     def series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Compute the Taylor coefficients of q about the state of each lane, with UNIT as the unit of time."""
@@ -663,10 +665,12 @@ class LaneCode(LaneSteps):
         return holds, a
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return the mask of the function `turned`; None for series, whose defects reveal passed singular positions."""
+        """Return `mask_of_changed_orientation`; None for series, whose defects reveal passed singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
-        return turned(emit, *(self._rows(emit, at, time, base) for time, base in self._ends_of_step(at)))
+        return mask_of_changed_orientation(
+            emit, *(self._rows(emit, at, time, base) for time, base in self._ends_of_step(at))
+        )
 
     def _ends_of_step(self, at: Places) -> list[tuple[int, Value]]:
         return [(lanes.T, at.state), (lanes.AHEAD, at.new)]

@@ -44,8 +44,8 @@ class Factors:
         self.conditions: list[tuple[Affine, Affine]] = []
         self.positive: list[Affine] = []
         alone: dict[int, Any] = {}
-        pairs = _pairs(rows, n)
-        for places in [*pairs, *_order(rows, n, pairs)]:
+        pairs = _pairs_without_conditions(rows, n)
+        for places in [*pairs, *_elimination_order(rows, n, pairs)]:
             zero = Affine(rows[places[0]][places[0]].graph, 0.0, {})
             pivots = [[rows[i].pop(j, zero).value() for j in places] for i in places]
             inverse = self._inverse(pivots, [alone.get(i) for i in places])
@@ -127,7 +127,7 @@ def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
     return total
 
 
-def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
+def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
     """Return pairs of a coordinate and a row of G that are eliminated first, without a condition or a division.
 
     The coordinate occurs in no other row of [M G^T; G 0], and both of its entries, in M and in G, are constants. The
@@ -140,7 +140,9 @@ def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
     return [(i, k) for k, i in pairs.items()]
 
 
-def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
+def _elimination_order(
+    rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]
+) -> list[tuple[int, ...]]:
     """Return the rows (indices) except those in `pairs`, ordered by minimum degree, as tuples of one or two rows.
 
     Two rows with the same neighbours are in one tuple. A row of G (index n and later) comes after its coordinates.
@@ -159,8 +161,8 @@ def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int
     while remaining:
         i = min((j for j in remaining if not waiting_for[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
         ready = [j for j in neighbours[i] if not waiting_for[j] and (j < n) == (i < n)]
-        alike = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
-        places = (i, *sorted(alike)[:1])
+        same_neighbours = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
+        places = (i, *sorted(same_neighbours)[:1])
         order.append(places)
         remaining -= set(places)
         for j in _eliminate(neighbours, places):
@@ -171,10 +173,10 @@ def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int
 
 def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
     """Eliminate rows from the graph of entries: connect the neighbours of the rows, and return these neighbours."""
-    around = set().union(*(neighbours[i] for i in places)) - set(places)
-    for j in around:
-        neighbours[j] = (neighbours[j] | around) - {*places, j}
-    return around
+    new_neighbours = set().union(*(neighbours[i] for i in places)) - set(places)
+    for j in new_neighbours:
+        neighbours[j] = (neighbours[j] | new_neighbours) - {*places, j}
+    return new_neighbours
 
 
 Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
@@ -248,7 +250,9 @@ class DependentCoordinates:
         other_columns = sorted({j for i in places for j in self._rows[i]} - set(columns))
         entries = {j: [self._rows[i].get(j, self._zero) for i in places] for j in other_columns}
         solved = [
-            _not_zero({j: _add_products(self._zero, zip(row, known, strict=True)) for j, known in entries.items()})
+            _nonzero_entries(
+                {j: _add_products(self._zero, zip(row, known, strict=True)) for j, known in entries.items()}
+            )
             for row in inverse
         ]
         self._left -= set(places)
@@ -259,7 +263,7 @@ class DependentCoordinates:
             for factor, others in zip(factors, solved, strict=True):
                 for j, entry in {} if factor is None else others.items():
                     row[j] = row.get(j, self._zero) - factor * entry
-            self._rows[k] = _not_zero(row)
+            self._rows[k] = _nonzero_entries(row)
         for i, row in zip(places, solved, strict=True):
             self._rows[i] = row
         if pivot.terms:
@@ -316,7 +320,7 @@ class DependentCoordinates:
                 right = right - entry * self.g[k]
                 for independent, factor in self.T[k].items():
                     entries[independent] = entries.get(independent, self._zero) - entry * factor
-        self.T[j], self.g[j] = _not_zero(entries), right.value()
+        self.T[j], self.g[j] = _nonzero_entries(entries), right.value()
 
 
 def reduced_accelerations(
@@ -364,5 +368,5 @@ def _add_products(total: Affine, pairs: Any) -> Affine:
     return total
 
 
-def _not_zero(entries: Terms) -> Terms:
+def _nonzero_entries(entries: Terms) -> Terms:
     return {j: entry.value() for j, entry in entries.items() if not is_zero(entry)}

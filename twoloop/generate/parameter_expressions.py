@@ -25,7 +25,7 @@ CANCELLED = 8.0 * 2.0**-52  # a sum of two terms, relative to one of them, count
 NUMBERS = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # by names of NumPy functions: the same in operators of Python
+OPERATORS: dict[str, Callable[..., Any]] = {  # functions with operators of Python, by the names of NumPy's functions
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,
@@ -261,7 +261,7 @@ def _product(a: float, b: float) -> float:
 def _power(base: float, exponent: float) -> float:
     # a power whose exponent is no whole number is an atom: as Powers, (x^2)^0.5 would become x instead of |x|
     if type(exponent) is Parameter or not exponent.is_integer():
-        return _function("power", base, exponent)
+        return _record_function("power", base, exponent)
     assert isinstance(base, Parameter)
     return base.to(exponent) if exponent else 1.0
 
@@ -289,10 +289,10 @@ def apply_function(name: str, *arguments: Any) -> Any:
         return float(getattr(np, name)(*numbers))
     if name in _OPERATIONS:
         return _OPERATIONS[name](*numbers)
-    return _function(name, *numbers)
+    return _record_function(name, *numbers)
 
 
-def _function(name: str, *numbers: float) -> Parameter:
+def _record_function(name: str, *numbers: float) -> Parameter:
     tape = _tape_of(*numbers)
     arguments = tuple((each.powers, each.scale) if isinstance(each, Parameter) else ((), each) for each in numbers)
     with np.errstate(all="ignore"):  # a generic value may be outside the domain of the function

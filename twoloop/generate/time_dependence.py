@@ -186,7 +186,7 @@ class Rates(Degrees):
 
 def _is_short_in_time(graph: Graph, needed: list[int]) -> bool:
     depending = [i for i in needed if graph.inputs_of[i] & TIME]
-    degrees = Degrees([0])  # degrees in time, or in vibrations with time
+    degrees = Degrees([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
     degrees.run(graph, depending)
     return any(graph.kind(i) not in SMOOTH or degrees.values[i] > MAX_DEGREE for i in depending)
 

@@ -130,7 +130,7 @@ class _CallbackCopier(FunctionCopier):
 
 
 def _type(value: Any, *more: Any) -> Any:
-    _refuse(value, "asks for the type of")
+    _refuse_symbols(value, "asks for the type of")
     return type(value, *more)
 
 
@@ -152,7 +152,7 @@ def _has_parameters(value: Any) -> bool:
     return any(map(_has_parameters, value)) if isinstance(value, list | tuple) else type(value) is Parameter
 
 
-def _refuse(value: Any, does: str) -> None:
+def _refuse_symbols(value: Any, does: str) -> None:
     symbol = _symbol_in(value)
     if symbol is not None:
         symbol.graph.refuse(f"it {does} what depends on t, q or v")
@@ -163,7 +163,7 @@ def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]
 
     @functools.wraps(function_of_numbers)
     def function(*arguments: Any, **options: Any) -> Any:
-        _refuse([*arguments, *options.values()], f"calls {name} on")
+        _refuse_symbols([*arguments, *options.values()], f"calls {name} on")
         return function_of_numbers(*arguments, **options)
 
     return function
@@ -205,7 +205,7 @@ def _conversion(conversion: Any) -> Callable[..., Any]:
         if _symbol_in(value) is None and not _has_parameters(value):
             return conversion(value, dtype, **options)
         if not _is_real(dtype):
-            _refuse(value, f"makes {np.dtype(dtype).name} of")
+            _refuse_symbols(value, f"makes {np.dtype(dtype).name} of")
         return conversion(value, object, **options)
 
     return function
@@ -219,7 +219,7 @@ def _full(shape: Any, value: Any, dtype: Any = None) -> Any:
     ):
         return np.full(shape, value, dtype)
     if not _is_real(dtype):
-        _refuse(value, f"makes {np.dtype(dtype).name} of")
+        _refuse_symbols(value, f"makes {np.dtype(dtype).name} of")
     return np.full(shape, value, object)
 
 
@@ -227,7 +227,7 @@ def _norm(x: Any, *more: Any, **options: Any) -> Any:
     if _symbol_in(x) is None:
         return np.linalg.norm(x, *more, **options)
     if more or options or np.ndim(x) != 1:
-        _refuse(x, "calls numpy.linalg.norm, but of a vector, on")
+        _refuse_symbols(x, "calls numpy.linalg.norm, but of a vector, on")
     x = np.asarray(x, dtype=object)
     return (x @ x) ** 0.5
 
@@ -588,7 +588,7 @@ def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
     """Return the trace cache that a system with compiled callbacks shares with others; create it if it is missing."""
     parameters = system.parameters
     classes = _classes(parameters)
-    fixed = parameters[classes == 0] + 0.0  # without a sign of zero
+    fixed = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that the bytes are equal
     key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed.tobytes())
     cache: TraceCache | None = _CACHES.get(key)
     if cache is None:

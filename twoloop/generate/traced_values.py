@@ -35,9 +35,9 @@ DISTANCE = 0.3  # largest distance of a random position from the start, relative
 # approximate largest number of compared states: in a chunk of a run, in a run, in a run with callbacks called in Python
 MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of entries compared at all states of a run: large systems have fewer
-# largest difference between call and trace that is a rounding error, relative to the largest term in the callback
+# largest difference between call and trace that is a rounding error, relative to the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-CLEAR_DIFFERENCE = 1e-6  # smaller differences, relative to the same, count only if about equal at neighbouring states
+CLEAR_DIFFERENCE = 1e-6  # relative difference below which entries must differ at neighbouring states, too
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
 MARGIN = 0.01  # margin of a CheckedRegion, relative to its sides: small compared with the steps of a run
 MARGIN_AT_REST = 1e-9  # further margin, relative to the longest side except time, as coordinates at rest have no side
@@ -228,7 +228,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
     """Return rows [t, q, v]: the start, and N_NEARBY random states near it, at times spread over the run."""
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
-    n, parts = len(q), _random_parts(len(q))
+    n, parts = len(q), _random_directions(len(q))
     states = np.empty((1 + N_NEARBY, 1 + 2 * n))
     states[0, 0], states[0, 1 : 1 + n], states[0, 1 + n :] = t0, q, v
     states[1:, 0] = t0 + (t1 - t0) * TIMES
@@ -238,7 +238,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 
 @cache
-def _random_parts(n_q: int) -> Array:
+def _random_directions(n_q: int) -> Array:
     """Return an array (2, N_NEARBY, n_q) of random numbers between -1 and 1, the same in every call."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 

@@ -134,7 +134,7 @@ def switch_method(run: Run) -> None:
     run.clock[: run.a.N_PAST] = 0.0
 
 
-def load(run: Run) -> None:
+def load_next_step(run: Run) -> None:
     """Compile, or load from the disk, the step to which the run switches, and renew the kit."""
     loaded(run.plan.second)
     _renew_kit(run)
@@ -162,7 +162,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     base, run.mirrored = None, 0.0
     if not fixed:
         base, run.mirrored = _find_base(run, [place for place in past if place[0] >= earliest])
-    # accelerations at earlier nodes may be wrong after a jump of a force, and too few near the start: other origins
+    # earlier accelerations may precede a jump of a force, and be too few near the start: try other origins, too
     run.origins = [(earliest, base, False), (np.inf, None, False)]
     if float(clock[a.T] - clock[a.T_START]) < clock[a.H_LONG] and not run.system.called_in_python:
         run.origins.append((-np.inf, None, False))
@@ -196,9 +196,9 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.looser[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     longest, allowed = float(clock[a.H_LONG]), float(control[a.MAX_STEP])
-    first = max(longest, min(run.mirrored, LARGER_SIZES[-1] * longest))
-    run.lengths = sizes_across(first, allowed)
-    run.longer = [longest * part for part in LARGER_SIZES if first < longest * part <= allowed]
+    first_size = max(longest, min(run.mirrored, LARGER_SIZES[-1] * longest))
+    run.lengths = sizes_across(first_size, allowed)
+    run.longer = [longest * part for part in LARGER_SIZES if first_size < longest * part <= allowed]
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
     run.crossed = float(clock[a.H_NEXT])
 
@@ -215,23 +215,23 @@ def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     farthest = present = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
     scale = present / singular_value if singular_value > 0.0 else np.inf
     base: Place | None = None
-    length, oldest = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
+    step_size, oldest = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
     for time, state in reversed(past):
         distance = scale * least_singular_value(run.system, time, state[:n], run.rank)
-        if (farthest >= FAR and length > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > oldest:
+        if (farthest >= FAR and step_size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > oldest:
             break
         if distance > farthest:
-            length = 2.0 * present * (t - time) / (distance - present)
-            oldest = max(oldest, FARTHEST * length)
+            step_size = 2.0 * present * (t - time) / (distance - present)
+            oldest = max(oldest, FARTHEST * step_size)
             if farthest < FAR:
-                farthest, base, length = distance, (time, state.copy()), length + t - time
-    return base, length
+                farthest, base, step_size = distance, (time, state.copy()), step_size + t - time
+    return base, step_size
 
 
 def sizes_across(longest: float, allowed: float) -> list[float]:
     """Return the sizes of steps to try across a singular position, s: `longest` times SIZES, at most `allowed`."""
-    first = min(longest, allowed)
-    return [first, *(longest * part for part in SIZES if longest * part < first)]
+    first_size = min(longest, allowed)
+    return [first_size, *(longest * part for part in SIZES if longest * part < first_size)]
 
 
 def crossing_kit(kit: Kit) -> Kit:
@@ -253,7 +253,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
 
     a, clock = run.a, run.clock
     end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # time at which the polynomial ends; -inf: none
-    # a later end of a piece is ahead, as the end may have a rounding error
+    # the current time, with a margin because the end of a piece may have a rounding error
     now = float(clock[a.T] + kernels.ROUNDING * run.crossed + 4.0 * np.spacing(abs(clock[a.T])))
     if code in (a.PAUSED, a.RANK_LOST) and end > now:
         if not run.pieces:

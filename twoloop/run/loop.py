@@ -32,7 +32,7 @@ from twoloop.run.fallbacks import (
     apply_jump,
     cross_singularity,
     crossing_kit,
-    load,
+    load_next_step,
     may_cross,
     switch_method,
     warn_of_missed_changes,
@@ -158,10 +158,7 @@ CHUNK_TIME = 0.05  # CPU time of a chunk, s, from which on the next chunk is not
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 MAX_BASE_CANDIDATES = 16  # largest number of last states that may be the base of a step across a singular position
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
-MOST_SPARE, LARGEST_SPARE = (
-    16,
-    250_000,
-)  # largest number of buffers kept for later runs; largest number of floats in each
+MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs, and of floats in a buffer
 _spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for later runs, by their sizes
 
 
@@ -377,7 +374,7 @@ class IntegrationLoop:
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.NEEDS_COMPILATION:
             began = time.monotonic()
-            load(run)
+            load_next_step(run)
             self.deadline += time.monotonic() - began  # compilation does not count against time_limit
             self.kit, self.code = run.kit, a.PAUSED
         elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
@@ -394,10 +391,10 @@ class IntegrationLoop:
         """Return the last MAX_BASE_CANDIDATES states (time, row), oldest first; [] if not all states are recorded."""
         if not self.request.every_step:
             return []
-        places = [(self.run.t0, self.start)] if len(self.latest) < 2 else []
+        states = [(self.run.t0, self.start)] if len(self.latest) < 2 else []
         for t, rows in self.latest:
-            places += zip(t[-MAX_BASE_CANDIDATES:].tolist(), rows[-MAX_BASE_CANDIDATES:], strict=True)
-        return places[-MAX_BASE_CANDIDATES:]
+            states += zip(t[-MAX_BASE_CANDIDATES:].tolist(), rows[-MAX_BASE_CANDIDATES:], strict=True)
+        return states[-MAX_BASE_CANDIDATES:]
 
     def _correct_last_state(self) -> None:
         """Replace [q, v, a] of the last recorded state by those of the run: those of the more accurate polynomial."""

@@ -187,13 +187,13 @@ def _dominant_eigenvalue(
         if kit.inner(kit, work, tasks.EVALUATE, sample.t, Q, V, INNER_TOL, a, work.lam) != indices.DONE:
             return 0.0, False
         image = (a - sample.a)[independent]
-        longest = float(np.abs(image).max(initial=0.0))
-        if not 0.0 < longest < np.inf:
+        largest = float(np.abs(image).max(initial=0.0))
+        if not 0.0 < largest < np.inf:
             return 0.0, False
         previous = direction[independent]
         cosine = float(image @ previous) / float(np.linalg.norm(image) * np.linalg.norm(previous))
-        eigenvalue, opposed = longest / (displacement * float(np.abs(previous).max())), cosine < -ALIGNED
-        direction[independent] = image / longest
+        eigenvalue, opposed = largest / (displacement * float(np.abs(previous).max())), cosine < -ALIGNED
+        direction[independent] = image / largest
     return eigenvalue, opposed
 
 

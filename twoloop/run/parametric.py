@@ -58,8 +58,10 @@ class SharedSetup:
             raise ValueError("for large systems, more choices depend on the numbers")
         symbolic = copy.copy(system)  # a system whose numbers are expressions in the parameters
         symbolic.derived = {("family", trace_cache_of): self.family, ("numbers", self.family): lambda array: array}
-        own = code_for(symbolic, method, fixed, compiled, t, q, unchecked)
-        self.plan, self.interiors = plans_for(symbolic, method, run.rtol, run.least_atol, fixed, own, unchecked)
+        symbolic_code = code_for(symbolic, method, fixed, compiled, t, q, unchecked)
+        self.plan, self.interiors = plans_for(
+            symbolic, method, run.rtol, run.least_atol, fixed, symbolic_code, unchecked
+        )
         self.exact = exact_derivatives(symbolic)
         self.definite = has_definite_mass(system, t, q)
         new = system.given.keys() - self.family.traced
@@ -68,7 +70,7 @@ class SharedSetup:
         if not self.family.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
         evaluated = ParametricRun(self, run.copy()).run
-        if (code is None) is not (own is None) or _plan_values(evaluated) != _plan_values(run):
+        if (code is None) is not (symbolic_code is None) or _plan_values(evaluated) != _plan_values(run):
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:

@@ -289,7 +289,7 @@ def _consistent_state(
     large = None if kept else project_sparsely(system, t, guess, speeds, check_assembly)
     if large is not None:
         return _state_of_large(system, t, guess, speeds, *large)
-    position = _position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
+    position = _projected_position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
     jacobian = system.rows(t, position)
     change = _least_change(jacobian, free, -system.velocity_constraint(t, position, speeds))
     velocity = speeds + change
@@ -329,7 +329,7 @@ def _state_of_large(
     return state
 
 
-def _position(
+def _projected_position(
     system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int], check_assembly: bool
 ) -> Array:
     """Return a guess projected by its `free` coordinates; raise if that fails, or if the assembly is in doubt."""

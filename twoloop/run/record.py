@@ -97,7 +97,7 @@ class FileStore:
 
     def array(self, name: str) -> NDArray[Any]:
         """Return all rows as a memory map; writing to it does not change the file."""
-        return mapped(self._path(name))
+        return memory_map(self._path(name))
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npy"
@@ -119,14 +119,14 @@ class FileStore:
 Store = MemoryStore | FileStore
 
 
-def mapped(path: Path) -> NDArray[Any]:
+def memory_map(path: Path) -> NDArray[Any]:
     """Return the array in a NumPy file as a memory map, copy-on-write: changes of the array do not change the file."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
 def read(folder: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays in a folder, by name; arrays that belong together are cut to equal numbers of rows."""
-    arrays = {path.stem: mapped(path) for path in sorted(folder.glob("*.npy"))}
+    arrays = {path.stem: memory_map(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
         present = [name for name in group if name in arrays]
         n = min((len(arrays[name]) for name in present), default=0)
@@ -301,9 +301,9 @@ class Recorder:
                 self.search.break_off()
                 ends = ends[ends <= self.search.reached]
             if self.ended is not None:
-                before = int(np.searchsorted(ends, self.ended[1]))
-                self.last_step = float(self.ended[1] - ends[max(before - 1, 0)])
-                ends = np.append(ends[:before], self.ended[1])
+                n_before = int(np.searchsorted(ends, self.ended[1]))
+                self.last_step = float(self.ended[1] - ends[max(n_before - 1, 0)])
+                ends = np.append(ends[:n_before], self.ended[1])
         self.n_steps += len(ends) - 1
         if self.request.times is not None and not self.request.lands:
             times = self.request.times[self._n_outputs :]
@@ -605,9 +605,9 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
     return dict(zip(OF_STEPS, (h, *changes, untested), strict=True))
 
 
-def statistics(counted: Integers, cpu: float) -> Statistics:
+def statistics(counters: Integers, cpu: float) -> Statistics:
     """Return the Statistics of a run, given the array of counters of its workspace, and its CPU time, s."""
-    return Statistics(**dict(zip(COUNT_NAMES, COUNTERS(counted.tolist()), strict=True)), cpu_time=cpu)
+    return Statistics(**dict(zip(COUNT_NAMES, COUNTERS(counters.tolist()), strict=True)), cpu_time=cpu)
 
 
 def fields_of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:

@@ -165,23 +165,21 @@ def describe_changed_force(run: Run) -> str | None:
         warnings.simplefilter("ignore")
         for arguments, value in samples:
             try:
-                again = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
+                second = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
             except Exception:  # the state is outside the domain of the force
                 continue
-            comparable = np.isfinite(value) & np.isfinite(again)
-            differences = np.abs(np.subtract(value, again, out=np.zeros(len(value)), where=comparable))
+            comparable = np.isfinite(value) & np.isfinite(second)
+            differences = np.abs(np.subtract(value, second, out=np.zeros(len(value)), where=comparable))
             if differences.max(initial=0.0) > CLEAR_DIFFERENCE * np.abs(value[comparable]).max(initial=0.0):
                 entry = int(differences.argmax())
-                return (
-                    f"In the run {_changed_value(system.name, float(arguments[0]), entry, value[entry], again[entry])}."
-                )
+                return f"In the run {_changed_value(system.name, float(arguments[0]), entry, value[entry], second[entry])}."
     return None
 
 
-def _changed_value(name: str, t: float, entry: int, once: float, again: float) -> str:
+def _changed_value(name: str, t: float, entry: int, first: float, second: float) -> str:
     return (
         f"force of {name!r} gives something else when it is called again with the same t, q and v: at "
-        f"t = {t:.10g} entry {entry} is {once:.9g}, and then {again:.9g}. It must "
+        f"t = {t:.10g} entry {entry} is {first:.9g}, and then {second:.9g}. It must "
         "depend on its arguments alone: steps are tried, rejected and sampled in advance"
     )
 

@@ -38,8 +38,7 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # as FIRST_CHUNK, for callbacks that are called in Python, which may be slow
 SMALL = 32  # number of coordinates up to which a system is small; larger systems have proportionally smaller chunks
-# number of first steps in which a method that needs long steps is replaced if a step is short
-TRIAL_STEPS = 10
+TRIAL_STEPS = 10  # number of first steps during which a method that needs long steps is replaced after a short step
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
 CONTRADICTS = 1e-6  # relative residual of a row for the accelerations at the start above which the rows contradict
 
@@ -132,26 +131,26 @@ class Run:
 
     def copy(self) -> "Run":
         """Return a copy of this run, which must be at its start."""
-        other = self._copy()
-        other.work = copy_of(self.work)
-        return other
+        new_run = self._copy()
+        new_run.work = copy_of(self.work)
+        return new_run
 
     def from_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
         """Return a copy of this run at another start; None if the ranks of C_q differ there, or accelerations fail.
 
         The run must not use the static form.
         """
-        other = self._copy()
-        other.t0, other.compared_until = t0, [-np.inf]
+        new_run = self._copy()
+        new_run.t0, new_run.compared_until = t0, [-np.inf]
         work = empty(self.work.sizes)
-        prepare_workspace(work, self.system, self.kit.flags, other._pattern(q0), q0, self.rtol, self.reuse)
+        prepare_workspace(work, self.system, self.kit.flags, new_run._pattern(q0), q0, self.rtol, self.reuse)
         work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
-        other.work = work
-        if other.restart(t0, q0, v0) != indices.DONE:
+        new_run.work = work
+        if new_run.restart(t0, q0, v0) != indices.DONE:
             return None
-        other.redundant, other.rows_warning = other.redundant_rows()
-        other.start_warning = other._start_warning()
-        return other
+        new_run.redundant, new_run.rows_warning = new_run.redundant_rows()
+        new_run.start_warning = new_run._start_warning()
+        return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
         """Set the run to a state, without past steps; compute the accelerations, and return the code of this."""
@@ -199,8 +198,8 @@ class Run:
         return code
 
     def _copy(self) -> "Run":
-        other = object.__new__(Run)
-        vars(other).update(
+        new_run = object.__new__(Run)
+        vars(new_run).update(
             vars(self),
             plan=self.plan.fresh(),
             state=self.state.copy(),
@@ -211,11 +210,11 @@ class Run:
             crossings=[],
             jumps=[],
         )
-        other.looser = other.tolerances
+        new_run.looser = new_run.tolerances
         if self.static is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # a run may change these flags
-            other.kit = kit_for_plan(self.system, self.kit.flags, other.plan)
-            other.functions = other.kit.functions
-        return other
+            new_run.kit = kit_for_plan(self.system, self.kit.flags, new_run.plan)
+            new_run.functions = new_run.kit.functions
+        return new_run
 
     @property
     def lands(self) -> bool:

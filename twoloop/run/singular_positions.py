@@ -73,8 +73,8 @@ def _least_ratio(
         return ratio(system, t0, first[:n], rank)
     from scipy.interpolate import CubicHermiteSpline  # imported here, as that takes 0.1 s and few runs need it
 
-    way = CubicHermiteSpline([t0, t1], [first[:n], last[:n]], [first[n : 2 * n], last[n : 2 * n]])
-    return min(ratio(system, float(t), way(t), rank) for t in np.linspace(t0, t1, SAMPLES))
+    path = CubicHermiteSpline([t0, t1], [first[:n], last[:n]], [first[n : 2 * n], last[n : 2 * n]])
+    return min(ratio(system, float(t), path(t), rank) for t in np.linspace(t0, t1, SAMPLES))
 
 
 def describe_turn(
@@ -87,9 +87,9 @@ def describe_turn(
     n = system.n_q
     for (t0, first), (t1, last), across in _passages(crossings, now):
         size, speeds = (max(np.abs(first[part]).max(), np.abs(last[part]).max()) for part in (_q_slice(n), _v_slice(n)))
-        turn = np.abs(last[_v_slice(n)] - first[_v_slice(n)])
+        change = np.abs(last[_v_slice(n)] - first[_v_slice(n)])
         least = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
-        if not (turn > np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * least)).any():
+        if not (change > np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * least)).any():
             continue
         near = min(LOST, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST
         # if no step led across, the run's own steps may have left the branch: evaluate the ratio at the last state only
@@ -97,14 +97,14 @@ def describe_turn(
         ratio = _least_ratio(system, here if across else there, there, rank, ratio_in_any_units)
         if ratio >= near:
             continue
-        known = max(
+        explained = max(
             _known_acceleration(system, t, state[_q_slice(n)], state[_v_slice(n)], near) for t, state in (here, there)
         )
-        turn[turn <= np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * known)] = 0.0
-        if turn.any():
+        change[change <= np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * explained)] = 0.0
+        if change.any():
             return (
                 f"Not to be trusted beyond t = {t0:.10g}: near it the constraints lose rank "
-                f"({_measured({t0: ratio})}), and velocities changed there by up to {turn.max():.1g} within "
+                f"({_measured({t0: ratio})}), and velocities changed there by up to {change.max():.1g} within "
                 f"{t1 - t0:.1g} s, more than forces and constraints explain: within the tolerances lies another "
                 "branch of the motion, onto which the steps may have come. Tighten rtol and atol, take another method, "
                 "or end t_span before."
@@ -114,12 +114,12 @@ def describe_turn(
 
 def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
     """Return whether velocities changed in the last step by more than accelerations explain; `rows`: [q, v, a]."""
-    most = np.maximum.reduce  # array.max() makes three calls, which would slow down short repeated runs
+    largest = np.maximum.reduce  # array.max() makes three calls, which would slow down short repeated runs
     if times.size < 2:
         return False
-    turn = most(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
-    least = np.minimum.reduce(most(np.abs(rows[-2:, 2 * n : 3 * n]), axis=1))
-    return bool(turn > TURNED * (times[-1] - times[-2]) * least)
+    change = largest(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
+    least = np.minimum.reduce(largest(np.abs(rows[-2:, 2 * n : 3 * n]), axis=1))
+    return bool(change > TURNED * (times[-1] - times[-2]) * least)
 
 
 def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
@@ -144,11 +144,11 @@ def _v_slice(n: int) -> slice:
 
 def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
     """Return the largest acceleration without the rows whose singular values are below `near` times the largest."""
-    mass, rows, lengths, units = _in_any_units(system, t, q)
+    mass, rows, norms, units = _in_any_units(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     kept = values > near * values[0]
     short = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / max(np.abs(v).max(), DIFFERENCE)
-    rates = [system.velocity_constraint(t + dt, q + dt * v, v) / lengths for dt in (-short, short)]
+    rates = [system.velocity_constraint(t + dt, q + dt * v, v) / norms for dt in (-short, short)]
     gamma = (left.T @ (rates[0] - rates[1]))[kept] / (2.0 * short * values[kept])
     equations = np.block([[mass, right[kept].T], [right[kept], np.zeros((int(kept.sum()),) * 2)]])
     solution = np.linalg.lstsq(equations, np.append(units * system.force(t, q, v), gamma), rcond=None)[0]
@@ -169,16 +169,16 @@ def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
     units = 1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max()))
-    lengths = np.linalg.norm(rows * units, axis=1)
-    way = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) * units / units.max() * signs(len(q))
+    norms = np.linalg.norm(rows * units, axis=1)
+    displacement = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) * units / units.max() * signs(len(q))
     try:
-        bends = np.linalg.norm((system.rows(t, q + way) - system.rows(t, q - way)) * units, axis=1)
+        slopes = np.linalg.norm((system.rows(t, q + displacement) - system.rows(t, q - displacement)) * units, axis=1)
     except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
-        bends = np.zeros(len(rows))
-    if bends.max(initial=0.0) > 0.0:  # false for NaN
-        lengths = np.maximum(lengths, MIN_ROW_NORM * lengths.max() * bends / bends.max())
-    lengths[lengths == 0.0] = 1.0
-    return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units
+        slopes = np.zeros(len(rows))
+    if slopes.max(initial=0.0) > 0.0:  # false for NaN
+        norms = np.maximum(norms, MIN_ROW_NORM * norms.max() * slopes / slopes.max())
+    norms[norms == 0.0] = 1.0
+    return mass * units * units[:, None], rows * units / norms[:, None], norms, units
 
 
 def _times(ratios: dict[float, float]) -> str:
@@ -206,22 +206,24 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
-    for u, value, way in zip(left.T[:rank], values[:rank], right[:rank], strict=True):
+    for u, value, direction in zip(left.T[:rank], values[:rank], right[:rank], strict=True):
         if value > WEAK * values[0]:
             continue
         if value == 0.0:
             return np.full(len(q), np.inf)
-        step = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / np.abs(way).max()
-        beside = [q + side * step * way for side in (1.0, -1.0)]
+        step = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / np.abs(direction).max()
+        beside = [q + side * step * direction for side in (1.0, -1.0)]
         try:
-            turn = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
-            bend = np.abs(np.subtract(*(system.rows(t, each) for each in beside)))
+            slope = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
+            row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in beside)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # a row may be small at this position only: the rounding error of its constraint is that of a displaced position
-        away = np.abs(rows) + (bend * (np.abs(rows).max() / bend.max()) if bend.any() else 0.0)
-        rounding = ROUNDING * np.sqrt((away * away) @ (q * q))
-        errors = np.maximum(errors, np.abs(way * (u @ turn)) * np.sqrt((u * u) @ (rounding * rounding)) / value**2)
+        # a row may be small at this position only: use rows beside it for the rounding errors of the constraints
+        nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
+        rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
+        errors = np.maximum(
+            errors, np.abs(direction * (u @ slope)) * np.sqrt((u * u) @ (rounding * rounding)) / value**2
+        )
     return errors
 
 
@@ -252,9 +254,9 @@ def _displacement_to_singular(system: ConstrainedSystem, t: float, q: Array, ran
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, held = left[:, rank - 1], right[rank - 1], right[: rank - 1]
     step, gradient = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE), np.zeros(len(q))
-    for j, way in enumerate(np.eye(len(q)) * step):
+    for j, displacement in enumerate(np.eye(len(q)) * step):
         try:
-            gradient[j] = u @ (system.rows(t, q + way) - system.rows(t, q - way)) @ w / (2.0 * step)
+            gradient[j] = u @ (system.rows(t, q + displacement) - system.rows(t, q - displacement)) @ w / (2.0 * step)
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
     gradient -= held.T @ (held @ gradient)

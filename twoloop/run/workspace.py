@@ -64,8 +64,8 @@ def newton_form(
     rng = np.random.default_rng(9)
     size, lam = max(1.0, float(np.abs(q0).max())), rng.uniform(0.5, 1.5, system.n_c)
     max_entries = MAX_NEWTON_SHARE * system.n_q**2
-    for share in NEARBY[:2]:
-        q = q0 + share * size * rng.uniform(-1.0, 1.0, system.n_q)
+    for scale in NEARBY[:2]:
+        q = q0 + scale * size * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
         except Exception:  # q is outside the domain of the callbacks; entries missed here are found during the run
@@ -186,7 +186,7 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
     bodies = _coordinates_of_bodies(system, mass)
     stiff = _stiff_rows(system, t0, q0, mass, jacobian, bodies)
     program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff)
-    if program is None or program[N_UPDATES] > MAX_STATIC_SHARE * _dense_work(system.n_q, system.n_c):
+    if program is None or program[N_UPDATES] > MAX_STATIC_SHARE * _dense_cost(system.n_q, system.n_c):
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF] + 1)
     static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
@@ -260,7 +260,7 @@ def _is_sparse(n_q: int, n_entries: int) -> bool:
     return n_entries <= MAX_STATIC_SHARE * n_q * n_q + 24 * n_q
 
 
-def _dense_work(n_q: int, n_c: int) -> float:
+def _dense_cost(n_q: int, n_c: int) -> float:
     """Return the estimated number of multiplications of one evaluation by a dense Schur complement."""
     return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
 
@@ -275,9 +275,9 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     pattern = np.zeros((system.n_q, system.n_q))
     size = np.maximum(np.abs(q0), np.abs(q0).max())
     directions = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
-    for share, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
+    for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
-            mass = system.mass(t0, q0 + share * size * direction)
+            mass = system.mass(t0, q0 + scale * size * direction)
         except Exception:  # outside the domain of the callbacks; missed entries are found during the run
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
@@ -296,7 +296,7 @@ def kit_of(
 
     if static is not None:
         return _static_kit(system, plan, static)
-    flags = _flags_at(system, t0, q0)
+    flags = _flags_for_start(system, t0, q0)
     if plan is not None:
         return kit_for_plan(system, flags, plan)
 
@@ -324,11 +324,11 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
     return Kit(functions, sparse_inner_loop, *_steps_of(plan), sparse_inner_loop)
 
 
-def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
+def _flags_for_start(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     """Return the flags that choose the linear algebra for a start at q0; the cached array must not be changed."""
     definite = has_definite_mass(system, t0, q0)
     key = ("flags", system.functions.flags.tobytes(), definite)
-    flags, sparse = system.remembered(key, lambda: _flags(system, t0, q0, definite))
+    flags, sparse = system.remembered(key, lambda: _dense_flags(system, t0, q0, definite))
     if not sparse:
         return flags  # type: ignore[no-any-return]
     position = (t0, q0.tobytes())
@@ -338,7 +338,7 @@ def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     return flags  # type: ignore[no-any-return]
 
 
-def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
+def _dense_flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
     """Return new flags that choose dense or banded algebra, and whether sparse factors would be faster."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
@@ -437,8 +437,8 @@ def prepare_workspace(
     static: StaticForm | None = None,
 ) -> common.Work:
     """Reset a workspace, which another run may have used, for a run from q0; return the workspace."""
-    given = map(np.ascontiguousarray, (pattern, q0))
-    entry_point(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
+    arrays = map(np.ascontiguousarray, (pattern, q0))
+    entry_point(cached_run().prepare_workspace)(work, *lasting(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
         _set_constants(work, system, static, q0)
         return work
