@@ -165,14 +165,16 @@ def describe_changed_force(run: Run) -> str | None:
         warnings.simplefilter("ignore")
         for arguments, value in samples:
             try:
-                second = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
+                later = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
             except Exception:  # the state is outside the domain of the force
                 continue
-            comparable = np.isfinite(value) & np.isfinite(second)
-            differences = np.abs(np.subtract(value, second, out=np.zeros(len(value)), where=comparable))
+            comparable = np.isfinite(value) & np.isfinite(later)
+            differences = np.abs(np.subtract(value, later, out=np.zeros(len(value)), where=comparable))
             if differences.max(initial=0.0) > CLEAR_DIFFERENCE * np.abs(value[comparable]).max(initial=0.0):
                 entry = int(differences.argmax())
-                return f"In the run {_changed_value(system.name, float(arguments[0]), entry, value[entry], second[entry])}."
+                return (
+                    f"In the run {_changed_value(system.name, float(arguments[0]), entry, value[entry], later[entry])}."
+                )
     return None
 
 
