@@ -362,7 +362,7 @@ class CollocationCode:
         return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
 
     def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """Return an emitter for vectors of coordinates, and the first coordinate of each; the last two may overlap."""
+        """Return an emitter for vectors of coordinates, and the first coordinate of each vector; two may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
@@ -417,7 +417,7 @@ class CollocationCode:
             q[i], v[i] = load_lanes(emit, work, self.q + LANES * k), load_lanes(emit, work, self.v + LANES * k)
         finish = evaluate([times, *q, *v])
         change = one.multiply(stricter, self._integrate(emit, work, state))
-        m = one.add(sweeps, llvm_code.ONE)
+        sweep = one.add(sweeps, llvm_code.ONE)
 
         def compare(name: str, x: Value, y: Value | float) -> Value:
             return builder.compare(f"fcmp {name}", x, y if isinstance(y, Value) else number(y))
@@ -427,31 +427,33 @@ class CollocationCode:
 
         contraction = one.divide(change, one.larger(change_before, number(SMALLEST)))
         contraction = one.smaller(one.larger(contraction, number(MIN_RHO)), number(MAX_RHO))
-        rho_now = builder.select(compare("ogt", m, 1.0), contraction, rho)
+        rho_now = builder.select(compare("ogt", sweep, 1.0), contraction, rho)
         out_of_range = either(compare("olt", rho_now, FAST_START), compare("ogt", rho_now, SLOW_START))
         guessed = builder.both(
-            builder.both(may_guess, compare("oeq", m, 2.0)),
+            builder.both(may_guess, compare("oeq", sweep, 2.0)),
             builder.both(out_of_range, compare("ogt", change, 0.0)),
         )
         stagnant = builder.both(
-            compare("ogt", m, 2.0),
+            compare("ogt", sweep, 2.0),
             builder.both(
                 compare("oge", change, one.multiply(number(STAGNATION_RATIO), change_before)),
                 compare("ole", change, noise),
             ),
         )
         converged = either(compare("ole", one.multiply(rho_now, change), kappa), stagnant)
-        slow = builder.both(builder.both(compare("ogt", m, 3.0), estimated), compare("oge", rho_now, MAX_CONTRACTION))
-        refused = either(either(slow, compare("oge", m, max_sweeps)), compare("uge", change, INFINITE))
+        slow = builder.both(
+            builder.both(compare("ogt", sweep, 3.0), estimated), compare("oge", rho_now, MAX_CONTRACTION)
+        )
+        refused = either(either(slow, compare("oge", sweep, max_sweeps)), compare("uge", change, INFINITE))
         stops = builder.operation("or", either(guessed, converged), refused)
-        for phi, value in zip(carried, (m, change, rho_now), strict=True):
+        for phi, value in zip(carried, (sweep, change, rho_now), strict=True):
             phi.add_incoming(value, builder.block)
         builder.branch(stops, after, loop)
         builder.position_at_end(after)
         all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [finish()])
         with self._returning_if(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
             builder.ret(otherwise())
-        for value, place in ((m, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
+        for value, place in ((sweep, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
             one.store(value, work, place)
         code = builder.select(converged, number(at.CONVERGED), number(at.REFUSED))
         code = builder.select(guessed, number(at.GUESSED), code)

@@ -308,12 +308,12 @@ class SplitFunctions:
     ) -> Value:
         """Project q and v in the metric of M, and store the results; return whether they are valid.
 
-        The results are the change of q, the projected q and v, and the accelerations and multipliers at this v.
+        The results are the change of q, the projected q and v, and the accelerations and multipliers for the new v.
         """
         kept, r, c, change = self._stack_arrays(emit)
         u, at = self._stack_array(emit, self.n), [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
-        moves = self._call(
+        corrections_valid = self._call(
             emit,
             ("factors", at),
             *(("off", [*at, c]), ("solution", [r, c, kept, numbers, moved, lam])),
@@ -327,7 +327,7 @@ class SplitFunctions:
             ("solution", [r, c, kept, numbers, a, of_rows]),
             *([("least", [c, c, kept, numbers, lam])] if self.redundant else []),
         )
-        holds = emit.builder.both(moves, holds)
+        holds = emit.builder.both(corrections_valid, holds)
         _leave_unless(emit, holds)
         _sum(emit, self.n, q, moved, new_q)
         _sum(emit, self.n, v, change, new_v)

@@ -198,7 +198,7 @@ class PivotChooser:
         return replace(last, added=last.rows, scale=float(scale), least=float(LEAST[new]))
 
     def _decode(self, index: int) -> PivotChoice:
-        """Return the choice in `self._chosen`; raise Untraceable if `index`, in LEAST, is negative: an error code."""
+        """Return the choice that the kernel wrote to `self._chosen`; raise Untraceable if `index` is an error code."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -303,10 +303,10 @@ class Elimination:
         size, speed = (sum((x * x for x in state), unit) for state in (self.q, self.v))
         for k in redundant:
             row, rate = self.all_rows[k], rates[k]
-            faster = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
+            velocity_residual = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
             allowed = sum((entry * entry for entry in row), self.zero).times(MAX_VIOLATION**2)
-            for what, scale in ((violations[k], size), (faster, speed)):
-                conditions.append((allowed * scale, what * what))
+            for residual, scale in ((violations[k], size), (velocity_residual, speed)):
+                conditions.append((allowed * scale, residual * residual))
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:

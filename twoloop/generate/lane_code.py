@@ -258,7 +258,7 @@ class LaneSteps:
         store_mask(emit, work, lanes.RUNNING, builder.both(running, within_limit))
 
     def commit(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Copy the end of an accepted step to the state."""
+        """Copy NEW to STATE in the lanes in which the step was accepted."""
         at = self.places(emit, order, control, work)
         accepted = is_set(emit, work, lanes.ACCEPTED)
         for k in range(2 * self.n):

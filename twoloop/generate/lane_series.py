@@ -368,7 +368,7 @@ class LaneSeries:
     def _begin(
         self, emit: LaneEmitter, known: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for order 0 of operations: store their factors, as far as they are known, and define results."""
+        """Write code for the results of operations, of order 0; store the factors in a row as far as they are known."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -442,7 +442,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write code for order k > 0 of operations: store factors, define results (if pending, as far as known)."""
+        """Write code for the results of operations, of order k > 0; of pending products, the part known so far."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:

@@ -309,16 +309,16 @@ COSINES = (
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     """Return sine and cosine of x, accurate to rounding errors for |x| up to LARGEST_ANGLE."""
     builder, whole = emit.builder, emit.whole
-    turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
+    quarter_turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
     remainder = x
     for part in HALF_PI:
-        remainder = emit.fused(turns, emit.far(-part), remainder)
+        remainder = emit.fused(quarter_turns, emit.far(-part), remainder)
     square = builder.operation("fmul", remainder, remainder)
     fourth = builder.operation("fmul", square, square)
     sine = emit.fused(builder.operation("fmul", square, remainder), emit.polynomial(SINES, square), remainder)
     cosine = emit.fused(square, emit.far(-0.5), emit.constant(1.0))
     cosine = emit.fused(fourth, emit.polynomial(COSINES, square), cosine)
-    quarter = builder.convert("fptosi", turns, emit.whole_number)
+    quarter = builder.convert("fptosi", quarter_turns, emit.whole_number)
     odd, next_quarter = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
     results = []
     for if_odd, if_even, turn in ((cosine, sine, quarter), (sine, cosine, next_quarter)):

@@ -603,12 +603,12 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
 
 def _classes(parameters: Array) -> NDArray[np.int64]:
     """Return the class of each parameter, see `TraceCache`; classes are numbered in the order of the parameters."""
-    size = np.abs(parameters)
-    varies = (size > EXTREME) & (size < 1.0 / EXTREME) & (size != np.floor(size))
-    _, first, which = np.unique(size[varies], return_index=True, return_inverse=True)
+    magnitudes = np.abs(parameters)
+    varies = (magnitudes > EXTREME) & (magnitudes < 1.0 / EXTREME) & (magnitudes != np.floor(magnitudes))
+    _, first, which = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[first.argsort()] = np.arange(1, len(first) + 1)
-    classes = np.zeros(len(size), dtype=np.int64)
+    classes = np.zeros(len(magnitudes), dtype=np.int64)
     classes[varies] = np.copysign(rank[which], parameters[varies])
     return classes
 

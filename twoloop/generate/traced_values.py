@@ -156,8 +156,8 @@ class Traced:
         """Return whether an entry differs by about the same amount at neighbouring states; rounding errors do not."""
         parts = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * parts))
-        gap = (called - traced)[:, entry]
-        return bool(np.abs(gap).min() > 0.5 * np.abs(gap).max() and np.abs(gap.sum()) == np.abs(gap).sum())
+        gaps = (called - traced)[:, entry]
+        return bool(np.abs(gaps).min() > 0.5 * np.abs(gaps).max() and np.abs(gaps.sum()) == np.abs(gaps).sum())
 
     def _message(self, state: Array, entry: int, called: float, traced: float) -> str:
         kind, place = self.places[entry]
@@ -226,13 +226,13 @@ def unchecked(traced: Traced) -> None:
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
     """Return rows [t, q, v]: the start, and N_NEARBY random states near it, at times spread over the run."""
-    size = sizes(q)
-    speed = np.maximum(size, np.abs(v))
+    scales = sizes(q)
+    speed = np.maximum(scales, np.abs(v))
     n, parts = len(q), _random_directions(len(q))
     states = np.empty((1 + N_NEARBY, 1 + 2 * n))
     states[0, 0], states[0, 1 : 1 + n], states[0, 1 + n :] = t0, q, v
     states[1:, 0] = t0 + (t1 - t0) * TIMES
-    states[1:, 1 : 1 + n] = q + DISTANCE * size * parts[0]
+    states[1:, 1 : 1 + n] = q + DISTANCE * scales * parts[0]
     states[1:, 1 + n :] = speed * parts[1]
     return states
 

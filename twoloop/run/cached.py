@@ -558,11 +558,11 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
     if not trusted or run.work.notes.base.size > MAX_WORKSPACE:
         return None
     t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
-    final = code is not None or not may_have_code(
+    is_final = code is not None or not may_have_code(
         system, options.method, options.step_size is not None, options.compiled
     )
     definite = has_definite_mass(system, t0, q0)
-    for_other_starts = run.static is None and final and (definite or not sparse_factors_pay(system, run.kit.flags))
+    for_other_starts = run.static is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
     start = t0, q0.tobytes(), v0.tobytes()
     idle: list[CachedIntegrator] | None = [] if for_other_starts and CachedIntegrator.can_start(run) else None
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
@@ -609,7 +609,7 @@ def _new_run(
     fixed, original, new = options.step_size is not None, system, not system.checked
     if new:
         load_checked_bounds(system)
-    first = first_force(system, t0, q0, v0)
+    first_value = first_force(system, t0, q0, v0)
     _check_start(system, t0, q0, v0, options.check_derivatives)
 
     def check(traced: Traced) -> None:
@@ -626,8 +626,8 @@ def _new_run(
         difference = find_nondeterminism(system, states_near_start(t0, t1, q0, v0))
         if difference is not None:
             raise ValueError(difference)
-    if first is not None and not any("force" in each.kinds for each in plan.traced):
-        system.derived.setdefault(FIRST_FORCE, [first])
+    if first_value is not None and not any("force" in each.kinds for each in plan.traced):
+        system.derived.setdefault(FIRST_FORCE, [first_value])
     run = Run(system, plan, t0, q0, v0, options.rtol, options.atol, options.step_size, interiors)
     options.set_sizes(run, t1)
     if options.max_steps is not None:

@@ -150,9 +150,9 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
     by_vibration, by_decay, vibration, decay, h = np.median(samples, axis=0)
     if max(by_vibration, by_decay) < MIN_STABILITY_RATIO:
         return ""
-    what = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"
+    motion = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"
     return (
-        f" The problem looks stiff: steps of {h:.2g} s are about as long as they can be for {what} to remain stable. "
+        f" The problem looks stiff: steps of {h:.2g} s are about as long as they can be for {motion} to remain stable. "
         "If these need not be resolved, take method='auto', 'RadauIIA9', or 'TRBDF2' for few digits."
     )
 
@@ -353,15 +353,15 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
 def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
     """Return sentences about how short the steps are, how many more would be needed, and the likely reason."""
     n_left = (t1 - float(run.clock[run.a.T])) / stall.mean
-    before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
+    earlier_steps, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
     if stall.has_slowed:
-        before = f", after steps of up to {stall.longest:.2g} s"
+        earlier_steps = f", after steps of up to {stall.longest:.2g} s"
         advice = "Look for a singular position or a stiff force near this time, or take another method. "
         advice = _describe_near_singular(run, t1) or advice
     elif run.control[run.a.FIXED_STEP] > 0.0:
         advice = "Take a larger step_size, or shorten t_span. "
     return (
-        f"the last {STAGNATION_STEPS} steps were {stall.mean:.2g} s long on average{before}, and the rest needs "
+        f"the last {STAGNATION_STEPS} steps were {stall.mean:.2g} s long on average{earlier_steps}, and the rest needs "
         f"{n_left:.1g} of them. {advice}With max_steps the run goes on up to that number of steps."
     )
 

@@ -163,12 +163,12 @@ def _other_guesses_agree(metric: _Metric, position: Array, change: Array) -> boo
     """Return whether three other guesses, with displacements like `change`, are projected near points C_q predicts."""
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
-    rest = np.zeros(len(position))
+    at_rest = np.zeros(len(position))
     for displacement in (-2.0 * change, distance * directions[0], distance * directions[1]):
-        if metric.project(position, rest) is None:
+        if metric.project(position, at_rest) is None:
             return False
         expected = position + metric.allowed_part(displacement)
-        projected = metric.project(position + displacement, rest)
+        projected = metric.project(position + displacement, at_rest)
         if projected is None or np.abs(projected[0] - expected).max() > MAX_NONLINEARITY * np.abs(displacement).max():
             return False
     return True
@@ -348,24 +348,24 @@ def _projected_position(
     if position is None or not excess <= 1.0:
         diverged = position is None
         worst = _format_largest(system.constraint(t, guess if diverged else position))
-        reached = f"the iteration diverges; at q max|C| is {worst}"
+        outcome = f"the iteration diverges; at q max|C| is {worst}"
         if not diverged:
-            reached = f"after {iterations} iterations max|C| is {worst}"
+            outcome = f"after {iterations} iterations max|C| is {worst}"
         raise ValueError(
-            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: {reached}. Give a guess that "
+            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: {outcome}. Give a guess that "
             f"is nearer to an assembled position{_describe_rank_loss(scales, jacobian, free, kept)}"
         )
     shift = float((np.abs(position - guess) / scales.columns).max())
     if check_assembly and (start.excess > 1.0 or shift > CONSISTENT):  # next to a dead centre a small error moves far
-        other = _another_assembly(system, t, position, guess, free, scales, cut)
-        if other is not None:
-            there = system.jacobian(t, position)
+        where = _another_assembly(system, t, position, guess, free, scales, cut)
+        if where is not None:
+            jacobian_there = system.jacobian(t, position)
             raise ValueError(
                 f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
-                f"{_describe_change(guess, position, scales)}, and that of another guess as far away {other}. Give a "
+                f"{_describe_change(guess, position, scales)}, and that of another guess as far away {where}. Give a "
                 "guess that is nearer to the assembly that is meant, or farther from a dead centre; "
                 f"twoloop.consistent_state(..., check_assembly=False) takes the one found"
-                f"{_describe_rank_loss(scales, there, free, kept)}"
+                f"{_describe_rank_loss(scales, jacobian_there, free, kept)}"
             )
     return position
 

@@ -252,8 +252,8 @@ class Recorder:
         if request.times is None:
             self._store(t, rows)
         elif request.lands:  # steps also end at the ends of the run, which may not be output times
-            landed = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
-            self._store(t[landed], rows[landed])
+            is_output = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
+            self._store(t[is_output], rows[is_output])
         if request.dense:
             store.add("sol_t", t)
             store.add("sol_states", rows[:, : 3 * self._n_q])
@@ -326,8 +326,8 @@ class Recorder:
             store.cut("states", n)
         t = store.array("t")
         if self.request.times is None and self.last is not None and t[-1] < self.last[0]:
-            last = np.array([self.last[0]])
-            self._store(last, self._with_accelerations(last, self.last[1][None, :]))
+            end_time = np.array([self.last[0]])
+            self._store(end_time, self._with_accelerations(end_time, self.last[1][None, :]))
             t = store.array("t")
         return t, self._with_accelerations(t, store.array("states"))
 

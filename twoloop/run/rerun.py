@@ -47,9 +47,9 @@ def compare_callbacks(
     region.count()
     if not everywhere and end <= run.compared_until[0]:
         return status, message
-    before = status
+    old_status = status
     status, message = compare_callbacks_at(run, region, sample.states(), check_derivatives, status, message, everywhere)
-    if status == before:
+    if status == old_status:
         run.compared_until[0] = end
         if parameters is not None:
             region.add_parameters(parameters)
@@ -60,8 +60,8 @@ def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
     """Return the region in which runs of the same system, with equal traces and checks, compared callbacks."""
     if run.region is not None:
         return run.region
-    what = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
-    return run.system.remembered(("territory", what), CheckedRegion)  # type: ignore[no-any-return]
+    key = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
+    return run.system.remembered(("territory", key), CheckedRegion)  # type: ignore[no-any-return]
 
 
 def compare_callbacks_at(
@@ -80,16 +80,16 @@ def compare_callbacks_at(
     first = states[-1]
     if not everywhere:
         states = region.states_outside(states)
-    before = status
+    old_status = status
     if len(states) > 0:
         if check_derivatives:
             status, message = _check_derivatives(run, states, first, status, message)
         status, message = _check_traces(run, states, status, message)
-        if status == before and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
+        if status == old_status and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
             difference = find_nondeterminism(run.system, states[:: 1 + len(states) // MAX_IN_PYTHON])
             if difference is not None:
                 status, message = Status.WRONG_TRACE, f"In the run {difference}. {message}"
-    if status == before:
+    if status == old_status:
         region.add(states)
     return status, message
 

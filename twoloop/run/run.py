@@ -398,9 +398,9 @@ class Run:
         self.max_step = max_step
         self.limit_steps()
         proposed = self.first_step(self.t0, t1, self.state, max_step)
-        first = min(first_step or proposed, t1 - self.t0)
-        self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first, float(first_step is not None)
-        self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first
+        first_size = min(first_step or proposed, t1 - self.t0)
+        self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first_size, float(first_step is not None)
+        self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
 
     def limit_steps(self) -> None:
         """Set the largest step size so that no hundredth of the run passes without an evaluation.

@@ -236,12 +236,12 @@ class SampledRun:
         """Compute the accelerations at t with the new parameters, and restart the method without past steps."""
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
-        first = 0
+        begin = 0
         if run.plan.first is not None:  # a pair of methods: the first numbers of the memory, the active method, remain
             from twoloop.kernels.control.stiffness import N_SCALARS
 
-            first = N_SCALARS + 2 * run.system.n_q
-        run.plan.memory[first:] = run.memory[first:]
+            begin = N_SCALARS + 2 * run.system.n_q
+        run.plan.memory[begin:] = run.memory[begin:]
         run.clock[: a.N_PAST] = 0.0
         if code != indices.DONE:
             raise RuntimeError(

@@ -36,20 +36,20 @@ def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], 
     `crossings`: states before and after each; the second is missing if the run ended between them, at the state `now`.
     """
     ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:SHOWN]}
-    lost = {t: ratio for t, ratio in ratios.items() if ratio < LOST}
-    others = {t: ratio for t, ratio in ratios.items() if ratio >= LOST}
-    words = ""
-    if lost:
-        words += (
-            f" Near t = {_times(lost)} steps went across positions where the constraints lose rank, or nearly so "
-            f"({_measured(lost)}): beyond these, errors may exceed the tolerances."
+    singular = {t: ratio for t, ratio in ratios.items() if ratio < LOST}
+    regular = {t: ratio for t, ratio in ratios.items() if ratio >= LOST}
+    text = ""
+    if singular:
+        text += (
+            f" Near t = {_times(singular)} steps went across positions where the constraints lose rank, or nearly so "
+            f"({_measured(singular)}): beyond these, errors may exceed the tolerances."
         )
-    if others:
-        words += (
-            f" Near t = {_times(others)} steps by collocation took the place of shorter ones ({_measured(others)})."
+    if regular:
+        text += (
+            f" Near t = {_times(regular)} steps by collocation took the place of shorter ones ({_measured(regular)})."
         )
-    more = len(crossings) - len(ratios)
-    return words + (f" There were {more} more such places." if more > 0 else "")
+    n_more = len(crossings) - len(ratios)
+    return text + (f" There were {n_more} more such places." if n_more > 0 else "")
 
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:

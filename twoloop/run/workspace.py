@@ -97,11 +97,11 @@ def _derivative_entries(
     force, of_rows = system.force(t, q, v), reaction(q)
     entries: set[tuple[int, int]] = set()
     for j in range(len(q)):
-        moved, faster = q.copy(), v.copy()
-        moved[j] += DISPLACEMENT * max(1.0, abs(q[j]))
-        faster[j] += DISPLACEMENT * max(1.0, abs(v[j]))
-        differs = (system.force(t, moved, v) != force) | (reaction(moved) != of_rows)
-        differs |= system.force(t, q, faster) != force
+        changed_q, changed_v = q.copy(), v.copy()
+        changed_q[j] += DISPLACEMENT * max(1.0, abs(q[j]))
+        changed_v[j] += DISPLACEMENT * max(1.0, abs(v[j]))
+        differs = (system.force(t, changed_q, v) != force) | (reaction(changed_q) != of_rows)
+        differs |= system.force(t, q, changed_v) != force
         for i in np.flatnonzero(differs).tolist():
             entries |= {(i, j), (j, i)}
         if len(entries) > max_entries:
@@ -240,10 +240,10 @@ def _stiff_rows(
             row = np.zeros(len(coordinates[body]))
             for j, value in own:
                 row[index_in_body[j]] += value
-            along = free[body] @ row
-            if np.linalg.norm(along) > MIN_FRACTION_ALONG * np.linalg.norm(row):
+            component = free[body] @ row
+            if np.linalg.norm(component) > MIN_FRACTION_ALONG * np.linalg.norm(row):
                 stiff_rows.append(i)
-                free[body] = np.linalg.svd(along[None, :])[2][1:] @ free[body]
+                free[body] = np.linalg.svd(component[None, :])[2][1:] @ free[body]
     return stiff_rows
 
 
