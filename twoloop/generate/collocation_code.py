@@ -211,8 +211,8 @@ class CollocationCode:
         """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
 
         The accelerations are those of the program with the fewest operations. Its conditions are checked once, after
-        the last sweep. If they fail, the iteration is repeated with the elimination that begins with M; so are the next
-        STEPS_BY_MASS_FIRST steps.
+        the last sweep. If they fail, the iteration is repeated with the elimination that begins with M, which the next
+        STEPS_BY_MASS_FIRST steps use, too.
         """
         builder, one = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
@@ -639,7 +639,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Project the ends of eight steps by `write`, a method of `parts`, that fills the arrays `names`."""
+        """Project states at the ends of eight steps by `write`, a method of SplitFunctions that fills `names`."""
         one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
         places = {name: one.pointer(work, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.ends), places["q"], places["v"]

@@ -78,7 +78,7 @@ def call_accelerations(
 ) -> Value:
     """Write a call that fills the array `filled` with the accelerations at `inputs`; return whether they are valid.
 
-    `index` of the program in `equations.accelerations`: 0: that with the fewest operations; -1: that eliminating M.
+    `index`: of a program in `equations.accelerations`: 0 has the fewest operations, -1 eliminates M first.
     """
     array = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):

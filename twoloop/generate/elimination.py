@@ -272,7 +272,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # number of operations of `reduced`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # `_n_reduced`: operations added for `reduced`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._values_of("mass")
         rows = [self._values_of("jacobian"), self._values_of("nonholonomic")]
@@ -436,7 +436,7 @@ class Elimination:
         )
 
     def _correction(self, c: Program) -> list[Affine]:
-        """Return the change x (n_q) of least norm, in the metric of M, with G x = c for the array "c" of a program."""
+        """Return the change x (n_q) of least norm in the metric of M with G x = c; `c`: program with the array "c"."""
         n = self.system.n_q
         return self.factors.solve([*([self.zero] * n), *(c.arrays["c"][k] for k in self.choice.rows)])[:n]
 

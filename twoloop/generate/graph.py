@@ -96,7 +96,7 @@ class Graph(Symbolic):
         return expression
 
     def number(self, form: "Affine") -> int:
-        """Return an identifier, which is equal for expressions whose coefficients are equal up to rounding."""
+        """Return an integer that identifies an expression, up to rounding of its coefficients."""
         if form.cached_number is None:
             form.cached_number = self._numbers.setdefault(form.key, len(self._numbers))
         return form.cached_number
@@ -116,7 +116,7 @@ class Graph(Symbolic):
         return self.quantity(quantity)
 
     def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the quantities needed for expressions, in an order of computation, without inputs and `available`."""
+        """Return the quantities needed for expressions, arguments first, except inputs and `available` quantities."""
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms]
         while stack:
@@ -198,7 +198,7 @@ class Affine:
     def __init__(self, graph: Graph, constant: float, terms: dict[int, float]):
         self.graph, self.constant, self.terms = graph, constant, terms
         self.cached_key: tuple[Any, ...] | None = None
-        self.cached_number: int | None = None  # see Graph.number
+        self.cached_number: int | None = None  # identifier, see Graph.number
 
     def on(self, graph: Graph) -> "Affine":
         """Return the same expression of the quantities of `graph`, a copy of its graph."""
@@ -449,7 +449,7 @@ def is_zero(form: Affine) -> bool:
 
 
 class Derivative:
-    """Derivatives of expressions along a direction: a dict of its nonzero components by indices of inputs."""
+    """Derivatives of expressions along a direction; `direction`: its nonzero components, by indices of inputs."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph

@@ -370,7 +370,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], at: Places) -> None:
-        """Store NEW, the state a time X after the beginning of the step; store ERROR, which is valid if X is H."""
+        """Store NEW, the state at the time X after the beginning of the step, and ERROR, which is valid if X is H."""
         A, b, c, fine, coarse = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -440,7 +440,7 @@ class _Coordinate:
         return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, size)))
 
     def move(self, weights: Array, twice: Array, x: Value) -> tuple[Value, Value]:
-        """Return q and v at a stage, and store them in NEW; weights of accelerations: `weights` in v, `twice` in q."""
+        """Store q and v at a stage in NEW, and return them; `weights`, `twice`: weights of accelerations in v, in q."""
         emit, (q, v) = self.emit, self.before
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
         q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(twice)))))

@@ -82,7 +82,7 @@ class LaneEmitter(Emitter):
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Load the vector at an index."""
+        """Return the vector at an index, loaded from memory."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*")
         return self.builder.load(pointer, constant=constant)
 
@@ -180,7 +180,7 @@ def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
 def loop_over(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Return a context for the body of a loop: it yields a count, a coordinate, and the two lists of `Emitter.loop`."""
+    """Return a context for a loop over `coordinates`: it yields k, a coordinate, and the lists of `Emitter.loop`."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
@@ -316,7 +316,7 @@ class LaneSeries:
             emit.store(known.sum(*form), scratch, self.r + place)
 
     def order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write code for order k > 0: velocities of order k, positions of order k + 1 in `out`; `unit`: of time, s."""
+        """Write code for order k > 0: it stores velocities of order k, and positions of order k + 1 in `out`."""
         builder, n = emit.builder, self.n
         following = builder.add(k, integer(1))
         q = emit.pointer(out, builder.mul(k, integer(n)))

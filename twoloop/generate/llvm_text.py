@@ -109,7 +109,7 @@ class Module:
         self.divided = divided
         self.kept_apart: list[str] = []  # addresses of blocks that LLVM must not merge
         self._tables: list[str] = []
-        self._numbers: list[float] = []  # see `Builder.far`
+        self._numbers: list[float] = []  # numbers that `Builder.far` loads
         self._declared: dict[str, str] = {}
         self._functions: list[Builder] = []
 
@@ -250,7 +250,7 @@ class Builder:
         return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
     def run(self, name: str, arguments: Sequence[Value]) -> None:
-        """Call a function of the module that returns no value."""
+        """Write a call of a function of the module that returns no value."""
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:
@@ -300,7 +300,7 @@ class Builder:
         return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
 
     def shuffle(self, a: Value, b: Value, places: Sequence[int]) -> Value:
-        """Return a vector of the elements with the indices `places`, counted from a to b, of two vectors."""
+        """Return a vector of elements of a and b with the indices `places`; the indices of b follow those of a."""
         mask = f"<{len(places)} x {WORD}> <{', '.join(f'{WORD} {place}' for place in places)}>"
         return self._value(vector_of(element_of(a.type), len(places)), f"shufflevector {a}, {b}, {mask}")
 

@@ -122,7 +122,7 @@ class ParameterTape(Symbolic):
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def on(self, parameters: Array) -> Callable[[float], Any]:
-        """Return a function that evaluates numbers for other parameters; their shapes are those of `products`."""
+        """Return a function that evaluates a number for other parameters; its result is an array as in `products`."""
         product = self.products(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
@@ -170,7 +170,7 @@ class ParameterTape(Symbolic):
 
 
 class Parameter(float):
-    """Float that knows how to compute it from parameters: `scale` times the product `powers` of atoms of a tape."""
+    """Float that records how it depends on parameters: it is `scale` times `powers`, a product of atoms of a tape."""
 
     __slots__ = ("powers", "scale", "tape")
     tape: ParameterTape

@@ -52,7 +52,7 @@ class Dependence(NamedTuple):
     """Result of the analysis of callbacks; the systems of a trace cache share it."""
 
     short: ShortForces
-    steep: bool  # see `may_be_steep`
+    steep: bool  # whether forces or drives may be steep, see `may_be_steep`
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":

@@ -42,7 +42,7 @@ class Table(NamedTuple):
 
     t: Array
     states: Array
-    kinds: NDArray[np.int64]  # see kernels/data/indices.py
+    kinds: NDArray[np.int64]  # kinds of intervals, see kernels/data/indices.py
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:

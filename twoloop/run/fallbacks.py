@@ -124,7 +124,7 @@ def switch_method(run: Run) -> None:
     """Replace the plan of a run by its substitute, as its method is unsuitable or its values are not finite."""
     substitute = run.plan.substitute
     assert substitute is not None
-    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` is only read
+    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` never changes, and needs no copy
     _renew_kit(run)
     run.substituted = True
     run.control_by(run.plan)

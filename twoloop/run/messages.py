@@ -158,7 +158,7 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
 
 
 def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]) -> tuple[float, float]:
-    """Return the angular frequency (rad/s) of the fastest vibration and the rate (1/s) of the fastest decay; else 0."""
+    """Return the frequency (rad/s) of the fastest vibration and the rate (1/s) of the fastest decay; 0: unknown."""
     from twoloop.kernels.evaluation import tasks
 
     if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != indices.DONE:
@@ -410,7 +410,7 @@ def warn_of_singular_end(run: "Run") -> str:
 
 
 def warn_of_passage_by_ordinary_steps(run: "Run") -> str:
-    """Warn if ordinary steps, after steps across failed, passed a singular position inaccurately; return a sentence."""
+    """Warn if ordinary steps may have passed a singular position inaccurately; return the warning as a sentence."""
     ratio = float(run.clock[run.a.PIVOT_PASSED])
     if ratio == 0.0:
         return ""

@@ -160,7 +160,7 @@ def project_sparsely(
 
 
 def _other_guesses_agree(metric: _Metric, position: Array, change: Array) -> bool:
-    """Return whether three other guesses, with displacements like `change`, are projected near points C_q predicts."""
+    """Return whether three other guesses, displaced by as much as `change`, are projected nearly as C_q predicts."""
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     at_rest = np.zeros(len(position))

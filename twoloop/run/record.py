@@ -628,7 +628,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kind of interval, for the dense solution, of each step by the run's own plan; `steps`: their rows."""
+    """Return the kind of interval, for the dense solution, of each step of the run's own plan, given rows of steps."""
     if run.plan.apart:
         return np.full(len(steps), indices.APART)
     explicit = indices.ACROSS if run.substituted else indices.ACCELERATIONS

@@ -44,7 +44,7 @@ CONTRADICTS = 1e-6  # relative residual of a row for the accelerations at the st
 
 
 class Run:
-    """State of an integration: plan, kit, workspace, state and controls, at first at its start.
+    """Data of an integration: plan, kit, workspace, state and controls; a new object is at the start of the run.
 
     Raises
     ------

@@ -53,13 +53,13 @@ def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], 
 
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the ratio of the singular value number `rank` of the rows to the largest one; 1 if there are no rows."""
+    """Return the ratio of the `rank`-th largest singular value of the rows to the largest; 1 if there are no rows."""
     values = np.linalg.svd(system.rows(t, q), compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
 def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the singular value number `rank`, in descending order, of the rows; 0 if there are no rows."""
+    """Return the `rank`-th largest singular value of the rows; 0 if there are no rows."""
     values = np.linalg.svd(system.rows(t, q), compute_uv=False)[:rank]
     return float(values[-1]) if len(values) else 0.0
 
@@ -123,7 +123,7 @@ def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
 
 
 def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
-    """Yield states before and after each passage, and whether steps led across; it includes crossings that failed."""
+    """Yield the states before and after each passage of a singular position, and whether special steps led across."""
     before: Place | None = None
     for first, *behind in crossings:
         before = first if before is None else before
@@ -175,7 +175,7 @@ def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
         slopes = np.linalg.norm((system.rows(t, q + displacement) - system.rows(t, q - displacement)) * units, axis=1)
     except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
         slopes = np.zeros(len(rows))
-    if slopes.max(initial=0.0) > 0.0:  # false for NaN
+    if slopes.max(initial=0.0) > 0.0:  # false if a slope is NaN
         norms = np.maximum(norms, MIN_ROW_NORM * norms.max() * slopes / slopes.max())
     norms[norms == 0.0] = 1.0
     return mass * units * units[:, None], rows * units / norms[:, None], norms, units
