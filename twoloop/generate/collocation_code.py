@@ -117,10 +117,7 @@ def _legendre(z: Extended) -> Extended:
 
 
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
-    """Return values, single and double integrals from 0 of the Lagrange polynomials, each an array (9, len(z)).
-
-    `coefficients`: Legendre coefficients of these polynomials. The points `z` are on [-1, 1], the integrals on [0, 1].
-    """
+    """Return values, single and double integrals from 0 of the Lagrange polynomials on [0, 1]; a row for each node."""
     values = _legendre(z)
     # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
     once = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])

@@ -6,8 +6,7 @@ The matrix of
     [G  0  ] [lam] = [Gamma]
 
 with G = [C_q; A] is eliminated without its structural zeros, in an order that is chosen once. Each row of G is
-eliminated after its coordinates. So the pivots are those of the definite matrices M and -G M^-1 G^T: no pivot search is
-necessary.
+eliminated after its coordinates. So the pivots are those of the definite matrices M and -G M^-1 G^T: none is zero.
 
 - If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows. The
   generated code then reports that its results are invalid.
@@ -38,8 +37,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # ratio of the smallest to the largest eigenvalue of M below which rows of G are added to M
-# a row of G counts as dependent if its part orthogonal to the other rows is shorter than this fraction of the row
-RANK = 1e-9
+RANK = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
 RELATIVE_BOUND = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
 # possible values of the smallest allowed pivot; with pivots below the last value, rounding errors would dominate
 LEAST = 10.0 ** np.arange(-2, -9, -1)
@@ -214,8 +212,7 @@ class PivotChooser:
         return PivotChoice(tuple(places[:n_independent]), added, float(self._room[0]), float(LEAST[index]))
 
 
-# largest number of operations of callbacks and elimination: enough for 40 bodies in space with hinges
-MOST_ELIMINATED = 60_000
+MOST_ELIMINATED = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
 # cost of the program `reduced`, relative to that of `mass_first`, from which on it is not used: it is compiled in
 # addition to `mass_first`, which is needed if pivots become small. At a ratio of 0.68 (four-bar) it saves 5 % of a run.
 MAX_COST_RATIO = 0.75

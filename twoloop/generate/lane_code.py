@@ -308,7 +308,7 @@ def clear_fine_unless(emit: LaneEmitter, work: Value, holds: Value) -> None:
 Rows = list[dict[int, Value]]  # the nonzero entries of each row, by column
 
 
-def mask_of_changed_orientation(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
+def changed_orientation(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
     """Return a mask of the lanes in which a step may have passed a singular position: det G1 G0^T is not positive.
 
     G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula
@@ -611,10 +611,7 @@ class LaneCode(LaneSteps):
         emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
 
     def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct positions NEW and project velocities in the lanes in which LEFT_TO_MOVE is set.
-
-        Store accelerations and multipliers, FINE, and LEFT_TO_MOVE in the lanes that need a further correction.
-        """
+        """Correct positions, project velocities in lanes with LEFT_TO_MOVE; store a, lam, FINE and LEFT_TO_MOVE."""
         builder, at = emit.builder, self.places(emit, order, control, work)
         fine, left = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
         active, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, at)
@@ -665,12 +662,10 @@ class LaneCode(LaneSteps):
         return holds, a
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return `mask_of_changed_orientation`; None for series, whose defects reveal passed singular positions."""
+        """Return the mask `changed_orientation`; None for series, whose defects reveal passed singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
-        return mask_of_changed_orientation(
-            emit, *(self._rows(emit, at, time, base) for time, base in self._ends_of_step(at))
-        )
+        return changed_orientation(emit, *(self._rows(emit, at, time, base) for time, base in self._ends_of_step(at)))
 
     def _ends_of_step(self, at: Places) -> list[tuple[int, Value]]:
         return [(lanes.T, at.state), (lanes.AHEAD, at.new)]

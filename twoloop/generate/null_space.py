@@ -45,7 +45,7 @@ class Factors:
         self.positive: list[Affine] = []
         alone: dict[int, Any] = {}
         pairs = _pairs_without_conditions(rows, n)
-        for places in [*pairs, *_elimination_order(rows, n, pairs)]:
+        for places in [*pairs, *_order_rows(rows, n, pairs)]:
             zero = Affine(rows[places[0]][places[0]].graph, 0.0, {})
             pivots = [[rows[i].pop(j, zero).value() for j in places] for i in places]
             inverse = self._inverse(pivots, [alone.get(i) for i in places])
@@ -140,9 +140,7 @@ def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tup
     return [(i, k) for k, i in pairs.items()]
 
 
-def _elimination_order(
-    rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]
-) -> list[tuple[int, ...]]:
+def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
     """Return the rows (indices) except those in `pairs`, ordered by minimum degree, as tuples of one or two rows.
 
     Two rows with the same neighbours are in one tuple. A row of G (index n and later) comes after its coordinates.
@@ -250,9 +248,7 @@ class DependentCoordinates:
         other_columns = sorted({j for i in places for j in self._rows[i]} - set(columns))
         entries = {j: [self._rows[i].get(j, self._zero) for i in places] for j in other_columns}
         solved = [
-            _nonzero_entries(
-                {j: _add_products(self._zero, zip(row, known, strict=True)) for j, known in entries.items()}
-            )
+            _nonzero({j: _add_products(self._zero, zip(row, known, strict=True)) for j, known in entries.items()})
             for row in inverse
         ]
         self._left -= set(places)
@@ -263,7 +259,7 @@ class DependentCoordinates:
             for factor, others in zip(factors, solved, strict=True):
                 for j, entry in {} if factor is None else others.items():
                     row[j] = row.get(j, self._zero) - factor * entry
-            self._rows[k] = _nonzero_entries(row)
+            self._rows[k] = _nonzero(row)
         for i, row in zip(places, solved, strict=True):
             self._rows[i] = row
         if pivot.terms:
@@ -320,7 +316,7 @@ class DependentCoordinates:
                 right = right - entry * self.g[k]
                 for independent, factor in self.T[k].items():
                     entries[independent] = entries.get(independent, self._zero) - entry * factor
-        self.T[j], self.g[j] = _nonzero_entries(entries), right.value()
+        self.T[j], self.g[j] = _nonzero(entries), right.value()
 
 
 def reduced_accelerations(
@@ -368,5 +364,5 @@ def _add_products(total: Affine, pairs: Any) -> Affine:
     return total
 
 
-def _nonzero_entries(entries: Terms) -> Terms:
+def _nonzero(entries: Terms) -> Terms:
     return {j: entry.value() for j, entry in entries.items() if not is_zero(entry)}
