@@ -18,7 +18,7 @@ from twoloop.generate.compile_equations import generated_code, write_acceleratio
 from twoloop.generate.elimination import Elimination, PivotChoice
 from twoloop.generate.lane_series import LaneEmitter
 from twoloop.generate.llvm_text import BIT, Module
-from twoloop.generate.null_space import LEAST
+from twoloop.generate.null_space import MIN_PIVOT_SQUARE
 from twoloop.generate.program import Coefficients
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
 from twoloop.kernels.lanes.layout import LANES
@@ -270,7 +270,7 @@ def test_in_lanes_no_run_depends_on_those_beside_it():
 
 
 def test_the_limit_of_pivots_leaves_nine_digits():
-    assert LEAST**-1.5 * 2.0**-52 < 1e-9
+    assert MIN_PIVOT_SQUARE**-1.5 * 2.0**-52 < 1e-9
 
 
 @pytest.mark.parametrize("inertia", quick([2e-5, 1e-6]))
