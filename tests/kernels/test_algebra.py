@@ -61,7 +61,8 @@ def test_a_singular_matrix_is_noted_in_its_lane_alone():
 
 
 make_program, factor = entry(factors.make_program), entry(factors.factor)
-solve, solve_transposed, sign_of = entry(factors.solve), entry(factors.solve_transposed), entry(factors.sign_of)
+solve, solve_transposed = entry(factors.solve), entry(factors.solve_transposed)
+determinant_sign = entry(factors.determinant_sign)
 
 
 def sparse_rows(rng, r, n, share):
@@ -102,7 +103,7 @@ def test_factors_solve(r, n_free, share, seed):
         assert np.abs(b - x[places]).max() < allowed
         b = (A.T @ x)[places]
         solve_transposed(index, values, b)
-        assert np.abs(b - x[row_order]).max() < allowed and sign_of(index, values) == np.sign(np.linalg.det(A))
+        assert np.abs(b - x[row_order]).max() < allowed and determinant_sign(index, values) == np.sign(np.linalg.det(A))
         G *= 2.0
         A = G[:r, columns]
 

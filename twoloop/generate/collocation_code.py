@@ -701,7 +701,7 @@ class CollocationCode:
     def _polynomial(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
         """Return a pointer to the polynomial of the last accepted step or, if `other`, of the attempted step."""
         builder, one = emit.builder, Emitter(emit.builder)
-        second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(work, at.WHICH), llvm_code.ZERO)
+        second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(work, at.CURRENT), llvm_code.ZERO)
         size = LANES * len(self.iterated)
         offset = builder.select(second, integer(self.polynomials + size), integer(self.polynomials))
         return one.pointer(work, offset)

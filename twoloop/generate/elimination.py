@@ -165,7 +165,7 @@ class PivotChooser:
         self._key, self._last = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
 
     def choice(self, mass: Array, G: Array) -> PivotChoice:
-        """Return the choice for values of M and G (the last object if it is equal); raise as `PivotChoice.at`."""
+        """Return the choice for values of M and G; raise the same exception as `PivotChoice.at`."""
         system, scratch, chosen = self.system, self._room, self._chosen
         constant = system.constant_mass and system.derived.get("no weak mass", False)
         scratch[0] = 0.0
@@ -204,8 +204,8 @@ class PivotChooser:
         if n_independent == 0:
             return PivotChoice((), (), 1.0, 0.0)
         if index < 0:
-            stays = "stays singular with constraints added" if index == STAYS_SINGULAR else "is too nearly singular"
-            raise Untraceable(f"the mass of {system.name!r} {stays}")
+            defect = "stays singular with constraints added" if index == STAYS_SINGULAR else "is too close to singular"
+            raise Untraceable(f"the mass of {system.name!r} {defect}")
         if n_added == 0:
             system.derived["no weak mass"] = True
         added = tuple(places[n_rows : n_rows + n_added])

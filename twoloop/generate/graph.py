@@ -201,7 +201,7 @@ class Affine:
         self.cached_number: int | None = None  # identifier, see Graph.number
 
     def on(self, graph: Graph) -> "Affine":
-        """Return the same expression of the quantities of `graph`, a copy of its graph."""
+        """Return this expression in terms of the quantities of `graph`, which must be a copy of self.graph."""
         copy = Affine(graph, self.constant, self.terms)
         copy.cached_key = self.cached_key
         return copy

@@ -271,10 +271,11 @@ class LaneSeries:
         return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Return, by product (cos x) x' or (sin x) x', the factors of the sum in the recurrence of sin x or cos x.
+        """Return the factors of the sums that products (cos x) x' and (sin x) x' share with recurrences of sin and cos.
 
-        (cos x) x' is the derivative of sin x. So the part of the product's coefficient that is known before an order is
-        solved is the sum in the recurrence of the sine for the next order, divided by the unit of time.
+        The keys are the quantities that are such products; the values are pairs of factors, see `_factors`. (cos x) x'
+        is the derivative of sin x. So a sum in the recurrence of sin x for order k + 1, divided by the unit of time, is
+        the part of coefficient k of the product that is known before order k is solved. For (sin x) x': that of cos x.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:

@@ -72,9 +72,9 @@ class SeriesProgram:
     late : Table
         Late operations; the last ones are the products in G^T lam + M a.
     rows, row_places : Sums, ndarray
-        G v + G_t without terms c v_i: the rows that are not zero, and their indices.
+        G v + G_t without the terms that are a constant times v_i: the rows that are then not zero, and their indices.
     balance, balance_places : Sums, ndarray
-        Q - G^T lam - M a without terms c lam_i and c a_i: the entries that are not zero, and their indices.
+        Q - G^T lam - M a without the terms that are a constant times lam_i or a_i: as for `rows`.
     traced : Traced or None
         Traces of the callbacks.
     """
@@ -206,10 +206,11 @@ def _sum_of_products(
     products: dict[Any, Any],
     of_rates: bool,
 ) -> Affine:
-    """Return rest + sum_i factors[i] multipliers[i], with few products; add these to the dict `products`.
+    """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
 
     Terms are collected by factors, or by the quantities in the factors, whichever needs fewer products. If both need
-    the same number, rates (`of_rates`) are collected by quantities: (cos x) x' is the derivative of sin x.
+    the same number, rates (`of_rates`) are collected by quantities. This gives products such as (cos x) x', whose sums
+    the recurrence of sin x computes anyway, see `_shared_sums` in lane_series.py.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}

@@ -42,7 +42,7 @@ TIME = 1  # bit mask of t, the first input of a graph
 
 
 class ShortForces(NamedTuple):
-    """Whether forces or drives may act for a short time: depending on time; depending on positions or velocities."""
+    """Whether forces or drives may have short pulses: one flag for their dependence on t, one for that on q or v."""
 
     by_time: bool  # a force, C_t or b may have short pulses as a function of time
     by_state: bool  # a force may have short pulses as a function of q or v

@@ -241,12 +241,12 @@ def _has_similar_gaps(t, lo, hi):
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
     """Store in out[g] the estimated error of the polynomials of interval g of `groups`, relative to the tolerances.
 
-    If there are more than two nodes, the difference that the last node makes is computed first. If it is at most 1, or
-    if accelerations contain the noise of stiff modes (VELOCITIES), it is the estimate. Otherwise positions, velocities
-    and accelerations at CHECKED_AT are compared with the constraints and the equations of motion: the error of
-    accelerations, times h over the number of coefficients, counts as an error of velocity.
-    Polynomials of methods of low order interpolate short steps, and are accurate if neighbouring steps are about
-    equally long: the estimate is then 0, unless the interval has interior states.
+    The estimate is 0 for polynomials that do not interpolate accelerations (of kind APART or VELOCITIES) if there are
+    more than two nodes, at about equal distances, and no states inside the interval. In all other cases with more than
+    two nodes, the change that the last node makes is computed first. It is the estimate if it is at most 1, or if the
+    kind is VELOCITIES, as accelerations then contain the noise of stiff modes. Without an estimate so far, positions,
+    velocities and accelerations at CHECKED_AT are compared with the constraints and the equations of motion: the error
+    of accelerations, times h over the number of coefficients, counts as an error of velocities.
     """
     n = w.Q.size
     half = z.size // 2

@@ -179,12 +179,12 @@ class RungeKutta:
 
         tableau = self.tableau
         extra = stages.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
-        n_eigen = int(extra[stages.N_REAL] + extra[stages.N_PAIRS])
+        n_systems = int(extra[stages.N_REAL] + extra[stages.N_PAIRS])
         made = plan.changed(
             step=LazyStep("steps.newton_step", "NEWTON"),
             options=np.concatenate([plan.options, extra]),
-            memory=np.zeros(stages.memory_size(n_eigen, tableau.stages, n_q)),
-            matrices=stages.n_matrices(n_eigen),
+            memory=np.zeros(stages.memory_size(n_systems, tableau.stages, n_q)),
+            matrices=stages.n_matrices(n_systems),
             projects=True,
             exponent=1.0 / (tableau.stages + 1),
         )

@@ -55,7 +55,7 @@ def warn_of_missed_changes(run: Run) -> str:
 
 Array = NDArray[np.float64]
 
-CORRECTIONS = 3  # number of Newton corrections of positions; their error is below the tolerances at first
+CORRECTIONS = 3  # number of Newton corrections of positions whose error is already below the tolerances
 NEGLIGIBLE = 1e-12  # singular value, relative to the largest, below which it counts as zero (because of redundant rows)
 MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to their right-hand side
 

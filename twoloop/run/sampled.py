@@ -237,7 +237,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         begin = 0
-        if run.plan.first is not None:  # a pair of methods: do not reset the part of the memory about the active one
+        if run.plan.first is not None:  # a pair of methods: do not reset the scalars that tell which is active
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             begin = N_SCALARS + 2 * run.system.n_q

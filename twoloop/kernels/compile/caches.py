@@ -55,7 +55,9 @@ def read_trusted(path: Path) -> bytes:
     Raises
     ------
     OSError
-        If there is no file. `Untrusted`, with a warning on stderr, if another user could have written the file.
+        If there is no such file.
+    Untrusted
+        If another user could have written the file; a warning is printed on stderr.
     """
     with path.open("rb") as file:
         if reason := _reason_of_mode(os.fstat(file.fileno())):

@@ -86,6 +86,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     APPLIES_JUMP,  # 1: the next step goes from JUMP_FROM to JUMP_TO; new_state is the state after the jump
     ROUGH_TO,  # end of the last step that was rejected with an error above SUDDEN_ERROR
     PIVOT_HERE,  # static form: value of PIVOT in Work.notes at the end of the last step
+    # samples in time alone (at a fixed state) and samples along the motion: see discontinuities.py
     SAMPLED_TO,  # time of the last sample in time alone
     SAMPLED_EVERY,  # spacing of the last samples in time alone, s
     WIDEST_SAMPLING,  # widest spacing of samples so far, s

@@ -56,7 +56,7 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.constraints import representable_step
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore
 from twoloop.kernels.evaluation.tasks import PROJECT
-from twoloop.kernels.linalg.markowitz_lu import sign_of
+from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
 # in methods with a trend, a factor between 1 and this one becomes 1, because a new step size needs a new factorization
 KEEP_BELOW = 1.2
@@ -183,7 +183,7 @@ def departure(w, tolerances, h, q, v, q1):
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
-    w.notes[ORIENTATION_NEW] = sign_of(w.index, w.values)
+    w.notes[ORIENTATION_NEW] = determinant_sign(w.index, w.values)
     motion = 0.0
     for m in range(q.size):
         motion = max(motion, h * abs(v[m]), abs(q1[m] - q[m]))

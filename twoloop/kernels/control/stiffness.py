@@ -83,7 +83,7 @@ SHARE_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts
 # cost of the run, relative to AFFORDED trials, at which a trial begins whatever the rates are; this number doubles
 # after one trial, triples after two, and so on
 COST_OF_ANY_TRIAL = 100.0
-HIDDEN_RATIO = 30.0  # ratio of rho to the rates that the motion shows above which rho is a hidden rate
+HIDDEN_RATIO = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
 QUIET_FACTOR = 10.0  # velocities, in tolerances, that an explicit method at its stability limit leaves as oscillations
 HIDDEN_FROM = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho

@@ -17,7 +17,7 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     H_BEFORE,  # size of the step whose polynomial predicts the accelerations in this step, s
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: accelerations are predicted by a polynomial; 0: they are predicted to be constant
-    WHICH,  # index (0 or 1) of the polynomial of the last accepted step
+    CURRENT,  # index (0 or 1) of the polynomial of the last accepted step
     TRIED,  # 1: the other polynomial is that of the step just attempted
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     KEPT_DEGREE,  # value of DEGREE before a step was rejected, to be restored; 0: no step was rejected

@@ -471,8 +471,9 @@ def compare_traces(
     """Compare callbacks with their traces at `states`, which has rows [t, q, v]; return how many numbers differ.
 
     Two numbers differ if their difference exceeds SAME times the largest value at these states, plus ROUNDED times the
-    bound. `sizes`: n_q, n_c and n_a; `is_compared`: 1 for each of KINDS in traced_values.py that has to be compared.
-    `called`, zero on entry, `traced` and `bounds` become the results, `nodes` is scratch.
+    error bound of the traced number. `sizes`: n_q, n_c and n_a; `is_compared`: 1 for each of KINDS in traced_values.py
+    that has to be compared. Stores the values of the callbacks in `called`, which must be zero on entry, those of the
+    traces in `traced`, and their error bounds in `bounds`; `nodes` is scratch.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

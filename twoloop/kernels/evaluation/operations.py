@@ -46,7 +46,7 @@ def operation(kind, x, y):
 
 @exact
 def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return numbers[constant] plus the sum of coefficient times node of the terms begin to end - 1, see run_table."""
+    """Return numbers[constant] plus the sum of coefficient times node over terms begin to end - 1; see run_table."""
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]

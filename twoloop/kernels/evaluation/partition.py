@@ -45,10 +45,10 @@ from twoloop.kernels.linalg.dense import contains, copy_matrix, largest_of, note
 from twoloop.kernels.linalg.markowitz_lu import (
     SIZE,
     columns_of,
+    determinant_sign,
     factor,
     make_program,
     rows_of,
-    sign_of,
     solve,
     solve_rows,
 )
@@ -331,7 +331,7 @@ def choose_oriented_partition(f, w, t, q):
     ratio = min(factor(w.entries, w.index, w.values), factor(w.entries, w.index_v, w.values_v))
     if not ratio > RANK_TOLERANCE:
         return SINGULAR
-    w.notes[ORIENTATION] = sign_of(w.index, w.values)
+    w.notes[ORIENTATION] = determinant_sign(w.index, w.values)
     return DONE
 
 

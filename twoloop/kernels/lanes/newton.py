@@ -52,9 +52,9 @@ from twoloop.kernels.steps.stages import (
     N_REAL,
     OUTER_TOL,
     VELOCITIES,
-    count_eigenvalues,
-    eigen_offset,
+    count_systems,
     middle_node,
+    newton_options_at,
     tableau_of,
 )
 from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STEPS_TO_DECAY
@@ -186,7 +186,7 @@ def factor_systems_of_lanes(settings, method_options, s, work):
     """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one eigenvalue l of each pair."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, offset = count_eigenvalues(method_options, s), eigen_offset(s)
+    n_systems, offset = count_systems(method_options, s), newton_options_at(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
     by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
@@ -278,7 +278,7 @@ def _correct(settings, method_options, s, work):
     """Store the corrections of the stage accelerations in CHANGES; add them to STAGES in lanes with ITERATING = 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, offset = count_eigenvalues(method_options, s), eigen_offset(s)
+    n_systems, offset = count_systems(method_options, s), newton_options_at(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
     scratch, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
@@ -385,7 +385,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 
 @compiled
-def end_of_stages(settings, b, bA, work):
+def state_from_stages(settings, b, bA, work):
     """Store the state at the time X after the beginning of the step in NEW, computed from STAGES."""
     n = settings[N]
     _, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -413,7 +413,7 @@ def _allowed(control, work, state, new, j, entry, k):
 def _embedded_estimate(settings, method_options, A, work, memory):
     """Store the unfiltered error estimate of the embedded formula in E_Q and E_V."""
     n, s = settings[N], A.shape[0]
-    offset = eigen_offset(s)
+    offset = newton_options_at(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
     stage_rows, begin = table(work, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
     e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
@@ -437,7 +437,7 @@ def _embedded_estimate(settings, method_options, A, work, memory):
 def _filter(settings, method_options, s, work, memory):
     """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), z = gamma0 H, where J is the Jacobian of (v, F)."""
     n = settings[N]
-    gamma0 = method_options[eigen_offset(s) + GAMMA0]
+    gamma0 = method_options[newton_options_at(s) + GAMMA0]
     e_q, e_v, scratch = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
     by_q = matrix_at(memory, n, s, BY_Q)
     for i in range(n):
@@ -446,7 +446,7 @@ def _filter(settings, method_options, s, work, memory):
             for j in range(n):
                 total += work[(by_q + i * n + j) * LANES + k] * work[(e_q + j) * LANES + k]
             work[(scratch + i) * LANES + k] = work[(e_v + i) * LANES + k] + gamma0 * work[H * LANES + k] * total
-    pivots = pivots_at(memory, n, s, count_eigenvalues(method_options, s), 0)
+    pivots = pivots_at(memory, n, s, count_systems(method_options, s), 0)
     solve_lanes(work, matrix_at(memory, n, s, SYSTEMS), pivots, n, 0, scratch)
     copy_vectors(work, scratch, e_v, n)
     for i in range(n * LANES):
@@ -477,7 +477,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
 
 @compiled
 def _velocity_error(control, work, n, error_v, duration, state, new, k):
-    """Return the largest effect, in lane k and in tolerances, of a velocity error that lasts for `duration`, s."""
+    """Return the largest error, in tolerances, that a velocity error of `duration` (s) causes in lane k."""
     error = 0.0
     for j in range(n):
         weight_q = duration / _allowed(control, work, state, new, j, j, k)
@@ -488,7 +488,7 @@ def _velocity_error(control, work, n, error_v, duration, state, new, k):
 
 @merged
 def _motion_time(control, work, n, memory, k):
-    """Return the largest velocity over the largest acceleration in lane k, s, as `motion_time` does."""
+    """Return the ratio (s) of the largest velocity to the largest acceleration in lane k, at most LONGEST_GAPS gaps."""
     begin = vector_at(memory, n, BEGIN_V)
     largest_v = largest_a = 0.0
     for j in range(n):
@@ -521,7 +521,7 @@ def _error_in_slow_directions(settings, control, method_options, s, work):
             z = STEPS_TO_DECAY * work[H * LANES + k]
             entry = -z * z * work[(by_q + i) * LANES + k] - z * work[(by_v + i) * LANES + k]
             work[(matrix + i) * LANES + k] = entry + (1.0 if i % (n + 1) == 0 else 0.0)
-    pivots = pivots_at(memory, n, s, count_eigenvalues(method_options, s), 0)
+    pivots = pivots_at(memory, n, s, count_systems(method_options, s), 0)
     factor_lanes(work, matrix, pivots, n, 0)
     solve_lanes(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
@@ -539,7 +539,7 @@ def _estimate(settings, control, method_options, A, work):
     """Store the error estimate, filtered to suppress stiff components and in units of the tolerances, in ERROR."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    offset = eigen_offset(s)
+    offset = newton_options_at(s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
     _embedded_estimate(settings, method_options, A, work, memory)
     copy_vectors(work, e_v, vector_at(memory, n, UNFILTERED), n)
@@ -596,7 +596,7 @@ def step_by_newton(code, settings, control, options, work, status, n_steps, with
     factor_systems_of_lanes(settings, method_options, s, work)
     predict_stages(settings, c, work, 0.0 if within else 1.0)
     solve_stages(code, settings, control, options, method_options, A, A2, c, work)
-    end_of_stages(settings, b, bA, work)
+    state_from_stages(settings, b, bA, work)
     set_end(work, control)
     if not within:
         _estimate(settings, control, method_options, A, work)

@@ -176,8 +176,11 @@ def _exchange(order, position, k, chosen):
 
 
 @compiled
-def _subtract(matrix, row, column, pivot, j, zero_source):
-    """Eliminate `row` from column j, with the pivot at (row, column); return False if a list of entries is full."""
+def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
+    """Subtract the multiple of column `column` from column j that removes its entry in `row`, the pivot row.
+
+    `pivot` is the entry (row, column). Returns False if there is no space for a fill-in entry (source `zero_source`).
+    """
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
         counts[WHERE, lists[ROWS, j, m]] = m + 1
@@ -203,10 +206,10 @@ def _subtract(matrix, row, column, pivot, j, zero_source):
 
 @compiled
 def order(index, matrix, zero_source, zero_share):
-    """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a result.
+    """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a code.
 
     Fill-in entries get the source `zero_source`, the index of a zero. A pivot of at most `zero_share` times the largest
-    one so far counts as zero. The result is ORDERED, SINGULAR_MATRIX or TOO_MANY; `index` is complete only if ORDERED.
+    one so far counts as zero. The code is ORDERED, SINGULAR_MATRIX or TOO_MANY; `index` is complete only if ORDERED.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
@@ -230,7 +233,7 @@ def order(index, matrix, zero_source, zero_share):
             return SINGULAR_MATRIX
         for n in range(counts[ROW_SIZE, i]):
             other = lists[COLUMNS, i, n]
-            if counts[COLUMN_POSITION, other] > k and not _subtract(matrix, i, j, pivot, other, zero_source):
+            if counts[COLUMN_POSITION, other] > k and not _eliminate_entry(matrix, i, j, pivot, other, zero_source):
                 return TOO_MANY
     return ORDERED if _store_program(index, counts, lists) else TOO_MANY
 
@@ -394,7 +397,7 @@ def run_program(index, values):
 
 
 @merged
-def sign_of(index, values):
+def determinant_sign(index, values):
     """Return the sign of the determinant of the factored matrix, with rows and columns in ascending order."""
     r = index[SIZE]
     if index[DENSE] == 1:

@@ -100,10 +100,11 @@ def norm_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def express_other_rows(rows, order, min_share, chosen_rows, basis, factors, kept, coefficients, lengths):
-    """Return whether the first n of `rows` in `order` are independent, and if so, express all others by these rows.
+    """Return whether the first n rows in `order` are independent; if so, express all other rows by them.
 
-    `chosen_rows`, (n, n_q), becomes the first n rows in `order`; row i of `coefficients` becomes their coefficients in
-    row n + i in `order`, by least squares; `lengths` become the norms of all `rows`. Other arguments: `select_rows`.
+    n is the number of rows of `chosen_rows`, in which the first n rows are stored. Row i of `coefficients` receives the
+    coefficients, by least squares, with which row order[n + i] is a combination of them; `lengths` receives the norms
+    of all `rows`. For the other arguments see `select_rows`.
     """
     n = len(chosen_rows)
     for i in range(len(rows)):

@@ -41,12 +41,12 @@ from twoloop.kernels.linalg.markowitz_lu import (
     begin_entries,
     clear_lists,
     columns_of,
+    determinant_sign,
     lists_of,
     order,
     put_entry,
     rows_of,
     run_program,
-    sign_of,
     solve_rows,
     solve_transposed,
 )
@@ -317,7 +317,7 @@ def factor_sparse(f, w):
         if code != at.ORDERED or not _factor(w):
             w.index_a[at.SIZE] = 0
             return MASS_NOT_DEFINITE
-    if sign_of(w.index_a, w.values_a) != (1.0 if w.rows_v.size % 2 == 0 else -1.0):
+    if determinant_sign(w.index_a, w.values_a) != (1.0 if w.rows_v.size % 2 == 0 else -1.0):
         return MASS_NOT_DEFINITE
     return DONE
 

@@ -20,7 +20,7 @@ from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined,
 from twoloop.kernels.data.indices import ATOL, DONE, N_OUTER, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 
-HIGHEST = 12  # largest order; above 13 the quadrature with NODES would not be exact
+HIGHEST = 12  # largest order; the quadrature with NODES is exact up to order 13
 N_TERMS = HIGHEST + 2  # number of differences of a step, of coefficients g and of coefficients G
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
 SAFETY = 0.8  # factor on the step size for which the estimated error would equal the tolerance
@@ -54,7 +54,7 @@ THETA, N_OPTIONS = range(2)
 # indices of the scalars in `memory`. The scalars are followed by rows of N_TERMS + 2 coefficients, two tables of
 # differences, see _table, and two scratch rows
 (
-    WHICH,  # index, 0 or 1, of the table of differences at the last accepted step
+    CURRENT,  # index, 0 or 1, of the table of differences at the last accepted step
     ORDER,
     DEPTH,  # number of accelerations in the history, at most N_TERMS
     AGE,  # number of steps accepted since the order changed or a step was rejected
@@ -113,7 +113,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
             memory[DEPTH] = 0.0
         return
     memory[FAILED] = 0.0
-    memory[WHICH] = 1.0 - memory[WHICH]
+    memory[CURRENT] = 1.0 - memory[CURRENT]
     psi, new_psi = _row(memory, PSI), _row(memory, NEW_PSI)
     for i in range(N_TERMS):
         psi[i] = new_psi[i]
@@ -125,7 +125,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
 @merged
 def _begin_history(memory, n, state):
     """Reset `memory` to order 1 and a history that contains only the accelerations of `state`."""
-    table = _table(memory, n, memory[WHICH])
+    table = _table(memory, n, memory[CURRENT])
     table[:, :] = 0.0
     for m in range(n):
         table[N_TERMS, m] = state[2 * n + m]
@@ -288,7 +288,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
         _begin_history(memory, n, state)
     k = int(memory[ORDER])
     w.counters[N_OUTER] += 1
-    old, new = _table(memory, n, memory[WHICH]), _table(memory, n, 1.0 - memory[WHICH])
+    old, new = _table(memory, n, memory[CURRENT]), _table(memory, n, 1.0 - memory[CURRENT])
     _compute_coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
     memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # order of the next attempt if an evaluation in this attempt fails

@@ -175,7 +175,7 @@ def _accept_polynomial(data):
     """Make the polynomial of an accepted step predict the next step."""
     if data[field.KEPT_DEGREE] > 0.0:
         data[field.NEXT_DEGREE], data[field.KEPT_DEGREE] = data[field.KEPT_DEGREE], 0.0
-    data[field.WHICH] = 1.0 - data[field.WHICH]
+    data[field.CURRENT] = 1.0 - data[field.CURRENT]
     data[field.DEGREE], data[field.H_BEFORE] = data[field.NEXT_DEGREE], data[field.H]
     data[field.PREDICTS], data[field.FAILURES] = 1.0, max(0.0, data[field.FAILURES] - 1.0)
     data[field.N_STEPS] += 1.0

@@ -35,9 +35,9 @@ from twoloop.kernels.steps.stages import (
     OUTER_TOL,
     STAGES,
     block,
-    eigen_offset,
     interpolate,
     middle_node,
+    newton_options_at,
     tableau_of,
     vector,
 )
@@ -134,7 +134,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
     m = w.independent.size
     filter_error(f, w, options, memory, s, h, e_q, e_v)
     for i in range(m):
-        e_q[i] += h * options[eigen_offset(s) + at.GAMMA0] * e_v[i]
+        e_q[i] += h * options[newton_options_at(s) + at.GAMMA0] * e_v[i]
 
 
 @compiled
@@ -143,7 +143,7 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
-    offset = eigen_offset(s)
+    offset = newton_options_at(s)
     gamma0 = options[offset + at.GAMMA0]
     e = options[offset + at.N_EIGEN_SCALARS : offset + at.N_EIGEN_SCALARS + s]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
@@ -190,7 +190,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     to matter. Overwrites E_Q, E_V and the factors of the filter.
     """
     s, n = int(options[STAGES]), w.Q.size
-    z = STEPS_TO_DECAY * h / options[eigen_offset(s) + at.GAMMA0]
+    z = STEPS_TO_DECAY * h / options[newton_options_at(s) + at.GAMMA0]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
     longest = motion_time(w, tolerances, state, state[2 * n :])
     error = velocity_error(w, tolerances, e_v, longest, state, new_state)

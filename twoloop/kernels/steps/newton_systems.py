@@ -84,9 +84,9 @@ from twoloop.kernels.steps.stages import (
     as_matrix,
     block,
     complex_vector,
-    count_eigenvalues,
-    eigen_offset,
+    count_systems,
     matrix_storage,
+    newton_options_at,
     pivots_of,
     system_storage,
     vector,
@@ -326,7 +326,7 @@ def _filter_dense(w, options, memory, s, h, e_q, e_v):
     """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
     n = w.Q.size
     m = e_q.size
-    gamma0 = options[eigen_offset(s) + GAMMA0]
+    gamma0 = options[newton_options_at(s) + GAMMA0]
     Jq = as_matrix(matrix_storage(w, n, BY_Q), m)
     for i in range(m):
         total = 0.0
@@ -525,7 +525,7 @@ def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
     """
     n = w.Q.size
     b = f.flags[BANDWIDTH]
-    z = h * options[eigen_offset(s) + GAMMA0]
+    z = h * options[newton_options_at(s) + GAMMA0]
     K, X = _band(matrix_storage(w, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
     _multiply_by_T(w, b, e_v, X)
     e_v[:] = 0.0
@@ -547,12 +547,12 @@ NOISE = 1e-13  # rounding error of a difference of residuals, relative to the la
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_vectors returns first
 
 
-def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalues: int) -> int:
+def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: int) -> int:
     """Return the length of w.matrices for sparse storage: see _sparse_state, _sparse_vectors and _sparse_factors."""
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
     n_factors = n + 2 * int(program[N_OFF])
-    return n_mass + n_jacobian + 2 * n_tangents + (N_SPARSE_VECTORS + 7) * n + (1 + 2 * n_eigenvalues) * n_factors
+    return n_mass + n_jacobian + 2 * n_tangents + (N_SPARSE_VECTORS + 7) * n + (1 + 2 * n_systems) * n_factors
 
 
 @inlined
@@ -741,7 +741,7 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
     """Replace e_v (n_q) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
     _, _, K, _, _, _ = _sparse_state(f, w)
     _, _, _, _, right, y = _sparse_vectors(f, w)
-    z, n = h * options[eigen_offset(s) + GAMMA0], y.size
+    z, n = h * options[newton_options_at(s) + GAMMA0], y.size
     x = right.view(np.float64)[:n]
     _sparse_right_side(f, w, e_v, x)
     rows, columns, _ = tangents_of(f.newton_program)
@@ -767,7 +767,7 @@ def derivatives_at(f, w, options, memory, s, t, q, v, a):
 @compiled
 def factor_filter(f, w, options, memory, s, h):
     """Factor the real system for z = h gamma0, with which `filter_error` filters errors; return a code."""
-    n, z = w.Q.size, h * options[eigen_offset(s) + GAMMA0]
+    n, z = w.Q.size, h * options[newton_options_at(s) + GAMMA0]
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
         return _factor_sparse(f, w, z, _sparse_factors(f, w, 0))
@@ -791,11 +791,11 @@ def _factor_system(f, w, memory, s, k, z):
 @compiled
 def factor_systems(f, w, options, memory, s, h):
     """Factor the systems of gamma0 and of every eigenvalue of A for steps of size h; return a code."""
-    offset = eigen_offset(s)
-    n_eigen, n_real = count_eigenvalues(options, s), int(options[offset + N_REAL])
+    offset = newton_options_at(s)
+    n_systems, n_real = count_systems(options, s), int(options[offset + N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
     offset += N_EIGEN_SCALARS + s
-    for k in range(n_eigen):
+    for k in range(n_systems):
         if code == DONE and (k > 0 or n_real == 0):  # a real eigenvalue equals gamma0
             code = _factor_system(f, w, memory, s, k, h * complex(options[offset], options[offset + 1]))
         offset += 2 + 4 * s
@@ -830,7 +830,7 @@ def _solve_complex(f, w, options, memory, s, k, x):
         solve_lu(f.newton_program, _sparse_factors(f, w, 1 + k).view(np.complex128), right, y)
         copy(right[:n], x)
     elif f.flags[BANDWIDTH] >= 0:
-        X, pivots = complex_vector(memory, s, n, count_eigenvalues(options, s), 1), pivots_of(memory, s, n, 1 + k)
+        X, pivots = complex_vector(memory, s, n, count_systems(options, s), 1), pivots_of(memory, s, n, 1 + k)
         _solve_banded(f, w, f.flags[BANDWIDTH], system_storage(w, n, k), pivots, ZGBTRS, X, x)
     else:
         lu_solve(as_matrix(system_storage(w, n, k), m), pivots_of(memory, s, n, 1 + k), x[:m])
@@ -839,7 +839,7 @@ def _solve_complex(f, w, options, memory, s, k, x):
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
     """Solve the system of eigenvalue number k; replace the first n_dof numbers of x (n_q), complex, by the solution."""
-    if k == 0 and options[eigen_offset(s) + N_REAL] > 0.0:  # a real eigenvalue equals gamma0
+    if k == 0 and options[newton_options_at(s) + N_REAL] > 0.0:  # a real eigenvalue equals gamma0
         real = vector(memory, s, w.Q.size, V_MOVED)
         for i in range(x.size):
             real[i] = x[i].real
@@ -873,14 +873,14 @@ def correct(f, w, options, memory, s, residual, A_stage):
     """
     n = w.Q.size
     m = w.independent.size
-    offset = eigen_offset(s)
+    offset = newton_options_at(s)
     n_real = int(options[offset + N_REAL])
-    n_eigen = count_eigenvalues(options, s)
-    x = complex_vector(memory, s, n, n_eigen, 0)
+    n_systems = count_systems(options, s)
+    x = complex_vector(memory, s, n, n_systems, 0)
     offset += N_EIGEN_SCALARS + s
     d = block(memory, s, n, Q_STAGE)  # a scratch array, overwritten before the next evaluation
     d[:, :] = 0.0
-    for k in range(n_eigen):
+    for k in range(n_systems):
         row = offset + 2
         column = row + 2 * s
         offset += 2 + 4 * s

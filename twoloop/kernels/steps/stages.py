@@ -124,8 +124,8 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
     return largest
 
 
-# indices of the further scalars in `options` of Newton's method, counted from `eigen_offset`. The scalars are followed
-# by the weights e (s) of the error estimate, and for each eigenvalue of A, its real and imaginary part, its row of T^-1
+# indices of the scalars that newton_options adds to `options`, counted from `newton_options_at`. They are followed by
+# the weights e (s) of the error estimate, and for each eigenvalue of A, its real and imaginary part, its row of T^-1
 # and its column of T (s real, then s imaginary parts each). VELOCITIES: 1 if the error of velocities is tested, too
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
@@ -191,14 +191,14 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
     return np.asarray(embedded - b)
 
 
-def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
+def memory_size(n_systems: int, s: int, n_q: int) -> int:
     """Return the length of `memory`: scalars, blocks, vectors, pivots, two complex scratch vectors, s weights."""
-    return N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + 5 + n_eigenvalues) * n_q + s
+    return N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + 5 + n_systems) * n_q + s
 
 
-def n_matrices(n_eigenvalues: int) -> int:
+def n_matrices(n_systems: int) -> int:
     """Return the number of parts of n_q^2 entries that w.matrices needs."""
-    return SYSTEMS + 2 * n_eigenvalues
+    return SYSTEMS + 2 * n_systems
 
 
 # `options` of a diagonally implicit method begin with those of Newton's method for one stage, A = [[gamma]]; N_REAL and
@@ -241,15 +241,15 @@ def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
 
 
 @merged
-def eigen_offset(s):
-    """Return the index in `options` of N_REAL, the first of the further scalars of Newton's method with s stages."""
+def newton_options_at(s):
+    """Return the index in `options` at which the entries of newton_options begin, N_REAL first, for s stages."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
 @merged
-def count_eigenvalues(options, s):
+def count_systems(options, s):
     """Return the number of linear systems: one for each real eigenvalue of A and one for each complex pair."""
-    offset = eigen_offset(s)
+    offset = newton_options_at(s)
     return int(options[offset + N_REAL] + options[offset + N_PAIRS])
 
 
@@ -300,9 +300,9 @@ def pivots_of(memory, s, n, k):
 
 
 @inlined
-def complex_vector(memory, s, n, n_eigen, which):
+def complex_vector(memory, s, n, n_systems, which):
     """Return a view of complex scratch vector `which` (n), 0 or 1, of `memory`."""
-    return _after_vectors(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)
+    return _after_vectors(memory, s, n, 1 + n_systems + 2 * which).view(np.complex128)
 
 
 @kernel(ATTEMPT)

@@ -70,13 +70,13 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
 # indices of the scalars in `memory`. The scalars are followed by two series of q (ORDER + 1, n_q each), and by the
 # arrays of `arrays_of`
 (
-    KNOWN,  # 1: series WHICH has been computed
-    WHICH,  # index, 0 or 1, of the series about the beginning of the step
-    UNIT,  # unit of time of series WHICH, s
+    KNOWN,  # 1: the current series has been computed
+    CURRENT,  # index, 0 or 1, of the current series: the one about the beginning of the step
+    UNIT,  # unit of time of the current series, s
     NEXT_UNIT,
-    LENGTH,  # step size that series WHICH allows, in units of UNIT
+    LENGTH,  # step size that the current series allows, in units of UNIT
     NEXT_LENGTH,
-    TRIED,  # 1: the last attempt computed the other series, which becomes series WHICH if the attempt is accepted
+    TRIED,  # 1: the last attempt computed the other series, which becomes the current one if the attempt is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is, s
     TARGET,  # index of the series that `expand` computes
     # ratio to LENGTH of the step size that the last distance of an end from the constraints allowed; 0: not known
@@ -493,9 +493,9 @@ def _shrink_factor(defect, order):
 
 @kernel(SETTLE)
 def settle_taylor(f, w, options, memory, tolerances, accepted):
-    """Make the series about the end of an accepted step series WHICH, with which the next step is taken."""
+    """Make the series about the end of an accepted step the current one, with which the next step is taken."""
     if accepted and memory[TRIED] == 1.0:
-        memory[WHICH] = 1.0 - memory[WHICH]
+        memory[CURRENT] = 1.0 - memory[CURRENT]
         memory[UNIT], memory[LENGTH] = memory[NEXT_UNIT], memory[NEXT_LENGTH]
     memory[TRIED] = 0.0
 
@@ -511,15 +511,15 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(state, new_state)
         code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
         if code == DONE:
-            code = _compute_series(f, w, options, memory, t, new_state, h, memory[WHICH])
+            code = _compute_series(f, w, options, memory, t, new_state, h, memory[CURRENT])
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         memory[KNOWN], memory[UNIT] = 1.0, h
         if estimated:
-            memory[LENGTH] = _allowed_step(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
+            memory[LENGTH] = _allowed_step(tolerances, series_of(memory, order, n, memory[CURRENT]), h, order, n)
             if memory[LENGTH] > GROWTH:
                 return Attempt(DONE, TOO_SHORT, min(memory[LENGTH], MAX_FIRST_FACTOR))
-    series, unit = series_of(memory, order, n, memory[WHICH]), memory[UNIT]
+    series, unit = series_of(memory, order, n, memory[CURRENT]), memory[UNIT]
     x = (memory[PASSED] + h) / unit
     error, checked, series_a = 0.0, False, series_accelerations(memory, n)
     if estimated:
@@ -567,9 +567,9 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
-    series = series_of(memory, order, n, 1.0 - memory[WHICH])
+    series = series_of(memory, order, n, 1.0 - memory[CURRENT])
     unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
-    code = _compute_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH])
+    code = _compute_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[CURRENT])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit

@@ -36,8 +36,8 @@ def filtered_velocity_error(
     """Return the error, in units of the tolerances, that a velocity error causes, see `velocity_error`.
 
     `unfiltered` (n_dof) is the velocity error; `filtered_once` and `filtered_twice` (n_dof) are this error after one
-    and two filters (I - z J)^-1. `a_end` are the accelerations at the end of the step, which show how fast the motion
-    changes if a contact began. Stores DURATION, the duration of the error, in `memory`.
+    and two filters (I - z J)^-1. `a_end` are the accelerations at the end of the step: if a contact began within
+    the step, only they show how fast the motion now changes. Stores DURATION, the duration of the error, in `memory`.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
