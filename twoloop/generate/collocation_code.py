@@ -265,7 +265,7 @@ class CollocationCode:
         return name
 
     def _caller(self, emit: LaneEmitter, work: Value, index: int) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return the argument `evaluate` of `_iterate` for the program `index`, see `call_accelerations`."""
+        """Return the argument `evaluate` of `_iterate` that uses the program `index`, see `call_accelerations`."""
         filled = Emitter(emit.builder).pointer(work, self.a)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -275,7 +275,7 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, work: Value) -> list[Value]:
-        """Return the accelerations at the nodes, loaded from `work`: kept values would be spilled to the stack."""
+        """Return the accelerations at the nodes, loaded again from `work`: values in registers would be spilled."""
         return [load_lanes(emit, work, self.a + LANES * i) for i in range(self.n)]
 
     @contextmanager

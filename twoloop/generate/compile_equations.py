@@ -264,7 +264,7 @@ class SplitFunctions:
         return lowering.holds(solution.kept, [])
 
     def _part(self, program: Program, kept: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that fills the arrays of a program; return whether they are valid. `kept`: see `_factors`."""
+        """Write the part that fills arrays of a program; return if they are valid. `kept`: places of quantities."""
         places = {i: (arguments[4], place) for i, place in kept.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)

@@ -43,7 +43,7 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-TARGET_ERROR = 0.3  # error of predicted positions, over its limit, for which a shorter step is chosen if it exceeds 1
+TARGET_ERROR = 0.3  # ratio of the error of predicted positions to its limit for which steps are shortened if above 1
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
 MAX_REJECTIONS = 10  # largest number of successive rejections; after more, a lane fails
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run

@@ -267,7 +267,7 @@ class LaneSeries:
         return operations
 
     def _slot(self, *key: Any) -> int:
-        """Return the index of a factor in a row; key: terms and constant; after "scaled", times the order."""
+        """Return the index in a row of a factor: of terms and a constant, multiplied by the order if after "scaled"."""
         return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
@@ -443,7 +443,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write code for the results of operations, of order k > 0; of pending products, the part known so far."""
+        """Write code for the results of operations at order k > 0; for pending products, for the part known so far."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:

@@ -199,7 +199,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest difference of (q, v) and (q_other, v_other), in tolerances, times scale_q or scale_v."""
+    """Return the largest difference, in tolerances, of q and q_other times scale_q, and v and v_other times scale_v."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):

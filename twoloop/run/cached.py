@@ -72,7 +72,7 @@ FIRST_CHUNKS = 4
 CALLS_SKIPPED = 16  # number of calls that do not use an integrator after a callback raised an exception in it
 STEP_FIELDS = (*OF_STEPS, "stats")  # fields of a result that are computed from the array of steps
 OTHER_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # CPU time of the last run, s, below which elapsed time is measured: this clock is faster to read
+SHORT_RUN = 1e-3  # CPU time of the last run, s, below which elapsed instead of CPU time is recorded: a faster clock
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
 
@@ -321,7 +321,9 @@ class CachedIntegrator:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
             states = sample.states()
-            if not everywhere:  # if the extreme states are added to it, the region contains all states of an equal run
+            if (
+                not everywhere
+            ):  # an equal run is within the region if the region includes the extreme states of this run
                 states = np.concatenate([extreme_states(t, rows[:, :n]), states])
             if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
                 return False
@@ -387,7 +389,7 @@ def arrays_of(
     """Return new arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for `n_attempts` attempts.
 
     `run` must be at its start; its clock, control and tolerances are replaced by views of one array.
-    `evaluation.system` has the parameters of the call. The other arguments are those of `CachedIntegrator`.
+    `evaluation.system` has the parameters of the call. For the other arguments see `CachedIntegrator`.
     """
     from twoloop.kernels.evaluation import checks as start_checks
     from twoloop.kernels.linalg import rank as pivots
@@ -465,7 +467,7 @@ class CacheEntry(NamedTuple):
     shared: SharedSetup | None = None  # setup shared with systems that have other parameters
 
 
-# cached data of a system: the last start; the entries by options; the id of the code of the last run, if it was new
+# cached data of a system: its last start, its entries by options, and the id of code that the last run generated
 NO_RUNS: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 

@@ -132,7 +132,7 @@ class Interpolator:
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
 
     def begin(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
-        """Reset for a run from another state with the same kits; `pattern`: 1 at the entries of the constraint rows."""
+        """Reset the interpolator for another run with the same kits; `pattern`: 1 at entries of constraint rows."""
         self.arguments = (system, t0, row.copy(), *self.arguments[3:])
         self.system, self.judges = system, True
         self.filled, self.across, self.accurate = {}, {}, set()
@@ -253,7 +253,7 @@ class Interpolator:
     def _repair(self, table: Table, group: Groups, smallest: float) -> None:
         """Cache other states for the polynomial of an interval if they reduce its residual, which is `smallest` so far.
 
-        They are, in this order, those of a step across a singular position, of N_REPAIR steps, and the ends alone.
+        Three sets are tried: the states of a step across a singular position, those of N_REPAIR steps, the ends alone.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
@@ -338,7 +338,7 @@ class Interpolator:
         return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
 
     def _divide(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
-        """Return (times, states) of equal steps in intervals, by first time; fewer steps if steps fail, or none."""
+        """Divide intervals into `plan.parts` steps, or fewer if steps fail; return (times, states) by first times."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)

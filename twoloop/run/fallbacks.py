@@ -94,12 +94,12 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
 # sizes of steps to try across a singular position, relative to H_LONG, the longest of the last steps: several, because
 # no node of the step should be at the position
 SIZES = tuple(0.85**k for k in range(28))
-# larger sizes to try, relative to H_LONG, if too few nodes of a step are beyond the position
+# larger sizes, relative to H_LONG, which are tried if too few nodes of a step are beyond the position
 LARGER_SIZES = tuple(1.4**k for k in range(1, 7))
 # The distance of a state from a singular position is its smallest pivot of C_q, relative to the largest value of this
 # pivot so far in the run.
 FAR = 0.2  # distance from which on a state may be the base of the polynomial
-# in the last attempts, factors of the tolerances and of the longest time without an evaluation
+# factors by which the last attempts increase the tolerances and the longest time between evaluations
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 # largest age of a base: LONGEST_PAST times H_LONG, or FARTHEST times twice the time to the position, if that is longer
 LONGEST_PAST, FARTHEST = 1.5, 4.0
@@ -181,7 +181,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
-    """Take the next of `run.origins` for the polynomial, and set the step sizes to try with it."""
+    """Remove the first of `run.origins`, store it for the next polynomial, and set the step sizes to try."""
     from twoloop.kernels.steps.crossing_step import begin
 
     a, clock = run.a, run.clock

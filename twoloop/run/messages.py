@@ -86,7 +86,8 @@ INITIAL_FACTOR = 0.1  # factor of `initial_direction` when added to eigenvectors
 # the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -ALIGNED
 ALIGNED = 0.9
 MIN_STEPS = 200  # number of accepted steps below which a message does not mention stiffness
-# median of step size times rate over the stability limit from which on stability limits the steps; 0.4 in smooth motion
+# stability limits the steps if the median of step size times rate, over the stability limit, is at least this value; in
+# smooth motion the ratio is 0.4
 MIN_STABILITY_RATIO = 0.45
 
 

@@ -125,7 +125,7 @@ def memory_map(path: Path) -> NDArray[Any]:
 
 
 def read(folder: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays in a folder, by name; arrays that belong together are cut to equal numbers of rows."""
+    """Return a dict of the arrays in a folder by name; arrays that belong together are cut to equal numbers of rows."""
     arrays = {path.stem: memory_map(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
         present = [name for name in group if name in arrays]
@@ -136,7 +136,7 @@ def read(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-PENDING = 1024  # number of states above which the intervals between them are interpolated, and searched for events
+PENDING = 1024  # number of stored states above which their intervals are searched for events, and interpolated
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-FIRST_FORCE = "first force"  # cache key of the value at the start of a compiled force that is not traced
+FIRST_FORCE = "first force"  # cache key under which the value of a compiled, untraced force at the start is stored
 N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
 

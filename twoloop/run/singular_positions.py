@@ -24,7 +24,7 @@ SAMPLES = 33  # number of positions between two states at which the ratio of sin
 SHOWN = 3  # largest number of singular positions that a message names
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DIFFERENCE = 1e-6
-MIN_ROW_NORM = 0.1  # norm, relative to that expected from its derivative, below which a row is small at a position only
+MIN_ROW_NORM = 0.1  # smallest norm of a row, over the norm expected from its derivative, with which the row is scaled
 # velocities turned if they changed by more than TURNED times the change that accelerations explain, and by more than
 # APPARENT times the tolerances
 TURNED, APPARENT = 3.0, 10.0
@@ -123,7 +123,7 @@ def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
 
 
 def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
-    """Yield the states before and after each passage of a singular position, and whether special steps led across."""
+    """Yield, for each crossed singular position, the states before and after, and whether special steps crossed it."""
     before: Place | None = None
     for first, *behind in crossings:
         before = first if before is None else before

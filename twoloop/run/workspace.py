@@ -409,7 +409,7 @@ def workspace(
     static: StaticForm | None = None,
     matrices: int = 0,
 ) -> common.Work:
-    """Return a new workspace for a run from q0; `ranks`: of C_q and of [C_q; A] (None: full rank).
+    """Return a new workspace for a run from q0; `ranks`: ranks of C_q and of [C_q; A], None for full ranks.
 
     `pattern`: 1 at the entries of [C_q; A], else 0. `matrices`: number of dense matrices that the plan needs.
     """

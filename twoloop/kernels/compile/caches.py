@@ -288,7 +288,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Suspend garbage collection, which takes a sixth of the compile time: numba's objects are never garbage."""
+    """Return a context without garbage collection, which takes a sixth of the compile time, and frees nothing."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -299,7 +299,7 @@ def garbage_collection_off() -> Iterator[None]:
 
 
 class BoundedCache(dict[Any, Any]):
-    """Dictionary of at most MAX_IN_MEMORY entries, the newest: a parameter sweep adds an entry for each run."""
+    """Dictionary that keeps its newest MAX_IN_MEMORY entries, because a parameter sweep adds an entry for each run."""
 
     def __setitem__(self, key: Any, value: Any) -> None:
         super().__setitem__(key, value)

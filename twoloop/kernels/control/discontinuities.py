@@ -35,9 +35,9 @@ N_PARTS = 12  # number of parts of an interval, at whose ends C_t and b are samp
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 RATE_HALVINGS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
-TIME_ROUNDING = 5e3  # rounding error of the twelfth difference by that of t, relative to slope times spacing of t
+TIME_ROUNDING = 5e3  # rounding error of the twelfth difference due to that of t, relative to slope times np.spacing(t)
 STEEPNESS = 4.0  # slope of C_t or b, relative to its mean over the step, above which a part of the step is a ramp
-MAX_RAMP_SHARE = 0.125  # largest fraction of a step that counts as a ramp, at which the step has to end
+MAX_RAMP_SHARE = 0.125  # longest part of a step, relative to the step, that counts as a ramp: a step has to end at it
 MIN_SPACINGS = 8.0  # size of the shortest interval that is halved, in spacings of floating-point numbers
 SMOOTH, RAMP, JUMP = range(3)
 
@@ -157,7 +157,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of sampling intervals in one set of samples
 LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-SUDDEN_SHARE = 0.1  # least second difference of a sudden change over the range of samples: a bell four spacings wide
+SUDDEN_SHARE = 0.1  # smallest ratio of second difference to range at a sudden change: for a bell four spacings wide
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
 # absolute lower bound of the range of samples that matters, whatever the units: squares of smaller values underflow,
 # and subnormal numbers are too coarsely spaced to look smooth
@@ -170,10 +170,11 @@ SAME_CHANGE = 1e-5  # largest time between two changes that count as one, relati
 # time after the start, relative to GAP, before which changes are not recorded: a force that begins at zero, such as
 # 1 - cos(t), changes at the start by rounding
 SOONEST = 5e-5
-STEEPER = 2.0  # smallest ratio of a sudden change to the changes before and after; in a smooth slope it is smaller
+STEEPER = 2.0  # smallest ratio of a sudden change to its neighbouring changes; a smooth slope has smaller ratios
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_IN_SHORT = 4  # number of samples within a short step
-# change of an acceleration, relative to the largest, while a velocity changes by its tolerance, that counts as decay
+# largest change of an acceleration, relative to the largest one, in the time in which a velocity changes by its
+# tolerance: accelerations that change more decay, see _acceleration_lasts
 MAX_LASTING_CHANGE = 0.5
 AT_CHANGE = 0.01  # time from a step's beginning, in spacings of samples, within which a change counts as passed
 LARGEST = N_SAMPLES + 1  # index in w.changes of the largest absolute values so far; the rows before are samples
@@ -194,7 +195,7 @@ def _sample(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _largest(values):
-    """Return the largest of the values, at least 0: the common scale of all components, as some may be always zero."""
+    """Return the largest of `values`, at least 0: a scale of all components, since single ones may always be zero."""
     largest = 0.0
     for x in values:
         largest = max(largest, x)
@@ -203,7 +204,7 @@ def _largest(values):
 
 @compiled
 def _is_smooth(values, k, n):
-    """Return whether second differences of n + 1 values, at index k and beside it, have one sign and similar sizes."""
+    """Return whether second differences of n + 1 values at k and k + 1 (or k - 1) have equal signs, similar sizes."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -297,7 +298,7 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 
 @compiled
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
-    """Return the time of the first sample at which a component changes suddenly, or infinity; and the last sample time.
+    """Return the time of the first sample at which a component changes suddenly (or infinity), and of the last sample.
 
     (q, v, a) is the state at t. Samples begin at `begin`, and end at `last` or earlier. With `follows_motion` = 1 they
     follow the motion, with 0 they stay at the state (q, v).
@@ -383,7 +384,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample along the motion of a step, and of LEAST_DISTANCE spacings at least; store the next change in `clock`."""
+    """Sample along the motion over a step, or LEAST_DISTANCE spacings if longer; store the next change in `clock`."""
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - AT_CHANGE) * size:
         return
     duration = min(max(size, LEAST_DISTANCE * spacing), last - t)

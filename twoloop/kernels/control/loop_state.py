@@ -48,7 +48,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     BRIDGE,
     SHORTEST,  # smallest allowed step size, s; steps of at most EQUAL_SPACINGS spacings of t are too short as well
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
-    TRIAL_STEPS,  # number of accepted steps during which a next step size of at most GAP stops with SWITCH_METHOD
+    TRIAL_STEPS,  # number of first steps: stop with SWITCH_METHOD if the next size is at most GAP after one of them
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # factor by which errors may exceed their estimates near a jump of a force, see SUDDEN_ERROR in advance.py
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
@@ -99,7 +99,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SAMPLES_MOTION,  # 1 while callbacks are sampled along the motion, at states that the motion may not reach
     # smallest result of least_pivot (partition.py) at output times and grid points, where steps have to end
     PIVOT_AT_OUTPUT,
-    PIVOT_PASSED,  # smallest pivot within steps, relative to LARGEST_PIVOT, while BRIDGE is SUSPENDED; 0: none yet
+    PIVOT_PASSED,  # smallest pivot within steps since BRIDGE is SUSPENDED, relative to LARGEST_PIVOT; 0: none yet
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 29)
 

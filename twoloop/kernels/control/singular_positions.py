@@ -38,9 +38,10 @@ CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partitio
 FREEDOMS_PER_CHECK = 32
 N_CHECKED = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
 CHECKED_BELOW = 0.5  # pivot at an end of a step, relative to its largest value so far, below which the step is checked
-# ratio of the smallest pivot within a step to its largest change between samples below which it passes through zero
+# the pivot passes through zero in a step if its smallest sample is below this fraction of its largest change between
+# two samples
 PASSED_SHARE = 0.6
-# numbers in near_share: its smallest and its largest result, allowed rounding errors in tolerances, unit roundoff
+# constants of near_share: its smallest and largest result, allowed rounding errors in tolerances, unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
 END_SHARE = 0.25  # sine at the end of a step, relative to that at its start, below which the step is halved
 

@@ -64,7 +64,7 @@ KEEP_BELOW = 1.2
 
 @compiled
 def factor_of(rule, past, h, error):
-    """Return the ratio of the next step size to h by `rule` and history `past`, for a step with `error` tolerances."""
+    """Return the ratio of the next step size to h by `rule` and history `past`; `error`: in units of the tolerances."""
     if not error > 0.0:
         return rule[FACTOR_MAX]
     follows = error <= 1.0 and rule[LEAST_ERROR] > 0.0
@@ -122,7 +122,7 @@ def on_grid(clock, t, h, target, goal):
 
 @merged
 def off_grid(control, t, h, left, crosses_jump):
-    """Return the size of a step of wanted size h, and whether it reaches the goal, which is `left` seconds ahead."""
+    """Return the size of a step, at most about h, and whether it reaches the goal, which is `left` seconds ahead."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:
@@ -214,7 +214,8 @@ def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the defect |predicted - a| at the end of a step of size h, relative to the largest allowed defect.
 
     The tolerances of q and v determine the allowed defect. The defect of a series of order `order` grows as the highest
-    power of the time: its integral over the step is h / order times its value at the end. Infinity: it is not finite.
+    power of the time: its integral over the step is h / order times its value at the end. A defect that is not finite
+    counts as infinite.
     """
     rtol, duration, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

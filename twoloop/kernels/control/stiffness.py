@@ -71,7 +71,7 @@ from twoloop.kernels.linalg.dense import copy
 # each; these numbers are multiplied by COST_RATIO while the explicit method is used
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 ITERATIONS = 4  # largest number of power iterations for dF/dq in one estimate, and for dF/dv
-NEGLIGIBLE = 1e-3  # largest eigenvalue of dF/dv times step size below which no further iteration for dF/dv is needed
+NEGLIGIBLE = 1e-3  # product of step size and eigenvalue of dF/dv below which the iterations for dF/dv end
 SEED = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
 STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability limits the step of the explicit method
 # least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
@@ -84,7 +84,7 @@ SHARE_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts
 # after one trial, triples after two, and so on
 COST_OF_ANY_TRIAL = 100.0
 HIDDEN_RATIO = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
-QUIET_FACTOR = 10.0  # velocities, in tolerances, that an explicit method at its stability limit leaves as oscillations
+QUIET_FACTOR = 10.0  # largest velocities, in tolerances, of oscillations that steps at the stability limit excite
 HIDDEN_FROM = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again

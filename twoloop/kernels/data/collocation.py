@@ -33,12 +33,12 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     TARGETED,  # target number of sweeps
     CHANGE,  # change of velocities by the last sweep, relative to the tolerances
     ERROR,  # error of the step, relative to the tolerances
-    CURVED,  # Legendre coefficients of degree 5 and 6 of the accelerations, relative to the tolerances
+    CURVED,  # largest Legendre coefficient of degree 5 or 6 of the accelerations, relative to the tolerances
     FACTOR,  # ratio of the next step size to this one that convergence allows
     FACTOR_OF_ERROR,  # ratio of the next step size to this one that the error allows
     FACTOR_OF_DEFECT,  # ratio of the next step size to this one that the defect allows
     ALLOWED_H,  # step size that the error would have allowed in the last step, s
-    SIZE,  # size of velocities and of their changes, relative to the tolerances
+    SIZE,  # largest sum of a velocity and its change in the step, relative to the tolerances
     STRICTER,  # ratio by which tolerances of the coordinates that are not iterated are stricter
 ) = range(28)
 # offsets of the arrays that follow the scalars

@@ -187,17 +187,17 @@ KIT.add_function("attempt_many", MANY)
 # functions generated for a mechanism, see generate/elimination.py and collocation_code.py. A boolean result is False if
 # the conditions of the generated code are not satisfied: results are then not written
 OWN_FUNCTIONS = {
-    # functions of a state, with arguments (t, q, v, numbers) and then arrays for the results. own_accelerate: a.
-    # own_correct_positions: the correction, and corrected q. own_project: a, the correction of q, corrected q and v,
-    # and lam. own_redundant writes no results: its conditions are that the state satisfies the redundant rows
+    # functions of a state, with arguments (t, q, v, numbers) and then arrays for the results. own_accelerate
+    # stores a; own_correct_positions stores the correction and the corrected q; own_project stores a, the correction of
+    # q, the corrected q and v, and lam; own_redundant stores nothing, but checks that redundant rows are satisfied
     "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_project": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     # functions of collocation; their first argument is the memory described in data/collocation.py. attempt_nodes
     # (memory, state, tolerances, numbers) returns how the iteration ended, audit_nodes (memory, state, numbers) the
-    # defect between nodes. Other arguments: retry_nodes (memory, state), end_nodes (memory, state, new_state),
-    # correct_ends and project_ends (memory, numbers)
+    # defect between nodes. The others return nothing: retry_nodes (memory, state), end_nodes (memory, state,
+    # new_state), correct_ends and project_ends (memory, numbers)
     "attempt_nodes": f8(*[VECTOR] * 4),
     "audit_nodes": f8(*[VECTOR] * 3),
     "retry_nodes": types.none(*[VECTOR] * 2),
@@ -306,10 +306,10 @@ NONE = np.zeros(0)  # empty data of generated functions
 class Kit:
     """Functions and data of a system and a method, passed to kernels as one reference.
 
-    `functions` are the callbacks, `inner` is the inner loop, and `step` has the functions of the method; None: never
-    called. Kernels call the inner loop and the step by their addresses, without compiling them again. A pair of methods
-    calls its two methods as `first` and `second`. `own` are sets of functions generated for the mechanism: an inner
-    loop that calls these functions leaves other tasks to the inner loop `general`. `numbers` are the data of the
+    `functions` are the callbacks, `inner` is the inner loop, and `step` has the functions of the method, or None if no
+    kernel calls them. Kernels call inner loop and step by their addresses, without compiling them again. A pair of
+    methods calls its two methods as `first` and `second`. `own` are sets of functions generated for the mechanism: an
+    inner loop that calls these functions leaves other tasks to the inner loop `general`. `numbers` are the data of the
     generated functions, and `own_numbers` the data of the collocation functions.
     """
 

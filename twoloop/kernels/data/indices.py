@@ -64,7 +64,7 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     GAMMA_STEP_RATIO,  # step of the differences for Gamma, relative to largest_difference_step
     GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_STEP_RATIO was chosen
     GAMMA_SCALE,  # largest entry of Gamma so far
-    REUSE,  # a last correction of positions up to this size does not require new factors of C_qd
+    REUSE,  # largest last correction of positions after which the factors of C_qd are not renewed
     ROUNDED,  # rounding error of positions: value of REUSE for states that may be accepted
     GENERATION,  # number of partitions so far
     RANK,  # rank of C_q, if it differs from the rank for which the workspace is allocated
@@ -100,7 +100,7 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     ATOL,  # first index of the absolute tolerances: one for each coordinate and its velocity
 ) = range(6)
 LONGEST_UNSEEN = 0.01  # value of GAP, relative to the duration of the run
-REPORTED_ERROR = 30.0  # largest error of velocities next to a singular position, in tolerances, without a report
+REPORTED_ERROR = 30.0  # error of velocities beside a singular position, in tolerances, above which it is reported
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
 # kinds of intervals between accepted states, for dense output: which values of the states the polynomials interpolate

@@ -107,11 +107,11 @@ def column_units(matrix, typical, columns, counts, logs, rows, scratch):
 
 @kernel(types.void(MATRIX, VECTOR, f8, VECTOR, VECTOR))
 def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
-    """Store in `ranges` the linear range of each row: its radius, if at most 1 or at most its largest coordinate.
+    """Store in `ranges` the linear range of each row: 1, its radius, or the median of its coordinates.
 
-    Otherwise the linear range is the lower median of the row's coordinates that are not NEGLIGIBLE, which an offset
-    does not affect; or 1 if all are at most `negligible`. `coordinates_in_units`: coordinates of each row, 0 where the
-    row is 0; `radius`: norm of each row over its change when a coordinate moves by a unit.
+    The range is the radius, if this is at most 1 or at most the largest coordinate of the row; otherwise, the lower
+    median of the coordinates that are not NEGLIGIBLE, or 1 if none exceeds `negligible`. `coordinates_in_units`: the
+    coordinates in each row, 0 where the row is 0; `radius`: norm of each row over its change for a unit displacement.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -135,7 +135,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
 NEAR_SHARE = 0.5  # distance from a stored position, relative to the sizes stored with it, up to which these apply
 ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
-EIGENVALUE_MARGIN = 2.0  # factor on the limit of zero eigenvalues, larger than that by which rounding changes them
+EIGENVALUE_MARGIN = 2.0  # factor from the limit of definite M to eigenvalues that rounding leaves above (or below) it
 
 
 def results_size(n: int, n_c: int, n_a: int) -> int:

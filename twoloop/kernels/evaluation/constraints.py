@@ -112,9 +112,9 @@ ENLARGE_BELOW = 1e-11
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 # step of one-sided differences, relative to that of central ones: it is smaller, because their order is lower
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0
-# rounding error of Gamma if the terms of G v cancel, relative to the largest term over largest_difference_step
+# rounding error of Gamma if the terms of G v cancel, relative to the largest term divided by largest_difference_step
 ROUNDING_OF_TERMS = 1e-14
-CONVERGED_CHANGE = 0.01  # change of Gamma between difference steps, over the required accuracy, that ends the search
+CONVERGED_CHANGE = 0.01  # a change of Gamma below this fraction of the required accuracy ends the search of a step
 
 
 @exact
@@ -148,7 +148,7 @@ def _one_sided_direction(notes, t, e):
 def _differences(f, w, t, q, v, e, first, last):
     """Store Gamma[first:last], by differences with the steps e and 2 e, in w.Gamma; return three maxima.
 
-    They are those of |Gamma|, of the disagreement of both differences (both NaN if not finite), and of |terms of G v|.
+    These are max|Gamma|, the largest disagreement of both differences (both NaN if not finite), and max|terms of G v|.
     """
     Gamma_twice = w.Gamma_tried[0]
     side = _one_sided_direction(w.notes, t, e)

@@ -160,7 +160,7 @@ def advance_lanes(
 ):
     """Integrate runs, one for each row of `numbers`, from t0 to t1.
 
-    options : those of the method, see control.py; times : (n_t,) output times, the last of which is t1; numbers :
+    options : options of the method, see control.py; times : (n_t,) output times, the last of which is t1; numbers :
     (n_runs, n_numbers) data of the generated code; q0, v0 : (n_runs, n) initial states. Results are stored in out_q and
     out_v : (n_runs, n, n_t); out_a : (n_runs, n + n_rows) accelerations and multipliers at t1; status and n_steps :
     (n_runs,); n_evaluations : (n_runs,) increased by the number of evaluations.

@@ -59,7 +59,7 @@ from twoloop.kernels.lanes.layout import (
 
 # indices in `options`, after the rule of step-size control. ROUGH: factor by which errors may exceed their estimates if
 # a force jumps; FIRST: first step, relative to the shortest time scale at the start; LEAST: the smallest tolerance.
-# From N_HEAD on, `options` are those of the method outside the lanes
+# The entries from N_HEAD on are the options that the method has outside the lanes
 ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
 # SUDDEN_ERROR: error, in tolerances, above which a force may have jumped. AFTER_REJECTION: largest ratio of the next

@@ -160,7 +160,7 @@ def _evaluate_middle(code, settings, control, c, work, new, a, memory):
 def find_derivatives(code, settings, control, c, work):
     """Store the derivatives BY_Q and BY_V of the accelerations in the middle of the step, in lanes with FINE = 1.
 
-    They are computed at the time of a stage, because a force might act between two stages that acts at no stage.
+    They are computed at the time of a stage, because a force between two stages might act at no stage.
     """
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -307,7 +307,7 @@ def _correct(settings, method_options, s, work):
 
 @merged
 def _store_largest(work, target, begin, n):
-    """Set the vector `target` to the largest absolute value of the n vectors from `begin` on, if larger, or to NaN."""
+    """Increase the vector `target` to the largest |value| of the n vectors from `begin` on, or to NaN if one is NaN."""
     for i in range(n * LANES):
         size, at = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if size > work[at] or size != size:

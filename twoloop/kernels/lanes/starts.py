@@ -221,8 +221,8 @@ MAX_CURVATURE = 0.25
 SINGULAR = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
 WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `places_of_starts`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
-# displacements, from the projected positions, of the guesses with which these are compared: multiples of the change
-# from the guess to the projected positions, and of the weakest direction
+# other guesses for the same start: each is displaced from the projected positions by a multiple of the projection's
+# change of the first guess, and by a multiple of the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
@@ -312,7 +312,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _change_velocities(code, settings, control, pattern, moves, work):
-    """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at its positions."""
+    """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` there."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     G, x, change, _, _, _, _, row, at_found, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
@@ -336,7 +336,7 @@ def _change_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
-    """Store the weakest direction in `weakest` (n), scaled so that its largest entry is as large as in `correction`.
+    """Store the weakest direction in `weakest` (n), scaled to the largest entry of `correction`.
 
     Clear RUNNING in lanes with dependent rows.
     """

@@ -70,7 +70,7 @@ def _is_pivot_block(R, column_left, squares, i, k, j, l, max_squares, min_sine_s
 def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_sizes, block):
     """Store a pivot block of varying entries in `block`; return False if there is none.
 
-    `block` becomes two rows and two columns; a block of one row has its row and its column twice. `rows` and
+    `block` receives two rows and two columns; a block of one row has its row and its column twice. `rows` and
     `column_sizes` are scratch.
     """
     m, n = R.shape

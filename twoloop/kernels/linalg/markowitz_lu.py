@@ -168,7 +168,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Exchange `chosen` and the number at position k of `order`; return -1, or 1 if `chosen` is already there."""
+    """Exchange `chosen` and the number at position k of `order`; return 1 if `chosen` is already there, else -1."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -253,7 +253,7 @@ def _sort(columns, sources, size, position):
 def _size_of_program(rows, counts, lists):
     """Sort the lists of the rows by the order of elimination; return the numbers of entries and subtractions.
 
-    The number of entries of each row of U, in the order of elimination, becomes counts[ROW_LEFT].
+    Stores the number of entries of each row of U, in the order of elimination, in counts[ROW_LEFT].
     """
     position = counts[COLUMN_POSITION]
     entries, subtractions = 0, 0

@@ -123,9 +123,9 @@ def express_other_rows(rows, order, min_share, chosen_rows, basis, factors, kept
 def least_solution(rows, values, min_share, basis, factors, kept, coefficients, gram, parts, x):
     """Store in `x` the vector of least norm for which rows @ x is nearest to `values`; return the rank of `rows`.
 
-    `x` is zero on entry; `values` become the residuals. If y are the values of the independent rows, b the values of
-    the other rows, and S the coefficients of independent rows in the other ones, then the independent rows times x are
-    y + S^T z, with (1 + S S^T) z = b - S y. Other arguments are scratch (`parts` for y and z), see `select_rows`.
+    `x` must be zero on entry; `values` is overwritten with the residuals. If y and b are the values of independent and
+    other rows, and S the coefficients of independent rows in the other ones, then the independent rows times x are
+    y + S^T z, with (1 + S S^T) z = b - S y. `basis` to `parts` are scratch; for `min_share` see `select_rows`.
     """
     n, n_others = select_rows(rows, min_share, basis, factors, kept), 0
     y, z = parts[0], parts[1]
@@ -213,7 +213,7 @@ def _factor_and_count_negative(A):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak, A):
-    """Return the number of eigenvalues of M below b = `weak` times their bound; A becomes the factors of M - b I."""
+    """Return the number of eigenvalues of M below b = `weak` times their bound; store factors of M - b I in A."""
     largest = 0.0
     for i in range(len(mass)):
         total = 0.0
@@ -283,7 +283,8 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
     """Add scale g g^T to M in place, for rows g of G, until no eigenvalue of M is below `weak` times the largest.
 
-    Rows are tried in the sequence `order`; `added` become their indices. Returns their number, or STAYS_SINGULAR.
+    Rows are tried in the sequence `order`. Stores the indices of the added rows in `added`; returns their number, or
+    STAYS_SINGULAR.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak, A) > 0:

@@ -165,7 +165,7 @@ def reduced_multipliers(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Store in w.L factors of w.M, or the inverse, faster to apply, if M is constant and dense; return a code."""
+    """Store in w.L factors of w.M, or its inverse if M is constant and dense (faster to apply); return a code."""
     if banded_mass(f):
         definite = factor_banded_mass(f, w) == DONE
     else:

@@ -180,7 +180,7 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
     """Replace x, the right-hand side [r, c], by the solution [a, lam], refined `times` times.
 
-    Returns max|a| of the last correction, relative to max|a|; 0 without refinement. The last three are scratch.
+    Returns max|a| of the last correction over max|a|; 0 without refinement. The last three arguments are scratch.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):

@@ -381,7 +381,7 @@ def order_of(program):
 
 @inlined
 def columns_of(program):
-    """Return the first entry of each column of L, with the end of the last, and the row of each entry, as its pivot."""
+    """Return the index of the first entry of each column of L, then of the end, and the row (pivot) of each entry."""
     first = N_HEAD + program[N_PIVOTS]
     middle = first + program[N_PIVOTS] + 1
     return program[first:middle], program[middle : middle + program[N_OFF]]

@@ -43,7 +43,7 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
     N_MEMORY_SCALARS,
 ) = range(7)
 # indices of the rows of coefficients. SPANS: times, s, from earlier points of the history to its last point; NEW_SPANS:
-# times, s, from all points of the history to the end of the step; ERROR_CONSTANTS: those of the orders 0, 1, ...
+# times, s, from all points of the history to the end of the step; ERROR_CONSTANTS: one for each order 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -146,7 +146,7 @@ def _predict(memory, differences, trial, h, prediction, rate):
 
 @merged
 def _corrector_coefficient(h, k):
-    """Return the coefficient c of the corrector, h / (1 + 1/2 + ... + 1/k), s."""
+    """Return the coefficient c (s) of the corrector of order k, h / (1 + 1/2 + ... + 1/k)."""
     leading = 0.0
     for j in range(k):
         leading += 1.0 / (j + 1.0)
@@ -204,7 +204,7 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error in tolerances and the ratio of the next step size to h; d: y1 - prediction."""
+    """Store NEXT_ORDER; return error (in tolerances) and ratio of the next step size to h; `d`: y1 - prediction."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _norm(tolerances, y, y1, d, 0.0, d)

@@ -31,7 +31,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(SETTLE)
 def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """Store the stage accelerations of an accepted step, which predict the next step, and its rounding errors."""
+    """Store rounding errors of an accepted step, and its stage accelerations, which predict those of the next step."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)

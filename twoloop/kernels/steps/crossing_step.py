@@ -66,7 +66,7 @@ MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a ste
 # smallest allowed ratio of the pivot at the end of a step to the pivot below which nodes are left out; the pivot may be
 # smaller if it is not smaller than at the beginning
 END_MARGIN = 4.0
-REPEAT = 2.0  # error and factor returned with a new polynomial, so that the step is repeated: it takes a piece of it
+REPEAT = 2.0  # error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
 TINY = 1e-300  # lower bound of divisors that may be zero
 
 

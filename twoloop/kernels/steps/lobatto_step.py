@@ -109,9 +109,9 @@ def _predict_from_rejected(f, data, state):
 
 @compiled
 def _collocate(f, w, options, data, tolerances, t, h, state):
-    """Solve for the stages of a step of size h; return a result, the error, and the ratio of the next step size to h.
+    """Solve for the stages of a step of size h; return a code, the error, and the ratio of the next step size to h.
 
-    The result is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py. The error is in tolerances.
+    The code is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py. The error is in tolerances.
     """
     first, estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[LOOK] / CHECKED_GAP

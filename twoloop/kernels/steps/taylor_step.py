@@ -62,7 +62,7 @@ ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # indices of the arrays of a table of operations, and of a list of sums, see `Sums` in twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # index of the array, after those of a list of sums, with the indices at which the sums are stored
+SUM_INDICES = N_SUMS  # index, after the arrays of a list of sums, of the array of indices at which sums are stored
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
@@ -79,7 +79,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     TRIED,  # 1: the last attempt computed the other series, which becomes the current one if the attempt is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is, s
     TARGET,  # index of the series that `expand` computes
-    # ratio to LENGTH of the step size that the last distance of an end from the constraints allowed; 0: not known
+    # step size, relative to LENGTH, that the distance of the last step's end from the constraints allowed; 0: unknown
     SHORTER,
     ATTEMPTS,  # number of attempts, from which the times at which the defect is evaluated follow
     SUSPECTED,  # 1: a step was rejected because of its defect at the time SUSPECT, s, which the run has not passed yet
@@ -358,8 +358,8 @@ def expand(f, w, options, memory, t, state, unit):
     return end_series(w, order, series)
 
 
-# distance of the end of a step from the constraints, before its projection, for which step sizes are chosen, in units
-# of what `departure` allows
+# distance of the end of a step from the constraints, before its projection, for which step sizes are chosen, relative
+# to the largest distance that `departure` allows
 TARGET_DISTANCE = 0.3
 # a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
 # times the defect near the beginning of the step, where the series is exact

@@ -58,7 +58,7 @@ def filtered_velocity_error(
 
 @compiled
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
-    """Return the largest effect of a velocity error e_v (n_dof) that lasts for `duration`, s, in units of tolerances.
+    """Return the largest effect, in units of the tolerances, of a velocity error e_v (n_dof) that lasts `duration` (s).
 
     The effect on a coordinate is the smaller of two ratios: of the velocity error to the tolerance of the velocity, and
     of the position error that e_v causes in this time to the tolerance of the position.
@@ -75,7 +75,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the largest velocity in `state` over the largest acceleration in a (n_q), s; at most LONGEST_GAPS GAP."""
+    """Return the ratio (s) of the largest velocity in `state` to the largest entry of a (n_q), limited by GAP."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
