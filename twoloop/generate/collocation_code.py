@@ -5,8 +5,7 @@ on one another within a sweep, so that a sweep takes little longer than one eval
 on some of the coordinates only: only these coordinates are iterated, and the others are computed from the final
 accelerations. The ends of eight steps are projected onto the constraints together, one in each lane.
 
-The functions share an array, `work`, whose layout is in kernels/data/collocation.py; kernels/steps/lobatto_step.py
-calls them.
+The functions share an array `work` (layout: kernels/data/collocation.py); kernels/steps/lobatto_step.py calls them.
 
 The method is Lobatto IIIA with nine nodes, the first of which is the end of the previous step; its order is 16. A
 polynomial of degree 8 through values at the nodes is expanded in Legendre polynomials, whose integrals and derivatives

@@ -183,8 +183,7 @@ class SplitFunctions:
     solution : Solution
         Solution of the linear equations; `solution.stored` lists the quantities that the parts share in memory.
     at_position, with_factors : dict
-        Programs by names of parts. Their inputs are t, q, v (`at_position`), or r, c and the stored factors
-        (`with_factors`).
+        Programs by names of parts, with inputs t, q, v (`at_position`), or r, c and stored factors (`with_factors`).
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -264,7 +263,7 @@ class SplitFunctions:
         return lowering.holds(solution.kept, [])
 
     def _part(self, program: Program, kept: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that fills arrays of a program; return if they are valid. `kept`: places of quantities."""
+        """Write the part that fills the arrays of a program; return whether they are valid. `kept`: see `Solution`."""
         places = {i: (arguments[4], place) for i, place in kept.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)

@@ -47,8 +47,7 @@ TARGET_ERROR = 0.3  # ratio of the error of predicted positions to its limit for
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
 MAX_REJECTIONS = 10  # largest number of successive rejections; after more, a lane fails
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
-# a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q), or RELATIVE_CORRECTION times
-# the largest position
+# a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
 CONTRACTION = 0.5  # ratio of two successive corrections above which a projection fails
 IN_PARALLEL = 3  # number of coordinates in one loop of Horner schemes: each needs 3 of the 16 vector registers

@@ -144,8 +144,7 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
     """Return the rows (indices) except those in `pairs`, ordered by minimum degree, as tuples of one or two rows.
 
     Two rows with the same neighbours are in one tuple. A row of G (index n and later) comes after its coordinates.
-    Among rows of equal degree, the one after the shortest chain of divisions comes first, so that independent
-    operations can overlap.
+    Among rows of equal degree, the one after the shortest chain of divisions comes first, so that operations overlap.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]

@@ -21,7 +21,7 @@ Powers = tuple[tuple[int, float], ...]
 
 MOST_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
-CANCELLED = 8.0 * 2.0**-52  # a sum of two terms, relative to one of them, counts as zero (rounding) up to this value
+CANCELLED = 8.0 * 2.0**-52  # largest sum of two terms, relative to a term, that counts as a rounding error of zero
 NUMBERS = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}

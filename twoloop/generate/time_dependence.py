@@ -61,10 +61,9 @@ class Dependence(NamedTuple):
 
 
 def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
-    """Return whether forces, C_t or b may act for a short time; True for callbacks that cannot be traced.
+    """Return whether forces, C_t or b may have short pulses; True for callbacks that cannot be traced.
 
-    Functions called in Python may store their arguments: they are traced only if the force was traced before
-    (`force_was_traced`).
+    Functions called in Python may store their arguments: they are traced only if the force was (`force_was_traced`).
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -75,8 +74,8 @@ def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForc
 def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
     """Return whether forces may act for a short time, or vary much over a distance shorter than a step.
 
-    Quotients and roots of the state may vary so: the stages of a long step may evaluate 1 / (1 + (x / w)**2) on its
-    flanks, but not at its peak. The stages of a long step may evaluate a fast vibration at nearly equal phases.
+    Quotients and roots may vary in this way: the stages of a long step may evaluate 1 / (1 + (x / w)**2) on its flanks,
+    but not at its peak. They may also evaluate a fast vibration at nearly equal phases.
     """
     if any(may_be_short(system, force_was_traced)):
         return True

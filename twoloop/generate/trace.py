@@ -425,9 +425,9 @@ Array = NDArray[np.float64]
 ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]  # entry i is scales[i] * products[indices[i]]
 Evaluator = Callable[[Any], Array]  # evaluates an array of expressions for the parameters of one system
 
-# smallest and largest random value of a parameter in traces: similar sizes, so that rounding hides no term of a sum
+# limits of the random values of parameters in traces: values are of similar size, so that rounding hides no term
 GENERIC = 0.5, 1.5
-# magnitude below which (or above the inverse of which) a parameter is a constant: its powers would under- or overflow
+# a parameter is a constant if its magnitude is below this value or above its inverse: powers would under- or overflow
 EXTREME = 1e-30
 
 _CACHES = BoundedCache()
@@ -530,9 +530,9 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, what: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return what `make` derives from a trace cache, converted by the method `of` of this result for one system.
+    """Return the result of `make` for a trace cache, converted for one system by the method `of` of the result.
 
-    The trace cache is the one that other systems use, too. If callbacks cannot be traced with variable parameters, or
+    The trace cache is shared with other systems. If callbacks cannot be traced with variable parameters, or
     `check` raises Untraceable (a callback may treat variable parameters differently from numbers), it is a cache for
     this system alone. Results are cached by the key `what`.
 
@@ -627,7 +627,7 @@ class ParameterArrays:
         self._gathered: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, expressions: Any) -> Array:
-        """Return the array of numbers for an array of expressions, to be filled by `write`; one per array object.
+        """Return the array of numbers, to be filled by `write`, for an array of expressions; one array per object.
 
         If the entries are plain numbers, return the given array.
         """

@@ -37,10 +37,10 @@ MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of entries compared at all states of a run: large systems have fewer
 # largest difference between call and trace that is a rounding error, relative to the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-CLEAR_DIFFERENCE = 1e-6  # relative difference below which entries must differ at neighbouring states, too
+CLEAR_DIFFERENCE = 1e-6  # smallest relative difference that proves a wrong trace without a test of neighbouring states
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
 MARGIN = 0.01  # margin of a CheckedRegion, relative to its sides: small compared with the steps of a run
-MARGIN_AT_REST = 1e-9  # further margin, relative to the longest side except time, as coordinates at rest have no side
+MARGIN_AT_REST = 1e-9  # added margin, relative to the longest side except time: sides of coordinates at rest are 0
 
 
 class Traced:
@@ -200,7 +200,7 @@ class Sample:
 
 
 def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-    """Compare traces that are not trusted yet with calls at random states near the start; times are those of the run.
+    """Compare traces that are not trusted yet with calls at random states near the start, at times of the run.
 
     Raises
     ------
@@ -221,7 +221,7 @@ Check = Callable[[Traced], None]  # raises Untraceable if traces are wrong
 
 
 def unchecked(traced: Traced) -> None:
-    """Accept traces without a comparison: a `Check` for results that no run uses."""
+    """Do nothing, which accepts any traces: a `Check` for results that no run uses."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:

@@ -321,9 +321,7 @@ class CachedIntegrator:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
             states = sample.states()
-            if (
-                not everywhere
-            ):  # an equal run is within the region if the region includes the extreme states of this run
+            if not everywhere:  # with the extreme states of this run, the region contains all states of an equal run
                 states = np.concatenate([extreme_states(t, rows[:, :n]), states])
             if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
                 return False

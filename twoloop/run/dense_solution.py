@@ -360,8 +360,7 @@ class Interpolator:
     def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
         """Yield the interior states of all divided intervals, in blocks to be stored in a file; `keep` restores them.
 
-        A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q) of m intervals. If an interval has fewer states,
-        its last entries are NaN.
+        A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q) of m intervals; missing states are NaN.
         """
         groups = _groups(table, np.arange(len(table.t) - 1))
         for block in _blocks(groups):

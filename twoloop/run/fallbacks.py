@@ -1,8 +1,7 @@
 """Continue a run where its own steps cannot: with another method, across a singular position, or over a jump.
 
 A run in which forces changed for a short time is repeated with more evaluations, at most MAX_REPETITIONS times: changes
-caused by noise have no shortest duration, so that every repetition would find shorter ones. After the last repetition a
-warning is issued.
+caused by noise have no shortest duration, so that every repetition would find shorter ones. The last one warns.
 """
 
 import numpy as np
@@ -96,8 +95,7 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
 SIZES = tuple(0.85**k for k in range(28))
 # larger sizes, relative to H_LONG, which are tried if too few nodes of a step are beyond the position
 LARGER_SIZES = tuple(1.4**k for k in range(1, 7))
-# The distance of a state from a singular position is its smallest pivot of C_q, relative to the largest value of this
-# pivot so far in the run.
+# The distance of a state from a singular position is its smallest pivot of C_q over the largest such pivot so far.
 FAR = 0.2  # distance from which on a state may be the base of the polynomial
 # factors by which the last attempts increase the tolerances and the longest time between evaluations
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0

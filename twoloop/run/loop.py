@@ -397,7 +397,7 @@ class IntegrationLoop:
         return states[-MAX_BASE_CANDIDATES:]
 
     def _correct_last_state(self) -> None:
-        """Replace [q, v, a] of the last recorded state by those of the run: those of the more accurate polynomial."""
+        """Replace [q, v, a] of the last recorded state by the state of the run, from the more accurate polynomial."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)

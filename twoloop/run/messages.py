@@ -199,8 +199,7 @@ def _dominant_eigenvalue(
 
 
 NEARLY_SINGULAR = 1e-3  # ratio of singular values of C_q (or inertias) up to which the message of a failure mentions it
-# rounding error of velocities (or accelerations) within a run, relative to the tolerances, above which the rest of the
-# run is not trusted
+# rounding error of velocities (or accelerations) in a run, over the tolerances, above which the rest is not trusted
 MAX_LASTING_ERROR = 100.0
 LOST_AT_END = 1e-6  # ratio of singular values up to which constraints do not determine the velocities at the end
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there

@@ -56,7 +56,7 @@ class Options:
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_sizes(self, run: Run, t1: float) -> None:
-        """Set the first step size and its limits, s, in a run that ends at t1, unless its step size is constant."""
+        """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
         run.work.notes[indices.KINK_AFTER] = t1  # no jump of C_t before t1 is known yet
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, t1)

@@ -431,7 +431,7 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
-    """Return the projected q (None: diverged), its violation over the accepted one, and the number of iterations."""
+    """Return the projected q (None: diverged), its violation over the allowed one, and the number of iterations."""
     best, nearest, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:

@@ -1,7 +1,6 @@
 """Record a run: its trajectory, status and cost (`Record`, to which `Result` adds views).
 
-A `Recorder` collects events, and the states of accepted steps or at output times; a store holds them in memory or in
-files.
+A `Recorder` collects events, and states at accepted steps or output times; a store holds them in memory or in files.
 """
 
 import pickle
@@ -598,7 +597,7 @@ INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record with one row per step; `counts` (totals before these steps) become those after."""
+    """Return the fields of a record with one row per step; `counts`: totals, which are updated."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)

@@ -153,7 +153,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to a state, without past steps; compute the accelerations, and return the code of this."""
+        """Set the run to a state, without past steps; compute the accelerations; return a code."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory

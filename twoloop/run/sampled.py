@@ -118,7 +118,7 @@ class SampledRun:
             np.empty((MAX_STEPS, self.run.a.N_STEP_COLUMNS)),
         )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu, self._every = 0.0, np.inf  # CPU time, s; limit of the time between evaluations, s
+        self.cpu, self._every = 0.0, np.inf  # CPU time, s; longest allowed time between evaluations, s
         self._store_sample(t0)
 
     def _run_from(self, t: float, q: Array, v: Array) -> Run:

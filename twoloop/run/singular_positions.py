@@ -248,8 +248,7 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
 def _displacement_to_singular(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
     """Return an estimated displacement (n_q,) to the nearest singular position, to first order; not finite if unknown.
 
-    Its direction is the one, among those that the other constraints allow, in which the smallest singular value changes
-    most.
+    Among the directions that the other constraints allow, the smallest singular value changes most in this one.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, held = left[:, rank - 1], right[rank - 1], right[: rank - 1]

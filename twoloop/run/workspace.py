@@ -194,9 +194,9 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body to which a joint refers and, if these have seven each, of all bodies.
+    """Return the coordinates of each body to which a joint refers, or of all bodies if these have seven coordinates.
 
-    A joint refers to one of its two bodies only, so that no joint may refer to a body at the end of a chain.
+    A joint refers to only one of its two bodies. So there may be bodies, at ends of chains, to which no joint refers.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - own[0] for j in own) for own in coordinates_by_joint}

@@ -1,8 +1,7 @@
 """Define the kinds of callback that a mechanism may have, and the decorator that compiles a callback.
 
 All kinds are defined in the table `KINDS`. Its entries determine the signature that numba compiles, the fields of
-`Functions` in the kernels, the methods and the documentation of `ConstrainedSystem`, and the adapters for plain Python
-functions.
+`Functions` in the kernels, the methods and the documentation of `ConstrainedSystem`, and adapters for Python functions.
 
 If a function computes indices, for example into a table, all its indices are checked in every call. Otherwise machine
 code might read memory beyond the end of an array, or crash the process. A function whose indices are constants or loop

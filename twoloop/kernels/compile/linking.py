@@ -130,8 +130,7 @@ def _options_text(options: Any) -> str:
 def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     """Return the signature of a call of a function that numba implements, cached by argument types and options.
 
-    Without this cache, numba tries all implementations of an operator at each call, which takes a tenth of the time of
-    a compilation.
+    Without this cache, numba tries all implementations of an operator at each call: a tenth of the compile time.
     """
     key = self, args, tuple(kws.items()), _options_text(ConfigStack.top_or_none())
     if key not in _call_types:

@@ -214,8 +214,7 @@ def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the defect |predicted - a| at the end of a step of size h, relative to the largest allowed defect.
 
     The tolerances of q and v determine the allowed defect. The defect of a series of order `order` grows as the highest
-    power of the time: its integral over the step is h / order times its value at the end. A defect that is not finite
-    counts as infinite.
+    power of the time: its integral over the step is h / order times its value at the end. NaN counts as infinite.
     """
     rtol, duration, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

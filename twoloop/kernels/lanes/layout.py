@@ -28,7 +28,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     AHEAD,  # time of NEW, s
     UNIT,  # unit of time of a series, s
     H,  # size of the step, s
-    X,  # time of a state to compute, after the beginning of the step, s
+    X,  # time from the beginning of the step to the state to be computed, s
     FINE,  # 1 in lanes in which a task has to run; it remains 1 if the task succeeds
     DEFECT,  # defect at the end of the step, relative to the allowed defect
     OFF,  # departure of the step, see control/step_size.py

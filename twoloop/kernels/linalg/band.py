@@ -1,8 +1,7 @@
 """Factor and solve banded matrices by LAPACK: the mass matrix, and Newton matrices with a border of constraints.
 
 In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of a C-ordered array, with top = b for the
-upper triangle of M, and top = 2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the
-system declares.
+upper triangle of M, and top = 2 b for an LU, whose row exchanges fill another b diagonals (b: bandwidth).
 
 The LAPACK library is that of SciPy. The addresses of its routines differ from process to process, and kernels are
 stored on disk, so that addresses cannot be compiled in: a run stores `lapack_addresses` in its workspace, and

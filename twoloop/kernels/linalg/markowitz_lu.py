@@ -3,8 +3,7 @@
 A mechanism's Jacobian has few nonzero entries, and their pattern does not change. So the order of elimination is chosen
 once for each partition (Markowitz's rule with a threshold), and written as a program, a list of operations. Later
 factorizations follow this program, without a search for pivots and without tests for zeros. If multipliers become
-large, another order is chosen. If the program is nearly as long as that of a full matrix, the factors are dense, with
-row exchanges.
+large, another order is chosen. If the program is nearly as long as that of a full matrix, the factors are dense.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
 lists that it changes. So the work is proportional to the number of rows times the number of entries, instead of to the

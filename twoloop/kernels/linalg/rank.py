@@ -283,8 +283,7 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
     """Add scale g g^T to M in place, for rows g of G, until no eigenvalue of M is below `weak` times the largest.
 
-    Rows are tried in the sequence `order`. Stores the indices of the added rows in `added`; returns their number, or
-    STAYS_SINGULAR.
+    Tries rows in the sequence `order`. Stores indices of added rows in `added`; returns their number or STAYS_SINGULAR.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak, A) > 0:

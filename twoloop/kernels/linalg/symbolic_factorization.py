@@ -117,8 +117,7 @@ def elimination_order(
     first : sequence of int
         Rows of single bodies that are eliminated before all joints, unless the body is a hub, and so are independent.
     couplings : (rows, columns), optional
-        Entries of K and D, which couple bodies other than by joints, such as by springs. All bodies are then hubs, each
-        with its rows in `first`.
+        Entries of K and D, which couple bodies as springs do. All bodies are then hubs, each with its rows in `first`.
     """
     body_of = bodies_of(n_q, mass_entries, together)
     touched: list[set[int]] = [set() for _ in range(n_rows)]

@@ -17,8 +17,7 @@ from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
 # number of rows of ROUNDING, rounding errors of the compensated sums in steps of fixed size: of q and v at the last
-# accepted step, then of q and v in this attempt. Without compensation, the energy of a symmetric method drifts with the
-# number of steps
+# accepted step, then of q and v in this attempt. Without compensation, the energy of a symmetric method drifts
 N_ROUNDING = 4
 
 # indices of the scalars, of the stage blocks (s, n_q), and of the vectors (n_q) in `memory`, in this order
@@ -266,8 +265,7 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 def estimate_and_extrapolate(f, w, factor, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
     """Return a code and the error of Richardson's estimate; if `factor` > 0, also extrapolate (q1, v1).
 
-    (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. `factor` is 1 / (2^order - 1), or 0
-    for no extrapolation.
+    (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. `factor`: 0 or 1 / (2^order - 1).
     """
     error = _richardson_error(tolerances, factor > 0.0, q, v, q_full, v_full, q1, v1)
     if not (factor > 0.0 and error <= 1.0):

@@ -234,8 +234,7 @@ def _choose_order(memory, h, k, table, d, n):
     """Store NEXT_ORDER; return the error in units of the tolerances, and the ratio of the next step size to h.
 
     The rules are those of Shampine and Gordon's STEP. The order decreases if the error at lower orders is not larger.
-    It increases after k + 1 steps at order k if the error at order k + 1 is smaller. While STARTING is 1, it increases
-    with every step.
+    It increases after k + 1 steps at order k if the error at order k + 1 is smaller; while STARTING is 1, at each step.
     """
     g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     weight_v, weight_q = _scratch(memory, n)

@@ -39,8 +39,7 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# indices of the scalars in `options`. The scalars are followed by A, A A and Legendre coefficients (S, S each), and by
-# b, b A and c (S each)
+# indices of the scalars in `options`, followed by A, A A and Legendre coefficients (S, S each), b, b A and c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of nodes
 # change of the accelerations by a sweep, in units of the tolerances, up to which the iteration has converged

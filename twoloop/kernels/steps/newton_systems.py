@@ -95,11 +95,10 @@ from twoloop.kernels.steps.stages import (
 MAX_ITERATIONS = 15  # number of Newton iterations after which a step has failed
 # relative difference up to which step sizes count as equal: they are differences of times, with rounding errors
 EQUAL_STEP_TOLERANCE = 1e-9
-# largest correction that counts as a rounding error once corrections no longer decrease, in units of the smallest
-# tolerance
+# largest correction, over the smallest tolerance, that counts as a rounding error once corrections do not decrease
 MAX_ROUNDING_CORRECTION = 0.1
 
-RELATIVE_DISPLACEMENT = 1e-7  # of a coordinate or velocity, for finite differences, relative to max(1, |value|)
+RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to max(1, |value|)
 # if all coordinates are displaced at once, the displacement of coordinate i is multiplied by 1 + UNEQUAL (i mod
 # N_UNEQUAL), because the effects of equal displacements might cancel
 UNEQUAL, N_UNEQUAL = 0.37, 7
@@ -147,8 +146,7 @@ def _jacobian_differs(f, w, t, q):
 def _subtract_reaction_differences(f, w, t, q, moved, b, K):
     """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K with |i - j| <= b.
 
-    w.G must be C_q at q. Coordinates j, j + 2 b + 1, j + 2 (2 b + 1), ... are displaced at once. `moved` (n_q) is
-    scratch.
+    w.G must be C_q at q. Coordinates j, j + 2 b + 1, ... are displaced at once. `moved` (n_q) is scratch.
     """
     n = q.size
     for j in range(n):
@@ -378,8 +376,7 @@ def _banded_residual(f, w, t, q, v):
 def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
     """Store K, or D if `by_v`, in `band` (n_q, 2 b + 1), computed by differences; return DONE, or NOT_FINITE.
 
-    Columns j, j + 2 b + 1, j + 2 (2 b + 1), ... are computed at once. `base` (n_q) is the residual at (q, v); `moved`
-    (n_q) is scratch.
+    Columns j, j + 2 b + 1, ... are computed at once. `base` (n_q) is the residual at (q, v); `moved` (n_q) is scratch.
     """
     n = q.size
     base_point = v if by_v else q
@@ -628,8 +625,7 @@ def _sparse_residual(f, w, t, q, v, renews_G, out):
 def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
     """Store K, or D if `by_v`, in `entries`, computed by differences; return DONE, or NOT_FINITE.
 
-    The coordinates of a group of columns are displaced at once. `base` is the residual at (q, v). Overwrites `other`
-    and `moved`.
+    The coordinates of a group of columns are displaced at once. `base`: residual at (q, v). `other`, `moved`: scratch.
     """
     rows, columns, begins = tangents_of(f.newton_program)
     base_point = v if by_v else q
@@ -651,10 +647,9 @@ def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
 
 @compiled
 def _entries_are_complete(f, base, other, base_point, moved, largest, entries, predicted):
-    """Return whether `entries`, those of K or D, predict the change of the residual from `base` to `other`.
+    """Return whether `entries` of K or D predict the residual `other` at `moved` from `base` at `base_point` (q or v).
 
-    The change is that from `base_point`, q or v, to `moved`. `largest`: largest term of the residual. Overwrites
-    `other` and `predicted`.
+    `largest`: largest term of the residual. Overwrites `other` and `predicted`.
     """
     rows, columns, _ = tangents_of(f.newton_program)
     predicted[:] = 0.0

@@ -67,8 +67,7 @@ EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
 
-# indices of the scalars in `memory`. The scalars are followed by two series of q (ORDER + 1, n_q each), and by the
-# arrays of `arrays_of`
+# indices of the scalars in `memory`, followed by two series of q (ORDER + 1, n_q each), and the arrays of `arrays_of`
 (
     KNOWN,  # 1: the current series has been computed
     CURRENT,  # index, 0 or 1, of the current series: the one about the beginning of the step
