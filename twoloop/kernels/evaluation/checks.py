@@ -135,7 +135,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
 NEAR_SHARE = 0.5  # distance from a stored position, relative to the sizes stored with it, up to which these apply
 ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
-EIGENVALUE_MARGIN = 2.0  # factor from the limit of definite M to eigenvalues that rounding leaves above (or below) it
+EIGENVALUE_MARGIN = 2.0  # factor by which eigenvalues must differ from their limit, so that rounding does not decide
 
 
 def results_size(n: int, n_c: int, n_a: int) -> int:

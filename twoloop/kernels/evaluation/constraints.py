@@ -114,7 +114,7 @@ ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0
 # rounding error of Gamma if the terms of G v cancel, relative to the largest term divided by largest_difference_step
 ROUNDING_OF_TERMS = 1e-14
-CONVERGED_CHANGE = 0.01  # a change of Gamma below this fraction of the required accuracy ends the search of a step
+CONVERGED_CHANGE = 0.01  # largest change of Gamma, over the required accuracy, that ends the search for a step
 
 
 @exact

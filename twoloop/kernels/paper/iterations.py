@@ -60,7 +60,7 @@ def store_rounding_errors(rounding):
 
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
-MAX_ITERATIONS_PAPER = 200  # the same for `iterate_first_order`; the paper has no limit, and ends divergence by (33)
+MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_order` has failed; the paper has no limit
 # ratio of a change to the first change above which the iteration counts as divergent; a smaller growth is possible in a
 # convergent iteration, because its matrix is not normal
 MAX_GROWTH = 1e3
