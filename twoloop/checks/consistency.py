@@ -17,7 +17,7 @@ from twoloop.checks.callbacks import UNSYMMETRIC, check_bounds, unsymmetric_mass
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.scales import EPS, NONE, Scales, defined, generic_factors, scales_of, signs
 from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
-from twoloop.checks.structure import SINGULAR_MASS, least_solution, not_finite, place_of_mass, shifts
+from twoloop.checks.structure import SINGULAR_MASS, least_solution, not_finite, pattern_of, place_of_mass, shifts
 from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
@@ -176,7 +176,9 @@ class Violation:
     ) -> Violation:
         """Measure the violation of C_q v + C_t = 0 and A v + b = 0, relative to the fastest motion there."""
         rate = system.rates(t, q)
-        fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+        # an entry that is zero at this position only counts, too: bars may lie in line with an axis
+        pattern = pattern_of(system, t, q)[: len(jacobian)]
+        fastest = (pattern * (np.abs(v) / scales.columns)).max(axis=1)
         pull = _without_constraints(system, t, q, v, scales.columns)
         falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
         speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)

@@ -6,6 +6,7 @@ they are read. Otherwise `IntegrationLoop` continues the run.
 """
 
 import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -61,6 +62,7 @@ from twoloop.run.rerun import (
 )
 from twoloop.run.run import CONTRADICTS, Run
 from twoloop.run.singular_positions import TURNED
+from twoloop.run.singular_start import Branch, branch_at
 from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
 Array = NDArray[np.float64]
@@ -555,7 +557,7 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
     """Return the cache entry of a run at its start, or None if the run cannot be cached."""
     system, n = run.system, run.system.n_q
     trusted = identity(options.method) is not None and all(traced.trusted for traced in run.traced)
-    if not trusted or run.work.notes.base.size > MAX_WORKSPACE:
+    if not trusted or run.starts_singular or run.work.notes.base.size > MAX_WORKSPACE:
         return None
     t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
     is_final = code is not None or not may_have_code(
@@ -616,23 +618,45 @@ def _new_run(
         traced.refuse(system, t0, t1, q0, v0)
 
     system, derived = with_derived_callbacks(system, check)
-    code = code_for(system, options.method, fixed, options.compiled, t0, q0, check)
-    plan, interiors = plans_for(system, options.method, options.rtol, float(options.atol.min()), fixed, code, check)
-    if derived:
-        plan = plan.changed(traced=(*plan.traced, *derived))
+    run, code = _run_from(system, t0, q0, v0, options, derived, check)
+    if run.static is None:
+        branch = branch_at(system, t0, run.state, run.rank, options.atol + options.rtol * np.abs(v0).max())
+        run.starts_singular = branch is not None
+        if isinstance(branch, Branch) and not fixed:
+            beside, other = _run_from(system, t0, branch.q, branch.v, options, derived, check)
+            if beside.rank == branch.rank and beside.static is None:
+                run, code = beside, other
+                run.move_to_singular_start(t0, q0, v0, branch.a, branch.length)
     if new:
         share_checked_bounds(original)
     if system.called_in_python and not fixed:
         difference = find_nondeterminism(system, states_near_start(t0, t1, q0, v0))
         if difference is not None:
             raise ValueError(difference)
-    if first_value is not None and not any("force" in each.kinds for each in plan.traced):
+    if first_value is not None and not any("force" in each.kinds for each in run.traced):
         system.derived.setdefault(FIRST_FORCE, [first_value])
-    run = Run(system, plan, t0, q0, v0, options.rtol, options.atol, options.step_size, interiors)
     options.set_sizes(run, t1)
     if options.max_steps is not None:
         run.control[run.a.MAX_STEPS] = options.max_steps
     return run, code
+
+
+def _run_from(
+    system: ConstrainedSystem,
+    t: float,
+    q: Array,
+    v: Array,
+    options: Options,
+    derived: Sequence[Traced],
+    check: Callable[[Traced], None],
+) -> tuple[Run, GeneratedCode | None]:
+    """Create the run from a state, and the machine code that it calls."""
+    fixed = options.step_size is not None
+    code = code_for(system, options.method, fixed, options.compiled, t, q, check)
+    plan, interiors = plans_for(system, options.method, options.rtol, float(options.atol.min()), fixed, code, check)
+    if derived:
+        plan = plan.changed(traced=(*plan.traced, *derived))
+    return Run(system, plan, t, q, v, options.rtol, options.atol, options.step_size, interiors), code
 
 
 def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, derivatives: bool) -> None:

@@ -4,6 +4,8 @@ A run in which forces changed for a short time is repeated with more evaluations
 caused by noise have no shortest duration, so that every repetition would find shorter ones. The last one warns.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -97,8 +99,21 @@ SIZES = tuple(0.85**k for k in range(28))
 LARGER_SIZES = tuple(1.4**k for k in range(1, 7))
 # The distance of a state from a singular position is its smallest pivot of C_q over the largest such pivot so far.
 FAR = 0.2  # distance from which on a state may be the base of the polynomial
-# factors by which the last attempts increase the tolerances and the longest time between evaluations
+# in the last attempts, factors of the longest time without an evaluation (WIDER; no limit if forces cannot be short),
+# and then of the tolerances, too (LOOSER)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
+STRICT, WIDER, LOOSER = range(3)
+
+
+class Origin(NamedTuple):
+    """Origin of polynomials across a singular position, and their limits: `beyond`, they may end beyond the run."""
+
+    earliest: float
+    base: Place | None
+    limits: int = STRICT
+    beyond: bool = False
+
+
 # largest age of a base: LONGEST_PAST times H_LONG, or FARTHEST times twice the time to the position, if that is longer
 LONGEST_PAST, FARTHEST = 1.5, 4.0
 # distance, relative to that of the base, below which an earlier state is beyond another singular position
@@ -160,17 +175,22 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     base, run.mirrored = None, 0.0
     if not fixed:
         base, run.mirrored = _find_base(run, [place for place in past if place[0] >= earliest])
-    # earlier accelerations may precede a jump of a force, and be too few near the start: try other origins, too
-    run.origins = [(earliest, base, False), (np.inf, None, False)]
-    if float(clock[a.T] - clock[a.T_START]) < clock[a.H_LONG] and not run.system.called_in_python:
-        run.origins.append((-np.inf, None, False))
+    # earlier accelerations may precede a jump of a force, and be too few near the start, as later ones are near the
+    # end; from an old base the polynomial may be too long: try other origins, too
+    longest, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
+    early = compiled and clock[a.T] - clock[a.T_START] < longest
+    near_end = compiled and clock[a.T] + LARGER_SIZES[-1] * longest > run.t1
+    places = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(early)]
+    run.origins = [*[Origin(*place) for place in places], Origin(np.inf, None)]
     if not fixed:
-        run.origins.append((earliest, base, True))
+        others = [(limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]]
+        run.origins += [Origin(*place, *other) for other in others[1:] for place in places]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
+    run.pieces = []  # an earlier run of a cached integrator may have ended within a polynomial
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else UNSEEN / (1.0 - BACK)
     clock[a.LIMIT_AGE] = 0.0
@@ -183,20 +203,26 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     from twoloop.kernels.steps.crossing_step import begin
 
     a, clock = run.a, run.clock
-    earliest, base, looser = run.origins.pop(0)
+    earliest, base, limits, beyond = run.origins.pop(0)
     begin(plan.memory, clock[a.LARGEST_PIVOT], earliest, base)
     run.looser = run.tolerances
-    if looser:
+    if limits != STRICT:
         run.looser = run.tolerances.copy()
+        run.looser[indices.GAP] *= GAP_FACTOR if any(run.short_forces) else np.inf
+    if limits == LOOSER:
         run.looser[[indices.RTOL, indices.LEAST]] *= TOLERANCE_FACTOR
         run.looser[indices.ATOL :] *= TOLERANCE_FACTOR
-        run.looser[indices.GAP] *= GAP_FACTOR
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.looser[indices.GAP] / control[a.MAX_EVALUATION_GAP])
-    longest, allowed = float(clock[a.H_LONG]), float(control[a.MAX_STEP])
+    longest, allowed, left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
+    least = left if beyond else 0.0
+    if not beyond and control[a.FIXED_STEP] == 0.0:
+        allowed = min(allowed, left)
     first_size = max(longest, min(run.mirrored, LARGER_SIZES[-1] * longest))
-    run.lengths = sizes_across(first_size, allowed)
-    run.longer = [longest * part for part in LARGER_SIZES if first_size < longest * part <= allowed]
+    run.lengths = [size for size in sizes_across(first_size, allowed) if size > least]
+    run.longer = [longest * part for part in LARGER_SIZES if max(first_size, least) < longest * part <= allowed]
+    if not run.lengths:
+        run.lengths, run.longer = run.longer or [min(first_size, allowed)], []
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
     run.crossed = float(clock[a.H_NEXT])
 
@@ -256,6 +282,8 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
     if code in (a.PAUSED, a.RANK_LOST) and end > now:
         if not run.pieces:
             run.pieces = kernels.piece_ends(plan.memory, plan.options[-kernels.S :], float(clock[a.T]))
+            if end > run.t1 - (now - clock[a.T]):
+                run.pieces = [*[piece for piece in run.pieces if piece < run.t1 - now + clock[a.T]], run.t1]
             if clock[a.T] > clock[a.T_START]:
                 run.state[: 3 * run.system.n_q] = kernels.state_at(plan.memory, plan.options, float(clock[a.T]))
         elif n_accepted == 0:
@@ -265,6 +293,9 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.pieces[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.pieces, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
+    in_singular = run.starts_singular and clock[a.T] == run.t0  # where no partition can be renewed after an attempt
+    if in_singular and code == a.RANK_LOST:
+        code = a.PAUSED
     if n_accepted > 0:  # the whole polynomial counts as one step
         clock[a.H_LONG] = max(clock[a.H_LONG], run.crossed)
         clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossed)
@@ -279,13 +310,15 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
             _prepare_next_origin(run, plan, control)
             return plan, control, code
     if code == a.PAUSED and n_accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * clock[a.LARGEST_PIVOT]):
-        proposal = clock[a.H_NEXT]
-        run.origins = [(float(clock[a.T]), None, False), (float(clock[a.T]), None, True)]
+        proposal = min(float(clock[a.H_NEXT]), run.t1 - float(clock[a.T]))
+        run.origins = [Origin(float(clock[a.T]), None, limits) for limits in (STRICT, WIDER, LOOSER)]
         _prepare_next_origin(run, plan, control)
         clock[a.H_NEXT] = run.crossed = proposal
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
+    if in_singular:
+        return run.plan, run.control, a.RANK_LOST
     if n_accepted == 0:  # all attempts failed: the run's own steps continue as far as they can
         run.control[a.BRIDGE] = a.SUSPENDED
     run.crossings[-1].append((float(run.clock[a.T]), run.state.copy()))

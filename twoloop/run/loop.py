@@ -157,6 +157,7 @@ CHUNK_TIME = 0.05  # CPU time of a chunk, s, from which on the next chunk is not
 # statuses whose message may say that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 MAX_BASE_CANDIDATES = 16  # largest number of last states that may be the base of a step across a singular position
+FAR_BEYOND = 100.0  # the end of the run does not shorten attempts across a singular position: it is so many runs later
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs, and of floats in a buffer
 _spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for later runs, by their sizes
@@ -198,6 +199,7 @@ class IntegrationLoop:
         system: ConstrainedSystem | None = None,
     ):
         self.run, self.t1, self.request, self.last = run, t1, request, last
+        run.t1 = t1
         self.start, self.system = run.state if start is None else start, run.system if system is None else system
         self.report, self.interrupts = report, interrupts
         self.deadline = np.inf if time_limit is None else time.monotonic() + time_limit
@@ -237,6 +239,9 @@ class IntegrationLoop:
         """Integrate to the end, check callbacks at states of the run, and return the record of the run."""
         run, recorder = self.run, self.recorder
         a, clock = run.a, run.clock
+        if run.starts_singular and self.code == a.PAUSED:
+            self.code = a.NEAR_SINGULAR if run.branch_known else a.ROWS_VIOLATED
+            self._choose_method(False, 0)
         buffers, copied = self._buffers(), True
         while self.code == a.PAUSED:
             across, over_jump = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
@@ -284,10 +289,14 @@ class IntegrationLoop:
         """Take one chunk of steps by the compiled `advance`, which fills `buffers`, and store the code."""
         run, a = self.run, self.run.a
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.attempts()))
+        outputs = self.outputs
+        tries = self.plan is not run.plan and not run.pieces and run.control[a.FIXED_STEP] == 0.0
+        if tries:  # attempts across a singular position have their own lengths
+            outputs = np.append(outputs[:-1], self.t1 + FAR_BEYOND * (self.t1 - run.t0))
         self.filled[:] = 0  # Ctrl-C may arrive before `advance` sets it
         try:
             with self._stopped_in_time():
-                self.code = run.advance(self.outputs, buffers, self.filled, (self.plan, self.control, self.kit))
+                self.code = run.advance(outputs, buffers, self.filled, (self.plan, self.control, self.kit))
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:
@@ -295,6 +304,8 @@ class IntegrationLoop:
             # continue without such samples. Otherwise `to_end` raises it again, unless an event has ended the run
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
+            elif tries and not run.system.called_in_python and not self.interrupts.n_signals:
+                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # nodes may be where the motion never comes
             else:
                 self.code, self.raised = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:

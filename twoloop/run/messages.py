@@ -207,9 +207,6 @@ _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
 CROSSINGS = "\0"  # placeholder in a message, to be replaced by the description of singular positions that were crossed
-# time after a start, s, at which the rank of the rows is compared with that at the start; singular value that counts as
-# zero at this time
-AFTER, NEGLIGIBLE_SLOPE = 1e-3, 1e-9
 # time left, relative to the duration of the run, up to which a message mentions that the end is near
 NEAR_END = 1e-3
 
@@ -270,7 +267,8 @@ def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
-        if t >= end or surely_above(run.near, system.rows(t, q), run.rank):
+        given = t == run.t0 and run.starts_singular  # positions and velocities at the start are given
+        if t >= end or given or surely_above(run.near, system.rows(t, q), run.rank):
             continue
         excess = _velocity_error_ratio(run, t, q, v)
         if excess > MAX_LASTING_ERROR:
@@ -368,14 +366,16 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 def _describe_contradiction(run: "Run") -> str:
     """Describe a redundant row that is violated although the independent rows are satisfied, and its dependence."""
-    t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[indices.CONTRADICTION])
-    words = in_words(run.system.rows(t, run.state[:n]), [row])
-    nearby_q = run.state[:n] + AFTER * run.state[n : 2 * n]
-    if t == run.t0 and np.linalg.matrix_rank(run.system.rows(t, nearby_q), NEGLIGIBLE_SLOPE) > run.rank:
+    t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
+    if run.starts_singular:
         return (
-            f"Stopped at its start, t = {t:.10g}, a singular position: the constraints have lost rank there ({words}), "
-            "but not beside it. Start a little before that position, or beyond."
+            f"Stopped at its start, t = {t:.10g}, a singular position: the constraints have lost rank there "
+            f"({dependent_rows(run.system, t, q)}), but not beside it, and no single branch of the motion has "
+            "velocities within the tolerances of v0, or the steps are constant. Start a little before that position, "
+            "or beyond."
         )
+    row = int(run.work.notes[indices.CONTRADICTION])
+    words = in_words(run.system.rows(t, q), [row])
     return (
         f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
         f"not hold along the motion that these allow ({words} at the last state). Either it contradicts them, or "

@@ -117,8 +117,10 @@ class Run:
         self.longer: list[float] = []  # larger sizes to be tried if too few nodes of a step are beyond the position, s
         self.crossed = 0.0  # size of the last attempted step across, s
         self.pieces: list[float] = []  # times at which the next pieces of the polynomial end
-        # origins of the polynomial still to be tried: earliest time of nodes, base, whether tolerances are looser
-        self.origins: list[tuple[float, tuple[float, Array] | None, bool]] = []
+        self.origins: list[Any] = []  # origins of the polynomial that are still to be tried
+        self.t1 = np.inf  # end of the run, s
+        self.starts_singular = False  # whether the start is a singular position from which the rank rises, ...
+        self.branch_known = False  # ... and whether it is known which branch the motion follows
         self.jumps: list[float] = []  # times at which C_t or b jumped, and velocities with them
         self.compared_until = [-np.inf]  # time up to which callbacks were compared; copies of the run share the list
         self.region: CheckedRegion | None = None  # region in which callbacks were compared; integrators share it
@@ -160,6 +162,18 @@ class Run:
         self._set_clock(t)
         code: int = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         return code
+
+    def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, length: float) -> None:
+        """Move a run that begins beside a singular position to a start in it; a step of about `length` s follows."""
+        n, clock = self.system.n_q, self.clock
+        self.t0, self.starts_singular, self.branch_known = t, True, True
+        self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
+        self._set_clock(t)
+        clock[self.a.H_LONG], clock[self.a.LARGEST_PIVOT] = length, self.work.notes[indices.PIVOT]
+        self.start_warning = (
+            "the run begins in a singular position, where the constraints lose rank: it follows the branch of the "
+            "motion to which v0 belongs; multipliers are not determined there, and are NaN at the start"
+        )
 
     def _set_clock(self, t: float) -> None:
         """Reset the array `clock` for a run that begins at t."""

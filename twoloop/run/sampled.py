@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_finite, check_real, shown
 from twoloop.checks.consistency import check_start
-from twoloop.checks.structure import parts_of
+from twoloop.checks.structure import dependent_rows, parts_of
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.compile.callbacks import KINDS
@@ -28,6 +28,7 @@ from twoloop.run.messages import warn_of_singular_end, warn_user
 from twoloop.run.record import MemoryStore, OutputRequest, Record, Status, statistics
 from twoloop.run.run import Run
 from twoloop.run.signals import signals_of
+from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
@@ -123,6 +124,13 @@ class SampledRun:
 
     def _run_from(self, t: float, q: Array, v: Array) -> Run:
         run = Run(self._derived, self._plan.fresh(), t, q, v, *self._tolerances, None)
+        allowed = self._tolerances[1] + self._tolerances[0] * np.abs(v).max()
+        if run.static is None and branch_at(self._derived, t, run.state, run.rank, allowed) is not None:
+            raise ValueError(
+                f"start of {self.system.name!r} must not be a singular position, as at t = {t:g}: the constraints "
+                f"have lost rank there ({dependent_rows(self._derived, t, q)}), but not beside it. Start a little "
+                "before that position, or beyond; run and solve_dae may start there"
+            )
         run.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
         run.set_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0

@@ -144,7 +144,7 @@ def _v_slice(n: int) -> slice:
 
 def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
     """Return the largest acceleration without the rows whose singular values are below `near` times the largest."""
-    mass, rows, norms, units = _in_any_units(system, t, q)
+    mass, rows, norms, units = in_any_units(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     kept = values > near * values[0]
     short = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / max(np.abs(v).max(), DIFFERENCE)
@@ -157,11 +157,11 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
 
 def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
     """Return the ratio of `singular_ratio` for scaled rows: it does not depend on the units of coordinates and rows."""
-    values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
+    values = np.linalg.svd(in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
-def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
+def in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
     """Return M and the rows, scaled to unit masses and unit norms, the divisors of rows, and the units of coordinates.
 
     The divisor of a row is its norm, or at least MIN_ROW_NORM times the norm expected from its derivative.

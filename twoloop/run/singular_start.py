@@ -1,0 +1,116 @@
+"""Start in a singular position, where C_q loses rank, if the velocities there belong to one branch of the motion only.
+
+Let u be the vectors with u^T C_q = 0 there. Along the motion, the first derivative of u^T (C_q v + C_t) is zero if v
+belongs to a branch, and the second one determines the accelerations, in addition to C_q a = gamma:
+
+    3 u^T (dC_q/dt) a = -u^T d^2/dt^2 (C_q v + C_t), with constant velocities on the right.
+
+If the rows u^T dC_q/dt raise the rank to what it is beside the position, this branch is the only one with velocities
+v. Forces of constraint may act along these rows, too: the multipliers then grow without limit towards the position.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.scales import signs
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.fallbacks import state_after_jump
+from twoloop.run.singular_positions import DIFFERENCE, in_any_units
+
+Array = NDArray[np.float64]
+
+TURN = 3e-3  # relative change of the rows from one sample to the next, for derivatives along the motion
+WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0  # first, second derivative
+NOTHING = 1e-8  # relative: smaller derivatives may be errors of differences
+RISES = 1e-6  # relative derivative of the rows from which on the rank rises: v0 may violate constraints by 1e-8
+# derivatives of the rows must be so many times larger than those for velocities within the tolerances
+DETERMINED = 10.0
+BESIDE, LENGTH = 0.1, 0.6  # relative change of the rows up to the state beside, and within the first step to be tried
+HALVINGS, MOVED = 6, 0.2  # number of states beside to try; their largest correction, relative to the way to them
+RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, relative to the right-hand side
+
+
+class Branch(NamedTuple):
+    """Branch of the motion through a singular position: accelerations there, and a state on the branch beside it.
+
+    `rank`: that of the rows beside the position. `length`: of the first step to be tried, s.
+    """
+
+    a: Array
+    q: Array
+    v: Array
+    rank: int
+    length: float
+
+
+def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
+    """Find the branch of the motion through a state [q, v, a], where the constraints have this rank.
+
+    Return None if the rank does not rise along the motion: then this is no singular position, or the motion stays in
+    it. Return False if it rises, but other branches have velocities within `allowed`, (n_q,).
+    """
+    if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
+        return None
+    try:
+        return _branch_at(system, t, *np.split(state[: 3 * system.n_q], 3), rank, allowed)
+    except Exception:  # callbacks may fail beside the start
+        return None
+
+
+def _branch_at(
+    system: ConstrainedSystem, t: float, q: Array, v: Array, a: Array, rank: int, allowed: Array
+) -> Branch | bool | None:
+    way = v if v.any() else a
+    if not way.any():
+        return None
+    mass, rows, lengths, units = in_any_units(system, t, q)
+    left, _, right = np.linalg.svd(rows)
+    lost, free = left[:, rank:].T, right[rank:].T
+
+    def derivative_of_rows(way: Array, step: float) -> Array:
+        samples = [system.rows(t, q + s * way) * units for s in step * np.array([-2.0, -1.0, 1.0, 2.0])]
+        return np.tensordot(WEIGHTS[0, [0, 1, 3, 4]], samples, axes=1) / (step * lengths[:, None])  # type: ignore[no-any-return]
+
+    def derivative_of_constraints(order: int) -> Array:
+        samples = [system.velocity_constraint(t, q + s * v, v) for s in step * np.arange(-2.0, 3.0)]
+        return WEIGHTS[order - 1] @ samples / (step**order * lengths)  # type: ignore[no-any-return]
+
+    size, step = float(np.linalg.norm(rows)), DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / np.abs(way).max()
+    speed = float(np.linalg.norm(derivative_of_rows(way, step))) / size  # relative change of the rows, 1/s
+    if not step * speed > NOTHING * DIFFERENCE:
+        return None
+    step = TURN / speed
+    added = lost @ derivative_of_rows(way, step) / speed
+    gained = np.linalg.svd(added @ free, compute_uv=False)
+    if gained.max() <= RISES * size:
+        return None
+    distance = step * float(np.abs(way).max())  # of displacements for differences
+    uncertain = np.linalg.norm(derivative_of_rows(allowed * signs(len(q)), distance / float(allowed.max())))
+    clear = gained > max(DETERMINED * float(uncertain) / speed, RISES * size)
+    if not v.any() or gained[~clear].max(initial=0.0) > RISES * size:
+        return False
+    wanted = -np.append(derivative_of_constraints(1), lost @ derivative_of_constraints(2) / (3.0 * speed))
+    equations, rank = np.vstack([rows, added]), rank + int(clear.sum())
+    a = np.asarray(np.linalg.lstsq(equations, wanted, rcond=NOTHING)[0])
+    if not np.abs(equations @ a - wanted).max() <= RESIDUAL * max(np.abs(wanted).max(), speed * speed * size):
+        return False
+    motions = np.linalg.svd(equations)[2][rank:].T
+    a += motions @ np.linalg.solve(motions.T @ mass @ motions, motions.T @ (units * system.force(t, q, v) - mass @ a))
+    a *= units
+    bend = 0.0
+    if a.any():
+        bend = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / size
+    for change in BESIDE * 0.5 ** np.arange(HALVINGS):
+        away = _duration(change, speed, bend)
+        ahead = away * (v + 0.5 * away * a)
+        beside = state_after_jump(system, t, q + ahead, v + away * a)
+        if beside is not None and np.abs(beside[: len(q)] - q - ahead).max() <= MOVED * np.abs(ahead).max():
+            return Branch(a, beside[: len(q)], beside[len(q) :], rank, _duration(LENGTH, speed, bend))
+    return False
+
+
+def _duration(change: float, speed: float, acceleration: float) -> float:
+    """Return the time within which rows change so much, at this speed and acceleration of their change."""
+    return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))
