@@ -113,7 +113,7 @@ def test_what_is_ignored_stands_in_the_order_of_its_effect(tmp_path):
     path.write_text("""<mujoco><worldbody><geom size="1"/><body><joint name="j" range="0 90" frictionloss="1"/>
         <geom type="mesh" mesh="none"/><geom size="1"/></body></worldbody><equality><tendon name="e" tendon1="t"/>
         </equality><sensor><jointpos joint="j"/></sensor><actuator><muscle joint="j"/></actuator></mujoco>""")
-    with pytest.warns(IgnoredWarning, match="ignored are the mass of geom"):
+    with pytest.warns(IgnoredWarning, match="ignored are the mass of a geom of body 'body 1'"):
         ignored = from_mjcf(path).ignored
     words = ("mass", "equality", "actuator", "frictionloss", "limits", "contacts", "sensor")
     assert [word in each for word, each in zip(words, ignored, strict=True)] == [True] * 7

@@ -39,10 +39,11 @@ def mesh_triangles(given: Mapping[str, str], folder: Path, what: str) -> Array |
         reference = {"pos": given.get("refpos", "0 0 0"), "quat": given.get("refquat", "1 0 0 0")}
         pose = pose_of(reference, what, True, "xyz")
         vertices = (vertices - pose.x) @ pose.R
-    vertices = vertices * numbers(given.get("scale", "1 1 1"), 3, f"scale of {what}")
+    scale = numbers(given.get("scale", "1 1 1"), 3, f"scale of {what}")
+    vertices = vertices * scale
     if faces is None or given.get("inertia", "legacy") == "convex":
         return _hull(vertices)
-    return np.asarray(vertices[faces])
+    return np.asarray(vertices[faces if scale.prod() > 0.0 else faces[:, ::-1]])  # a mirror turns triangles inside out
 
 
 def mesh_lump(triangles: Array, inertia: str) -> Lump:
@@ -128,16 +129,37 @@ def _stl(path: Path) -> tuple[Array, Any] | None:
 
 def _obj(path: Path) -> tuple[Array, Any] | None:
     vertices: list[list[float]] = []
-    faces: list[list[int]] = []
+    polygons: list[list[int]] = []
     for line in path.read_text(errors="replace").splitlines():
         tag, *words = line.split() or [""]
         if tag == "v":
             vertices.append([float(each) for each in words[:3]])
         elif tag == "f":
             corners = [int(each.split("/")[0]) for each in words]
-            corners = [each - 1 if each > 0 else len(vertices) + each for each in corners]
-            faces += [[corners[0], *corners[k : k + 2]] for k in range(1, len(corners) - 1)]
-    return (np.array(vertices), np.array(faces) if faces else None) if vertices else None
+            polygons.append([each - 1 if each > 0 else len(vertices) + each for each in corners])
+    points, faces = np.array(vertices), list[list[int]]()
+    for each in polygons:
+        faces += [each] if len(each) == 3 else [[each[k] for k in triple] for triple in _triangles(points[each])]
+    return (points, np.array(faces) if faces else None) if vertices else None
+
+
+def _triangles(points: Array) -> list[list[int]]:
+    """Cut a polygon into triangles: one of four corners along its shorter diagonal, as MuJoCo does, else ear by ear."""
+    left, triangles = list(range(len(points))), list[list[int]]()
+    if len(left) == 4:
+        across = np.linalg.norm((points[2:] - points[:2]).astype(np.float32), axis=1)
+        return [[0, 1, 2], [0, 2, 3]] if across[0] < across[1] else [[0, 1, 3], [1, 2, 3]]
+    normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
+    while len(left) > 3:
+        for k in range(len(left)):
+            ear = [left[k - 1], left[k], left[(k + 1) % len(left)]]
+            edges = np.roll(points[ear], -1, axis=0) - points[ear]
+            sides = np.cross(edges, points[[each for each in left if each not in ear], None] - points[ear]) @ normal
+            if np.cross(edges[0], edges[1]) @ normal > 0.0 and not (sides >= 0.0).all(axis=1).any():
+                break
+        triangles.append(ear)
+        left.remove(ear[1])
+    return [*triangles, left] if left[2:] else triangles
 
 
 def _msh(path: Path) -> tuple[Array, Any] | None:

@@ -29,7 +29,9 @@ ACTUATORS = (
     *("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle", "adhesion"),
     *("dcmotor", "plugin"),
 )
-SUPPORTED = ACTUATORS[:6]
+SUPPORTED = ACTUATORS[:7]
+FILTERS = ("filter", "filterexact", "integrator")  # activations that have a closed form for a constant command
+IMMEDIATE = 1e-15  # s, least time constant of MuJoCo: an activation without delay
 
 
 def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
@@ -41,11 +43,13 @@ def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str])
     law = {**inherited, **own}
     gain, bias = (_padded(key, inherited, own, default) for key, default in (("gainprm", "1"), ("biasprm", "0")))
     types = {"gaintype": "fixed", "biastype": "none", "dyntype": "none"}
-    first, last, constant = (float(x) for x in law.get(tag, "1 0 0").split())  # what defaults give this kind
+    stored = law.get(tag, "1 1 0 0 0" if tag == "cylinder" else "1 0 0")  # what defaults give this kind
+    first, last, constant, *more = (float(x) for x in stored.split())
     if tag == "general":
         types = {key: law.get(key, default) for key, default in types.items()}
         if types["gaintype"] == "fixed":
             law |= dict.fromkeys(("position", "intvelocity", "velocity"), text_of((gain[0], bias[2], 0.0)))
+            law["cylinder"] = text_of((gain[0], law.get("dynprm", "1").split()[0], *bias))
         else:
             law["damper"] = text_of((0.0, -gain[2], 0.0))
     elif tag == "motor":
@@ -55,7 +59,14 @@ def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str])
         last = -float(own["kv"]) if "kv" in own else float(own.get("dampratio", last))
         gain, bias, types["biastype"] = np.array([first, 0.0, 0.0]), np.array([0.0, -first, last]), "affine"
         if tag == "intvelocity" or constant:
-            types["dyntype"] = "integrator" if tag == "intvelocity" else "filterexact"
+            types["dyntype"], law["dynprm"] = "integrator" if tag == "intvelocity" else "filterexact", str(constant)
+    elif tag == "cylinder":
+        first, last = float(own.get("area", first)), float(own.get("timeconst", last))
+        first = 0.25 * np.pi * float(own["diameter"]) ** 2 if "diameter" in own else first
+        constant, *more = (float(x) for x in own["bias"].split()) if "bias" in own else (constant, *more)
+        gain, bias = np.array([first, 0.0, 0.0]), np.array([constant, *more])
+        types |= {"biastype": "affine", "dyntype": "filter"}
+        law["dynprm"] = str(last)
     elif tag == "velocity":
         first = float(own.get("kv", first))
         gain, bias, types["biastype"] = np.array([first, 0.0, 0.0]), np.array([0.0, 0.0, -first]), "affine"
@@ -64,7 +75,7 @@ def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str])
         gain, types["gaintype"] = np.array([0.0, 0.0, -last]), "affine"
         law["ctrllimited"] = "true"
     law |= types | {"gainprm": text_of(gain), "biasprm": text_of(bias)}
-    return law if tag in ("general", "motor") else law | {tag: text_of((first, last, constant))}
+    return law if tag in ("general", "motor") else law | {tag: text_of((first, last, constant, *more))}
 
 
 def _padded(key: str, inherited: Mapping[str, str], own: Mapping[str, str], default: str) -> Array:
@@ -79,8 +90,10 @@ class TendonsAndActuators:
     def __init__(self, reader: Any):
         self.reader, self.model, self.ignored = reader, reader.model, reader.ignored
         self.commands: dict[str, Any] = dict(reader.commands)
+        self.activations: dict[str, float] = {}  # at the start, where they are not zero
         self.inertia: Array | None = None  # mass matrix of the tree in the reference pose
         self.tendons: dict[str, tuple[Any, float]] = {}  # with their lengths in the reference pose
+        self.ranges: dict[str, str] = {}  # of tendons
         self.carriers: dict[str, list[tuple[Part | None, Array]]] = {}  # points of a path, in the reference pose
 
     def _of(self, part: Part | None) -> Body:
@@ -134,6 +147,7 @@ class TendonsAndActuators:
                 self.ignored.append(f"tendon: {called}")
             return
         self.tendons[given.get("name", "")] = tendon, reference
+        self.ranges |= {given.get("name", ""): given["range"]} if "range" in given else {}
         self.ignored += [f"{key} of {called}" for key in ("armature", "frictionloss") if float(given.get(key, 0.0))]
         self.ignored += [f"{key} of {called}" for key in ("springyield", "actuatorfrcrange") if key in given]
         if limited and self.reader.limits:
@@ -254,17 +268,19 @@ class TendonsAndActuators:
         gear = np.append([float(x) for x in given.get("gear", "1").split()], np.zeros(6))[:6]
         target = self._target(given, float(gear[0]))
         supported = given["gaintype"] in ("fixed", "affine") and given["biastype"] in ("none", "affine")
-        at_site = "site" in given and "refsite" not in given and not gain[1:].any() and not bias[1:].any()
-        if not supported or not (target or at_site):
+        joint = self._joint_of(given)
+        vector = joint is not None and joint.kind in ("ball", "free")  # gear has several components
+        vector |= "site" in given and "refsite" not in given
+        if not supported or not (target or (vector and not gain[1:].any() and not bias[1:].any())):
             self.ignored.append(called)
             return
-        self.ignored += [f"{key} of {called}" for key in ("delay", "ffrange", "velrange") if key in given]
-        if given["dyntype"] != "none":
+        self.ignored += [f"{key} of {called}" for key in ("delay", "ffrange", "velrange", "actearly") if key in given]
+        filtered = given["dyntype"] != "none"
+        if filtered and (callable(command) or given["dyntype"] not in FILTERS):
             self.ignored.append(f"the command of {called}, whose activation is {given['dyntype']}")
-            command = 0.0
+            command, filtered = self.activations.get(name, 0.0), False
         elif not callable(command):
             command = check_finite(f"commands[{name!r}]", command)
-        joint = self._joint_of(given)
         if bias[2] > 0.0 and gain[0] == -bias[1]:  # a damping ratio
             mass = 0.0
             if isinstance(target, Tendon) and gear[0]:
@@ -274,6 +290,9 @@ class TendonsAndActuators:
             bias[2] *= -2.0 * np.sqrt(max(gain[0], 0.0) * mass)
         if (span := self._range(given, "ctrl", joint)) and "clampctrl" not in self.reader.disabled:
             command = Limited(command, *span) if callable(command) else float(np.clip(command, *span))
+        if filtered:
+            constant = None if given["dyntype"] == "integrator" else float(given.get("dynprm", "1").split()[0])
+            command = activated(command, self.activations.get(name, 0.0), constant, self._range(given, "act", joint))
         limits = self._range(given, "force", None)
         if joint is None:
             bounded_joints = [each for each in self.reader.ordered if self._has_limited_force(each)]
@@ -284,7 +303,7 @@ class TendonsAndActuators:
         own_name = self.reader.free(name, f"actuator {number} of the file")
         law = ActuatorTension(command, tuple(gain), tuple(bias), limits)
         if target is None:
-            self._at_site(given["site"], gear, law, own_name)
+            self._push(given, joint, gear, law, own_name)
             return
         k, c = -gear[0] * gear[0] * bias[1:]
         if joint is None or limits is not None or gain[1:].any() or min(k, c) < 0.0:
@@ -316,11 +335,16 @@ class TendonsAndActuators:
         return self.reader.joints.get(given.get("joint", given.get("jointinparent", "")))
 
     def _range(self, given: dict[str, str], what: str, joint: FileJoint | None) -> tuple[float, float] | None:
-        """Return the limits of the force or of the command (ctrl) of an actuator, or None."""
-        inherited = float(given.get("inheritrange", 0.0))
-        if what == "ctrl" and inherited and joint is not None and "range" in joint.attributes:
-            low, high = self._unit(joint) * numbers(joint.attributes["range"], 2, f"range of joint {joint.name!r}")
-            return 0.5 * (low + high - inherited * (high - low)), 0.5 * (low + high + inherited * (high - low))
+        """Return the limits of the force, the command (ctrl) or the activation (act) of an actuator, or None."""
+        inherited, first = float(given.get("inheritrange", 0.0)), given["gainprm"].split()[0]
+        servo = given["gaintype"] == "fixed" and given["biastype"] == "affine"
+        servo &= float(first) == -float(given["biasprm"].split()[1])
+        if servo and inherited and what == ("act" if given["dyntype"] == "integrator" else "ctrl"):
+            unit = 1.0 if joint is None else self._unit(joint)
+            span = self.ranges.get(given.get("tendon", "")) if joint is None else joint.attributes.get("range")
+            if span is not None:
+                low, high = unit * numbers(span, 2, "range that an actuator inherits")
+                return 0.5 * (low + high - inherited * (high - low)), 0.5 * (low + high + inherited * (high - low))
         if not self.reader.limited(given, f"{what}limited", f"{what}range"):
             return None
         low, high = numbers(given.get(f"{what}range", ""), 2, f"{what}range of an actuator")
@@ -347,18 +371,40 @@ class TendonsAndActuators:
             return joint.joint in getattr(tendon, "joints", (joint.joint,))
         return self._joint_of(given) in (joint, None)
 
-    def _at_site(self, site: str, gear: Array, law: ActuatorTension, name: str) -> None:
-        """Add an actuator whose force and torque have fixed components in the frame of a site."""
-        part, pose = self.reader.frame(f"site {site}")
-        frame, body = start_pose(part, pose), self._of(part)
-        if part is None:
-            return
-        pushes = self.model.force, self.model.torque
-        for push, given, own in zip(pushes, (gear[:3], gear[3:]), (name, f"torque of {name}"), strict=True):
-            if given.any():
-                along = SiteForce(body, tuple(body.local_direction(frame.R @ given).tolist()), law)
-                at = (body.point(*body.local_point(frame.x)),) if push == self.model.force else ()
-                push(body, *at, along, name=self.reader.free(None, own))
+    def _push(
+        self, given: dict[str, str], joint: FileJoint | None, gear: Array, law: ActuatorTension, name: str
+    ) -> None:
+        """Add an actuator whose force and torque have fixed components: at a site, at a ball, or at a free joint.
+
+        They are in the frame of the site; of the body, or of its parent, for torques of joints; of space for forces.
+        """
+        ends: list[tuple[Part, float]] = []
+        if joint is None:
+            part, pose = self.reader.frame(f"site {given['site']}")
+            force_axes = torque_axes = part, start_pose(part, pose).R
+            at = start_pose(part, pose).x
+        else:
+            part = next(each for each in self.reader.parts if joint in each.freed)
+            force_axes = torque_axes = None, np.eye(3)
+            at = start_pose(part, part.pose).x
+            if "jointinparent" not in given:
+                torque_axes = part, start_pose(part, part.pose).R
+            elif joint.kind == "ball":
+                torque_axes = part.parent, start_pose(part.parent, part.pose).R
+            if joint.kind == "ball":
+                gear = np.append(np.zeros(3), gear[:3])
+                ends += [] if part.parent is None else [(part.parent, -1.0)]
+        ends += [] if part is None else [(part, 1.0)]
+        axes_of = (force_axes, gear[:3]), (torque_axes, gear[3:])
+        for which, ((carrier, R), components) in enumerate(axes_of):
+            axes, own = self._of(carrier), name if which == 0 else f"torque of {name}"
+            for end, sign in ends if components.any() else ():
+                body, along = self._of(end), tuple(axes.local_direction(sign * R @ components).tolist())
+                push, places = (
+                    (self.model.torque, ()) if which else (self.model.force, (body.point(*body.local_point(at)),))
+                )
+                called = own if which == 0 else self.reader.free(None, own if sign > 0.0 else f"reaction to {name}")
+                push(body, *places, SiteForce(axes, along, law), name=called)
 
 
 DEGREES = {"hinge": 1, "slide": 1, "ball": 3, "free": 6}
@@ -417,6 +463,33 @@ class Limited:
         return bounded(self.command(t), self.low, self.high)
 
 
+def activated(command: float, start: float, constant: float | None, span: tuple[float, float] | None) -> Any:
+    """Return the activation x of a constant command u from t = 0: T x' = u - x, or x' = u without a time constant T.
+
+    It is a number where it does not change.
+    """
+    if command == (0.0 if constant is None else start):
+        return start
+    if constant is not None and constant <= IMMEDIATE:
+        return command
+    activation = _Activation(command, start, constant)
+    return activation if span is None else Limited(activation, *span)
+
+
+@dataclass(frozen=True, eq=False)
+class _Activation:
+    """Evaluate an activation as a function of time."""
+
+    command: float
+    start: float
+    constant: float | None
+
+    def __call__(self, t: Any) -> Any:
+        if self.constant is None:
+            return self.start + self.command * t
+        return self.command + (self.start - self.command) * np.exp(-t / self.constant)
+
+
 @dataclass(frozen=True, eq=False)
 class ActuatorTension:
     """Evaluate minus the force of an actuator, whose gain and bias are linear in its length and rate."""
@@ -451,6 +524,13 @@ class SiteForce:
 def is_single(joint: FileJoint) -> bool:
     """Return True if a hinge or slide is a joint of its own in the model."""
     return joint.joint is not None and joint.joint.kind in ("revolute", "prismatic")
+
+
+def activation_of(element: Element, law: Mapping[str, str]) -> str:
+    """Return the kind of activation of an actuator, "other" where it may have several."""
+    if element.tag not in (*SUPPORTED, "adhesion"):
+        return "muscle" if element.tag == "muscle" else "other"
+    return law["dyntype"]
 
 
 def _gear(given: Mapping[str, str]) -> float:

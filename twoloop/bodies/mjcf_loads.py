@@ -21,7 +21,7 @@ from twoloop.bodies.file_parts import (
     text_of,
 )
 from twoloop.bodies.frames import vector_of
-from twoloop.bodies.mjcf_actuators import TendonsAndActuators, is_single, trimmed
+from twoloop.bodies.mjcf_actuators import FILTERS, TendonsAndActuators, activation_of, is_single, trimmed
 from twoloop.bodies.parameter_layout import HINGE_ROTOR, SLIDE_ROTOR
 from twoloop.bodies.parts import Body, Force, Numbers
 from twoloop.bodies.rotation import euler_parameters, rotation_matrix
@@ -77,14 +77,21 @@ class Loads(TendonsAndActuators):
                 joint.position = R if joint.kind == "ball" else Pose(q[:3], R)
             if v is not None and np.abs(v).max() > AT_REST:
                 joint.rate = float(v[0]) if joint.kind in ("hinge", "slide") else v
-        if "ctrl" in chosen.attrib:
-            actuators = [each for group in self.reader.root.findall("actuator") for each in group]
-            if any(each.tag in ("pid", "orientation") for each in actuators):  # these have several commands
-                self.ignored.append(f"the command of actuators in the keyframe {key!r}")
-                return
-            values = numbers(chosen.attrib["ctrl"], len(actuators), f"ctrl of the keyframe {key!r}")
-            for k, (each, value) in enumerate(zip(actuators, values, strict=True)):
-                self.commands.setdefault(each.get("name", f"actuator {k}"), float(value))
+        actuators = [each for group in self.reader.root.findall("actuator") for each in group]
+        activations = [activation_of(each, self.reader.attributes(each, "main")) for each in actuators]
+        names = [each.get("name", f"actuator {k}") for k, each in enumerate(actuators)]
+        active = [name for name, activation in zip(names, activations, strict=True) if activation != "none"]
+        several = {each.tag for each in actuators} & {"pid", "orientation"}  # of which one may have several commands
+        unknown = {*activations} - {"none", "muscle", *FILTERS}
+        for what, given, which, unclear in (
+            ("ctrl", self.commands, names, several),
+            ("act", self.activations, active, unknown),
+        ):
+            if what in chosen.attrib and unclear:
+                self.ignored.append(f"{what} of the keyframe {key!r}, the commands or activations of actuators")
+            elif what in chosen.attrib:
+                values = numbers(chosen.attrib[what], len(which), f"{what} of the keyframe {key!r}").tolist()
+                given |= dict(zip(which, values, strict=True)) | given
 
     def read(self, scale: float) -> None:
         """Add everything; `scale`: factor of all masses."""
@@ -243,6 +250,9 @@ class Loads(TendonsAndActuators):
             frames = [self.reader.frame(given.get(key, "world")) for key in ("body1", "body2")]
         (part_1, frame_1), (part_2, frame_2) = frames
         body_1, body_2 = self._of(part_1), self._of(part_2)
+        if body_1 is body_2:  # a body of the file is fixed to the other one
+            self.ignored += [f"equality: {what}, within one body"] if between_sites or "relpose" in given else []
+            return
         name = self.reader.free(given.get("name"), f"{element.tag} of {body_1.name} and {body_2.name}")
         if element.tag == "connect":
             points = frame_1.x, frame_2.x

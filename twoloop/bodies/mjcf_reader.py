@@ -193,7 +193,12 @@ class _Reader:
         carrying = {id(part.parent) for part in self.parts}
         for part in self.parts:
             part.lumps = [Lump(scale * each.mass, each.centre, scale * each.J) for each in part.lumps]
-            part.massless |= id(part) in carrying and not combined(part.lumps).mass and len(part.freed) == 1
+            mass = combined(part.lumps).mass
+            part.massless |= id(part) in carrying and not mass and len(part.freed) == 1
+            if unread := [
+                each for each in self.ignored if each.startswith("the mass of") and not (mass or part.massless)
+            ]:
+                raise ValueError(f"the body {part.name!r} has joints but no known mass; not read: {unread[0]}")
             add_part(self.model, part)
         loads.read(scale)
         if self.n_geoms > 1 and not self.disabled & {"contact", "constraint"}:
@@ -243,7 +248,12 @@ class _Reader:
             if each.tag == "body":
                 self._body(each, part, pose.then(frame), each.get("childclass", name))
             elif each.tag == "geom":
-                lump = self._geom(given, name_of(each), weigh)
+                what = (
+                    name_of(each)
+                    if each.get("name")
+                    else f"a geom of body {element.get('name', part.name if part else '?')!r}"
+                )
+                lump = self._geom(given, what, weigh)
                 lumps += [] if lump is None or not weigh else [lump.transformed(frame)]
             elif each.tag == "site":
                 if "fromto" in given:
@@ -265,6 +275,8 @@ class _Reader:
             lump = self._bounded(combined(lumps or stated), self.compiler(element.attrib))
             if lump.mass and not (lumps or stated) and numbers(element.get("pos", "0 0 0"), 3, "pos").any():
                 self.ignored.append(f"where boundmass puts the mass of {name_of(element)}")  # in MuJoCo at its pos
+            if self.fused and lump.J.any() and not lump.mass:  # MuJoCo: not if it is fused with its parent
+                self.ignored.append(f"fusestatic of the compiler, for the mass of {name_of(element)}")
             self.total += lump.mass
             self.static |= part is None and lump.mass > 0.0
             gravcomp = float(element.get("gravcomp", 0.0))
@@ -397,7 +409,9 @@ class _Reader:
             return geom_lump(given, what, compiler.degrees, compiler.sequence)
         triangles, inertia = self._mesh(given.get("mesh", ""))
         if triangles is None:
-            self.ignored.append(f"the mass of {what}, which is a {kind}")
+            asset = self.meshes.get(given.get("mesh", ""), given)
+            file = f"file {asset.get('file')!r} is missing or" if asset.get("file") else "is"
+            self.ignored.append(f"the mass of {what}, whose mesh {file} not of a kind that is read (STL, OBJ, MSH)")
             return None
         pose, lump = self.pose(given, what), mesh_lump(triangles, inertia)
         if kind in FITTED:
