@@ -6,10 +6,12 @@ See MuJoCo's XML reference, mujoco.readthedocs.io/en/stable/XMLreference.html.
 from __future__ import annotations
 
 import os
+import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -108,15 +110,32 @@ def principal_axes(J: Array, tolerance: float = 1e-15) -> Array:
 
 def root_of(path: str | os.PathLike[str], tag: str) -> Element:
     """Return the root element of an XML file, which must have this tag."""
-    try:
-        root = ElementTree.parse(check_path(path)).getroot()
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
-    for each in root.iter():  # without namespaces, which some exporters declare
-        if isinstance(each.tag, str):
-            each.tag = each.tag.rpartition("}")[2]
+    root = parsed(check_path(path))
     if root.tag != tag:
         raise ValueError(f"{os.fspath(path)!r} must begin with <{tag}>; it begins with <{root.tag}>")
+    return root
+
+
+def parsed(path: Path) -> Element:
+    """Return the root element of an XML file without namespaces, which some exporters declare.
+
+    Many files are XML for the parsers of simulators only: with -- within comments, lines before the declaration,
+    prefixes that nothing declares, bare &, or characters of another encoding.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the latter two: of encodings
+        text = path.read_bytes().decode(errors="replace").strip("\ufeff")
+        text = re.sub(r"<!--.*?-->|<\?.*?\?>", "", text, flags=re.DOTALL).strip()
+        text = re.sub(r"&(?!#?\w+;)", "&amp;", text)
+        text = re.sub(r"(?<=[<\s/])[A-Za-z_][\w.-]*:(?=[A-Za-z_][\w.-]*[\s=/>])", "", text)
+        try:
+            root = ElementTree.fromstring(text)
+        except ElementTree.ParseError:
+            raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
+    for each in root.iter():
+        if isinstance(each.tag, str):
+            each.tag = each.tag.rpartition("}")[2]
     return root
 
 
@@ -161,7 +180,7 @@ def numbers(text: str, n: int, what: str) -> Array:
     except ValueError:
         values = np.zeros(0)
     if len(values) != n or not np.isfinite(values).all():
-        raise ValueError(f"{what} must be {n} finite numbers; given {text!r}")
+        raise ValueError(f"{what} must be {f'{n} finite numbers' if n > 1 else 'a finite number'}; given {text!r}")
     return values
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 import os
-import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from twoloop.bodies.file_parts import numbers, pose_of, root_of, text_of
+from twoloop.bodies.file_parts import numbers, parsed, pose_of, root_of, text_of
 from twoloop.bodies.rotation import euler_parameters
 
 DEEPEST = 30  # files within files: more are taken for a cycle
@@ -198,10 +197,7 @@ def _include(element: Element, folder: Path, depth: int) -> None:
         path = folder / file
         if not path.is_file():
             raise FileNotFoundError(f"the file includes {file!r}, and there is no file {str(path)!r}")
-        try:
-            included = ElementTree.parse(path).getroot()
-        except ElementTree.ParseError as error:
-            raise ValueError(f"the included file {str(path)!r} is not XML: {error}") from None
+        included = parsed(path)
         _include(included, folder, depth + 1)
         children += list(included)
     element[:] = children

@@ -382,7 +382,8 @@ class _Reader:
         axis = numbers(given.get("axis", "0 0 1"), 3, f"axis of joint {name!r}")
         if not axis.any():
             raise ValueError(f"axis of joint {name!r} must have a direction; given {given['axis']!r}")
-        place = numbers(given.get("pos", "0 0 0"), 3, f"pos of joint {name!r}")
+        where = "0 0 0" if kind == "free" else given.get("pos", "0 0 0")
+        place = numbers(where, 3, f"pos of joint {name!r}")
         joint = FileJoint(name, kind, pose.point(place), pose.R @ axis / np.linalg.norm(axis), given)
         self.ordered.append(joint)
         if element.get("name"):

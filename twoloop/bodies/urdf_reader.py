@@ -172,6 +172,8 @@ def from_urdf(
     1
     """
     root = root_of(path, "robot")
+    if any(each.tag in ("macro", "include", "property") for each in root):
+        raise ValueError(f"{os.fspath(path)!r} is written in xacro: expand it first, by `xacro FILE -o robot.urdf`")
     check_flag("free_base", free_base)
     check_flag("limits", limits)
     model = SpatialModel(gravity, name=root.get("name", "robot"))
@@ -482,10 +484,12 @@ def _origin(element: Element, what: str) -> Pose:
     """Return the pose of a frame in its parent: translation xyz, then roll, pitch and yaw about fixed axes."""
     origin = element.find("origin")
     given = {} if origin is None else origin.attrib
+    place = {"pos": given.get("xyz") or "0 0 0"}
     if "quat_xyzw" in given:
-        raise ValueError(f"{what} has quat_xyzw, which is not read: give rpy")
-    turns = text_of(numbers(given.get("rpy", "0 0 0"), 3, f"rpy of {what}"))
-    return pose_of({"pos": given.get("xyz", "0 0 0"), "euler": turns}, what, False, "XYZ")
+        *vector, scalar = numbers(given["quat_xyzw"], 4, f"quat_xyzw of {what}").tolist()
+        return pose_of(place | {"quat": text_of([scalar, *vector])}, what, False, "XYZ")
+    turns = text_of(numbers(given.get("rpy") or "0 0 0", 3, f"rpy of {what}"))
+    return pose_of(place | {"euler": turns}, what, False, "XYZ")
 
 
 def _direction(body: Body, direction: Array) -> Any:
