@@ -138,9 +138,7 @@ class TestInMuJoCo:
             ("<worldbody>", '<worldbody><body pos="0 0 3"><freejoint/><geom type="box" size=".3 .2 .1" mass="3"/>'),
             ("</worldbody>", "</body></worldbody>"),
         ],
-        "chain": [
-            ('<joint name="pivot"/>', '<joint name="pivot" armature="0.3"/><joint axis="1 0 0" damping="0.2"/>'),
-        ],
+        "chain": [('<joint name="pivot"/>', '<joint name="pivot" armature="0.3"/><joint axis="1 0 0" damping="0.2"/>')],
         "polynomial": [('name="elbow"', 'name="elbow" stiffness="3 1 2" damping="0.1"')],
     }
 

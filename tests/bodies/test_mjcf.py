@@ -30,10 +30,10 @@ LEG = """<mujoco model="leg"><compiler angle="degree" eulerseq="XYZ"/><option gr
 </mujoco>"""
 
 
-def read(text, folder):
+def read(text, folder, **options):
     path = folder / "model.xml"
     path.write_text(text)
-    return from_mjcf(path)
+    return from_mjcf(path, **options)
 
 
 def end(model, end=0.5):
@@ -120,10 +120,6 @@ def test_loops_are_closed_again(tmp_path):
     (_, one), (made, other) = end(model), end(from_mjcf(tmp_path / "loop.xml"))
     order = [int(name[-1]) for name in made.names[::7]]
     np.testing.assert_allclose(other[:, :3], one[order, :3], atol=1e-8)
-
-
-def test_what_a_file_cannot_contain_is_listed(tmp_path):
-    model = four_bar()
     model.motor(model.joints[0], 1.0)
     model.drive(model.joints[3], lambda t: t)
     model.stop(model.bodies[0], (0.0, 0.0, 0.0), "ground", (0.0, 0.0, -9.0), normal=(0.0, 0.0, 1.0), name="floor")
@@ -156,12 +152,36 @@ def test_files_that_are_none(tmp_path):
             read(text, tmp_path)
     with pytest.raises(FileNotFoundError, match=r"includes 'other.xml'"):
         read('<mujoco><include file="other.xml"/></mujoco>', tmp_path)
-    with pytest.raises(FileNotFoundError):
-        from_mjcf(tmp_path / "missing.xml")
+    text = "\n<?xml version='1.0'?><mujoco model='a & b'><!-- -- --><worldbody x:y='1'/></mujoco>"  # MuJoCo takes it
+    assert read(text, tmp_path).name == "a & b"
     model = four_bar()
     model.distance("bar 0", (0.0, 0.0, 0.5), "ground", (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="no counterpart of 'distance bar 0-ground'"):
         model.to_mjcf(tmp_path / "out.xml")
+
+
+def test_activations_of_constant_commands_in_closed_form(tmp_path):
+    law = 'joint="x" gainprm="3" dynprm="0.5"'
+    text = f"""<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body>
+      </worldbody><actuator><general {law} dyntype="filter"/><general {law} dyntype="integrator" actrange="0 0.4"/>
+      </actuator><keyframe><key ctrl="2 1" act="0.6 0.1"/></keyframe></mujoco>"""
+    problem, t = read(text, tmp_path, key=0).problem(), np.array([0.0, 0.2, 0.9])
+    forces = [problem.system.force(each, problem.q0, problem.v0)[2] for each in t]
+    np.testing.assert_allclose(forces, 3.0 * (2.0 - 1.4 * np.exp(-t / 0.5) + [0.1, 0.3, 0.4]), atol=1e-6)
+
+
+def test_meshes_of_concave_polygons_that_are_mirrored(tmp_path):
+    """An L of two blocks."""
+    corners = [(0, 0), (3, 0), (3, 1), (1, 1), (1, 4), (0, 4)]
+    lines = [f"v {x} {y} {z}" for z in (0, 1) for x, y in corners] + ["f 6 5 4 3 2 1", "f 7/1 8/1 9/1 10/1 11/1 12/1"]
+    lines += [f"f {k + 1} {(k + 1) % 6 + 1} {(k + 1) % 6 + 7} {k + 7}" for k in range(6)]
+    (tmp_path / "m.obj").write_text("\n".join(lines))
+    (body,) = read(
+        """<mujoco><asset><mesh file="m.obj" scale="-1 1 2" inertia="exact"/></asset><worldbody><body>
+      <freejoint/><geom type="mesh" mesh="m" density="3"/></body></worldbody></mujoco>""",
+        tmp_path,
+    ).bodies
+    np.testing.assert_allclose(np.r_[body.inertia[0], body.position], [36.0, -1.0, 1.5, 1.0])
 
 
 def test_defaults_of_tendons_and_what_else_was_passed_over(tmp_path):
@@ -171,9 +191,8 @@ def test_defaults_of_tendons_and_what_else_was_passed_over(tmp_path):
       <equality><connect body1="bob" anchor="0 0 0"/></equality></mujoco>"""
     with pytest.warns(IgnoredWarning, match="frictionloss of spatial"):
         model = read(text, tmp_path)
-    problem = model.problem()
-    assert [value for name, value in problem.parameters.items() if "spring" in name][-3:] == [7.0, 2.0, 1.0]
-    assert len(problem.joints) == 0
+    parameters = model.problem().parameters
+    assert [value for name, value in parameters.items() if "spring" in name][-3:] == [7.0, 2.0, 1.0] and not model.joints
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.bodies.IgnoredWarning")

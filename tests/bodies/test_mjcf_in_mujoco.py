@@ -29,8 +29,9 @@ CASES = {
         <body pos="0 0 1"><joint type="slide" axis="0 1 1" stiffness="5" armature="1"/>{INERTIAL}{TIP}</body></body>
         </worldbody>""",
     "balls": f"""<worldbody><body><joint type="ball" pos="0.1 0 0" armature="0.4" stiffness="2"/>{INERTIAL}{TIP}</body>
-        <body pos="0 0 2"><joint type="free" armature="0.2"/>{INERTIAL}{TIP.replace("tip", "t").replace("last", "l")}
-        </body></worldbody>""",
+        <body pos="0 0 2"><joint name="f" type="free" armature="0.2"/>{INERTIAL}<body><joint name="b" type="ball"/>
+        {INERTIAL}</body></body></worldbody><actuator><motor jointinparent="b" gear="1 2 3"/><motor joint="f"
+        gear="3 1 2 4 6 5"/><motor joint="b" gear="3 2 1" forcerange="-0.2 0.2"/></actuator>""",
     "frames": f"""<default><default class="x"><joint axis="1 0 0" damping="0.3"/></default></default><worldbody>
         <frame pos="1 0 0" euler="0 40 0" childclass="x"><body name="arm"><frame pos="0 0.1 0" euler="0 0 50">
         <joint name="in" pos="0 0 0.2"/>{INERTIAL}</frame>{TIP}</body></frame>
@@ -53,12 +54,13 @@ CASES = {
     "limited actuators": f"""<default><general gainprm="2" biasprm="0.1 -1 -0.2"/></default>
         {ARM.format('actuatorfrcrange="-1 1"')}<actuator><position joint="a" kp="50" kv="1"/><position joint="b" kp="30"
         dampratio="0.7" gear="2" forcerange="-0.3 0.2"/><damper joint="c" kv="5" ctrlrange="0 1"/><velocity joint="c"/>
-        <general joint="c" gaintype="affine" gainprm="7 2 -3" biastype="affine" biasprm="1 2 3"/></actuator>""",
+        <general joint="c" gaintype="affine" gainprm="7 2 -3" biastype="affine" biasprm="1 2 3"/><cylinder joint="b"
+        diameter="2" bias="1 2 3"/><position joint="c" kp="4" timeconst="0.1"/></actuator>""",
     "fixed tendons": f"""<default><tendon damping="0.7"/></default>{ARM.format("")}<tendon>
-        <fixed name="t" stiffness="5" springlength="-0.1 0.3"><joint joint="a" coef="0.7"/><joint joint="b" coef="-1"/>
-        </fixed><fixed name="u" stiffness="3"><joint joint="c" coef="0.4"/><joint joint="a" coef="1"/></fixed></tendon>
-        <actuator><position tendon="t" kp="30" dampratio="0.7" forcerange="-5 5"/><motor tendon="u" gear="3"/>
-        </actuator>""",
+        <fixed name="t" stiffness="5" springlength="-0.1 0.3" range="-0.1 0.2" limited="false"><joint joint="a"
+        coef="0.7"/><joint joint="b" coef="-1"/></fixed><fixed name="u" stiffness="3"><joint joint="c"
+        coef="0.4"/><joint joint="a" coef="1"/></fixed></tendon><actuator><position tendon="t" kp="30" dampratio="0.7"
+        inheritrange="0.5"/><motor tendon="u" gear="3"/></actuator>""",
     "paths": f"""{ARM.format("")}<tendon><spatial name="t" stiffness="3" damping="1"><site site="w"/><site site="s"/>
         <pulley divisor="2"/><site site="u"/><site site="v"/><site site="w"/></spatial></tendon><actuator>
         <position tendon="t" kp="5" gear="-2"/><motor site="s" gear="1 2 3 0.1 0.2 0.3"/></actuator>""",
@@ -88,9 +90,10 @@ def test_the_accelerations_are_those_of_mujoco(name, tmp_path, monkeypatch):
     data, generic = mujoco.MjData(model), np.random.default_rng(7)
     mujoco.mj_integratePos(model, data.qpos, generic.uniform(-1.0, 1.0, model.nv), 1.0)
     data.qvel[:], data.ctrl[:] = generic.uniform(-1.0, 1.0, model.nv), generic.uniform(-1.0, 1.0, model.nu)
+    data.act[:] = generic.uniform(0.0, 1.0, model.na)
     mujoco.mj_forward(model, data)
-    state = {"qpos": data.qpos, "qvel": data.qvel, **({"ctrl": data.ctrl} if model.nu else {})}
-    given = " ".join(f'{key}="{" ".join(map(repr, values.tolist()))}"' for key, values in state.items())
+    state = {"qpos": data.qpos, "qvel": data.qvel, "ctrl": data.ctrl, "act": data.act}
+    given = " ".join(f'{key}="{" ".join(map(repr, each.tolist()))}"' for key, each in state.items() if each.size)
     path = tmp_path / "model.xml"
     path.write_text(text.replace("<!---->", f"<keyframe><key {given}/></keyframe>"))
     problem = from_mjcf(path, key=0).problem((0.0, 1.0))

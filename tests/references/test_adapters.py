@@ -99,9 +99,7 @@ def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
 
 
 # --- time limits
-OWN_MODEL = {
-    **{f"Exudyn {s}": lambda s=s, **options: solve_exudyn(PROBLEM, 1e4, 10**7, s, **options) for s in SOLVERS},
-}
+OWN_MODEL = {**{f"Exudyn {s}": lambda s=s, **options: solve_exudyn(PROBLEM, 1e4, 10**7, s, **options) for s in SOLVERS}}
 STOPPED = {
     **OWN_MODEL,
     **{

@@ -235,10 +235,7 @@ def test_a_verdict_that_turns_between_two_processors_is_told():
     sides = [processors.verdicts(of_processor(name, *times), STAMP) for name, times in (("A", (1, 2)), ("B", (2, 1)))]
     (found,) = processors.findings_of(pd.concat(sides))
     assert found["n"] == found["turned"] == 4 and found["same_code"]
-    assert found["processors"] == [
-        {"name": "A", "faster": 4, "slower": 0},
-        {"name": "B", "faster": 0, "slower": 4},
-    ]
+    assert found["processors"] == [{"name": "A", "faster": 4, "slower": 0}, {"name": "B", "faster": 0, "slower": 4}]
     same = [processors.verdicts(of_processor(name, 1.0, 2.0), f"commit {name}") for name in "AB"]
     (found,) = processors.findings_of(pd.concat(same))
     assert found["turned"] == 0 and not found["same_code"]

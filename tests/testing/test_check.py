@@ -41,11 +41,7 @@ def properties_that_fail(report):
 
 
 # --- what is right passes
-@pytest.mark.parametrize(
-    "fault",
-    slow_but(QUICK, FAULTS),
-    ids=[fault.name for fault in FAULTS],
-)
+@pytest.mark.parametrize("fault", slow_but(QUICK, FAULTS), ids=[fault.name for fault in FAULTS])
 def test_a_planted_fault_is_found_and_named(fault):
     module = module_of(fault.example, fault.edits)
     report = check_simulator(module.simulate, fault.problem, **fault.options)

@@ -64,7 +64,8 @@ def from_mjcf(
     - armature, stiffness, damping, springref; frictionloss, for `solve_with_friction`;
     - the equalities connect and weld, which are exact here and soft in MuJoCo, and joint equalities;
     - tendons between two sites as springs, gravcomp, and gravity;
-    - position, velocity, motor and general actuators of hinges and slides.
+    - position, velocity, motor, cylinder and general actuators of hinges and slides, where an activation is that of a
+      constant command from t = 0 on; motors of balls, free joints and sites.
 
     Bodies without joints are merged with their parents.
 
