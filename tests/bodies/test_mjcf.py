@@ -191,8 +191,8 @@ def test_defaults_of_tendons_and_what_else_was_passed_over(tmp_path):
       <equality><connect body1="bob" anchor="0 0 0"/></equality></mujoco>"""
     with pytest.warns(IgnoredWarning, match="frictionloss of spatial"):
         model = read(text, tmp_path)
-    parameters = model.problem().parameters
-    assert [value for name, value in parameters.items() if "spring" in name][-3:] == [7.0, 2.0, 1.0] and not model.joints
+    parameters = model.problem().parameters.items()
+    assert [x for name, x in parameters if "spring" in name][-3:] == [7.0, 2.0, 1.0] and not model.joints
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.bodies.IgnoredWarning")
