@@ -243,23 +243,18 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     if defined(lambda: system.force(t, q + NEAR_START * v, v)) is not None:
         q = q + NEAR_START * v
 
-    def force_in_q(x: Array) -> Array:
-        return system.force(t, x, v)
-
     def force_in_v(x: Array) -> Array:
         return system.force(t, q, x)
 
-    wrong = _wrong_column(system, "force_by_q", t, q, force_in_q, lambda x: system.force_by_q(t, x, v))
+    functions = lambda x: system.force(t, x, v), lambda x: system.force_by_q(t, x, v)
+    wrong = _wrong_column(system, "force_by_q", t, q, *functions)
     if wrong is None and (system.functions.flags[FORCE_BY_V_GIVEN] == 1 or _varies(force_in_v, v)):
         wrong = _wrong_column(system, "force_by_v", t, v, force_in_v, lambda x: system.force_by_v(t, q, x))
     if wrong is not None or system.functions.flags[REACTION_BY_Q_GIVEN] == 0:
         return wrong
     lam = np.linspace(1.0, 2.0, system.n_c)
-
-    def reaction_in_q(x: Array) -> Array:
-        return lam @ system.jacobian(t, x)
-
-    return _wrong_column(system, "reaction_by_q", t, q, reaction_in_q, lambda x: system.reaction_by_q(t, x, lam))
+    functions = lambda x: lam @ system.jacobian(t, x), lambda x: system.reaction_by_q(t, x, lam)
+    return _wrong_column(system, "reaction_by_q", t, q, *functions)
 
 
 def _varies(function: Callable[[Array], Array], x: Array) -> bool:

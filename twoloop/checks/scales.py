@@ -103,11 +103,7 @@ def generic_factors(n_q: int) -> Array:
 
 def median(values: Array) -> float:
     """Return the median of finite numbers, without NumPy's checks for other values."""
-    return _middle(np.sort(values))
-
-
-def _middle(ordered: Array) -> float:
-    """Return the median of sorted numbers."""
+    ordered = np.sort(values)
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 

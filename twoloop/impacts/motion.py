@@ -153,14 +153,10 @@ class Motion:
     def _result(self, times: Array | None, stagnated: str = "") -> Result:
         if note := self._law_note():
             warnings.warn(note.strip(), ImpactWarning, stacklevel=5)
-        return join_arcs(self.system, self.arcs, self.impacts, times, stagnated, self._summary)
+        return join_arcs(self.system, self.arcs, self.impacts, times, stagnated, f"{self._counts}{self._law_note()}")
 
     def _is_stalled(self, before: float) -> bool:
         return self.t - before <= STALLED * max(1.0, abs(self.t))
-
-    @property
-    def _summary(self) -> str:
-        return f"{self._counts}{self._law_note()}"
 
     def _law_note(self) -> str:
         """Describe where the outcome depends on the law of impacts, or which sequence was not followed to its end."""

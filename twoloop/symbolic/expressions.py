@@ -13,6 +13,8 @@ import sympy
 from sympy import Derivative, Expr, Symbol
 from sympy.core.function import AppliedUndef
 from sympy.core.relational import Equality
+from sympy.printing.precedence import PRECEDENCE
+from sympy.printing.pycode import PythonCodePrinter
 
 from twoloop.checks.arguments import check_finite, check_number
 from twoloop.kernels.compile.callbacks import KINDS
@@ -411,63 +413,39 @@ def velocity_coefficients(argument: str, expressions: Sequence[Expr], x: Reader)
     return nonzero(rows.items())
 
 
-class _Printer:
-    """Print expressions with the functions of `math` or `np`; all numbers are floats."""
+class _Printer(PythonCodePrinter):
+    """Print expressions with the functions of `math` or `np`; all numbers are floats, but for integer exponents."""
 
     def __init__(self, module: str):
-        self.module = module
-        names = {function: function.__name__ for function in FUNCTIONS}
+        names = {function.__name__: function.__name__ for function in FUNCTIONS}
         if module == "np":  # numpy 1 has arccos, not acos
-            names = {function: re.sub("^a", "arc", name) for function, name in names.items()}
-        self.functions = {function: f"{module}.{name}" for function, name in names.items()}
+            names = {name: re.sub("^a", "arc", name) for name in names}
+        self._module = module
+        # to sort the terms of long sums would take seconds
+        own = {name: f"{module}.{function}" for name, function in names.items()}
+        super().__init__({"order": "none", "user_functions": own})
 
-    def sum(self, expression: Expr) -> str:
-        """Print an expression that stands alone or is an argument."""
-        text = ""
-        for term in sympy.Add.make_args(expression):
-            negative = term.could_extract_minus_sign() and not term.is_Add
-            part = self.product(-term if negative else term)
-            text += (" - " if text else "-") + part if negative else (" + " if text else "") + part
-        return text
+    def _print(self, expr: Expr, **options: Any) -> str:
+        number = expr.is_Number or expr.is_NumberSymbol
+        return repr(float(expr)) if number else str(super()._print(expr, **options))
 
-    def product(self, expression: Expr) -> str:
-        """Print an expression as a term of a sum."""
-        above, below = [], []
-        for factor in sympy.Mul.make_args(expression):
-            if factor.is_Pow and factor.exp.is_Rational and factor.exp < 0:
-                below.append(self.power(factor.base, -factor.exp))
-            else:
-                above.append(self.factor(factor))
-        text = "*".join(above) or "1.0"
-        if not below:
-            return text
-        return f"{text}/{below[0]}" if len(below) == 1 else f"{text}/({'*'.join(below)})"
+    def parenthesize(self, item: Expr, level: float, strict: bool = False) -> str:
+        """Print an operand; SymPy would put parentheses around positive fractions, too."""
+        is_plain = item.is_Number and item >= 0
+        return self._print(item) if is_plain else str(super().parenthesize(item, level, strict))
 
-    def factor(self, expression: Expr) -> str:
-        """Print an expression as a factor of a product."""
-        if expression.is_Symbol:
-            return str(expression.name)
-        if expression.is_Number or isinstance(expression, sympy.NumberSymbol):
-            return repr(float(expression)) if expression >= 0 else f"({float(expression)!r})"
-        if expression.is_Pow:
-            negative = expression.exp.is_Rational and expression.exp < 0
-            return f"({self.product(expression)})" if negative else self.power(expression.base, expression.exp)
-        if expression.func in self.functions:
-            return f"{self.functions[expression.func]}({', '.join(map(self.sum, expression.args))})"
-        return f"({self.sum(expression)})"
-
-    def power(self, base: Expr, exponent: Expr) -> str:
-        """Print a power, parenthesised if necessary; small integer powers as products."""
+    def _print_Pow(self, expr: Expr, rational: bool = False) -> str:
+        base, exponent = expr.args
+        text, power = self.parenthesize(base, PRECEDENCE["Pow"]), exponent
+        if exponent.is_Rational and exponent < 0:
+            return f"1.0/{self.parenthesize(base**-exponent, PRECEDENCE['Pow'])}"
         if exponent == sympy.S.Half:
-            return f"{self.module}.sqrt({self.sum(base)})"
-        text = self.factor(base)
+            return f"{self._module}.sqrt({self._print(base)})"
         if not exponent.is_Integer:
-            return f"({text}**{self.factor(exponent)})"
-        if exponent == 1:
-            return text
-        if 1 < exponent <= MAX_FACTORS and base.is_Symbol:
+            power = self.parenthesize(exponent, PRECEDENCE["Pow"])
+        elif base.is_Symbol and exponent <= MAX_FACTORS:
             return f"({'*'.join([text] * int(exponent))})"
-        return f"({text}**{int(exponent)})"
+        return f"{text}**{power}"
 
 
 def callback_source(kind: str, arrays: Sequence[Entries]) -> str:
@@ -505,8 +483,8 @@ def _evaluate(expressions: list[Expr], printer: _Printer) -> tuple[list[str], li
         for symbol in sorted(used, key=_name_and_number)
         if (number := _number(symbol)) and symbol.name[0] != "x"
     ]
-    lines = [f"{symbol} = {printer.sum(value)}" for symbol, value in shared]
-    return loads + lines, [printer.sum(expression) for expression in reduced]
+    lines = [f"{symbol} = {printer.doprint(value)}" for symbol, value in shared]
+    return loads + lines, [printer.doprint(expression) for expression in reduced]
 
 
 def _number(symbol: Symbol) -> str:
