@@ -4,7 +4,7 @@ from __future__ import annotations  # help() shows ArrayLike by name
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,12 +133,12 @@ def _certify(result: Record, rtol: float | None, atol: ArrayLike | None, handler
     gap = max([checker.gap, *(end - start for start, end in unseen)])
     wrong = defect > LIMIT or (error > LIMIT and t_grown == np.inf)
     t_worst = t_worst if defect > LIMIT else t_error
-    outcome = _Outcome(defect, error, t_worst, gap, unseen, faults, wrong)
-    message = outcome.message(result)
-    if wrong or faults:
-        warnings.warn(message, CertificateWarning, stacklevel=4)
     passed = not wrong and error <= LIMIT and not unseen and not faults
-    return Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, message, error, faults)
+    certificate = Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, "", error, faults)
+    certificate = replace(certificate, message=_message(certificate, wrong, result))
+    if wrong or faults:
+        warnings.warn(certificate.message, CertificateWarning, stacklevel=4)
+    return certificate
 
 
 def _local_errors(checker: _Checker) -> tuple[float, float, list[tuple[float, float]]]:
@@ -390,52 +390,41 @@ class _Checker:
         return float(0.5 * (self.t[k] + self.t[k + 1]))
 
 
-@dataclass(frozen=True)
-class _Outcome:
-    """Numbers and faults that the checks found, and the message that describes them."""
-
-    defect: float
-    error: float
-    t: float
-    gap: float
-    unseen: list[tuple[float, float]]
-    faults: tuple[str, ...]
-    wrong: bool
-
-    def message(self, result: Record) -> str:
-        """Return the outcome in words."""
-        method = result.method or "the run"
-        parts = []
-        if self.defect > LIMIT:
-            parts.append(
-                f"Not passed: the step of {method} that starts at t = {self.t:.6g} ends {self.defect:.2g} times its "
-                f"tolerance away from the solution of the equations (limit: {LIMIT:g}). It missed a feature, or the "
-                "tolerance is not met: limit max_step, or use another method."
-            )
-        elif self.wrong:
-            parts.append(
-                f"Not passed: at t = {self.t:.6g} the state is {self.error:.2g} times the tolerance away from a second "
-                f"run from the same start (limit: {LIMIT:g}), although no step deviates more than {self.defect:.2g} "
-                "times: small errors add up. Use smaller tolerances or another method."
-            )
-        elif self.faults:
-            parts.append("Not passed.")
-        else:
-            parts.append(
-                f"{'Passed' if not self.unseen else 'Passed in part'}: reintegrated from the stored states, no part of "
-                f"the run ends more than {self.defect:.2g} times the tolerance of a step away from the next stored "
-                f"state, and a second run from the first state ends at most {min(self.error, LIMIT):.2g} tolerances "
-                f"away (limit of both: {LIMIT:g})."
-            )
-        parts.extend(f"{fault[0].upper()}{fault[1:]}." for fault in self.faults)
-        if self.unseen:
-            spans = [f"{start:.6g} to {end:.6g}" for start, end in self.unseen[:3]] + ["..."] * (len(self.unseen) > 3)
-            parts.append(
-                f"Not verified: t = {', '.join(spans)}, where reintegration failed, errors of a tolerance grow beyond "
-                "the limit, or the result has no states."
-            )
+def _message(certificate: Certificate, wrong: bool, result: Record) -> str:
+    """Return the outcome in words; `wrong`: the defect or the error shows that the run is wrong."""
+    method, defect, error = result.method or "the run", certificate.defect, certificate.error
+    parts = []
+    if defect > LIMIT:
         parts.append(
-            f"The equations were evaluated every {self.gap:.2g} s or closer: shorter features may be missed. The model "
-            "is not certified."
+            f"Not passed: the step of {method} that starts at t = {certificate.t:.6g} ends {defect:.2g} times its "
+            f"tolerance away from the solution of the equations (limit: {LIMIT:g}). It missed a feature, or the "
+            "tolerance is not met: limit max_step, or use another method."
         )
-        return " ".join(parts)
+    elif wrong:
+        parts.append(
+            f"Not passed: at t = {certificate.t:.6g} the state is {error:.2g} times the tolerance away from a second "
+            f"run from the same start (limit: {LIMIT:g}), although no step deviates more than {defect:.2g} "
+            "times: small errors add up. Use smaller tolerances or another method."
+        )
+    elif certificate.faults:
+        parts.append("Not passed.")
+    else:
+        parts.append(
+            f"{'Passed' if not certificate.unseen else 'Passed in part'}: reintegrated from the stored states, no part "
+            f"of the run ends more than {defect:.2g} times the tolerance of a step away from the next stored "
+            f"state, and a second run from the first state ends at most {min(error, LIMIT):.2g} tolerances "
+            f"away (limit of both: {LIMIT:g})."
+        )
+    parts.extend(f"{fault[0].upper()}{fault[1:]}." for fault in certificate.faults)
+    if certificate.unseen:
+        spans = [f"{start:.6g} to {end:.6g}" for start, end in certificate.unseen[:3]]
+        spans += ["..."] * (len(certificate.unseen) > 3)
+        parts.append(
+            f"Not verified: t = {', '.join(spans)}, where reintegration failed, errors of a tolerance grow beyond "
+            "the limit, or the result has no states."
+        )
+    parts.append(
+        f"The equations were evaluated every {certificate.gap:.2g} s or closer: shorter features may be missed. The "
+        "model is not certified."
+    )
+    return " ".join(parts)

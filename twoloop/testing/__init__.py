@@ -7,16 +7,16 @@ if TYPE_CHECKING:
     from twoloop.testing.conformance import check_simulator
     from twoloop.testing.mechanisms import problems
     from twoloop.testing.problem import KnownBody, KnownJoint, KnownProblem, Motion
-    from twoloop.testing.properties import Failure, Finding, Report
+    from twoloop.testing.properties import Finding, Report
 
 _MODULES = {
     **dict.fromkeys(("KnownBody", "KnownJoint", "KnownProblem", "Motion"), "problem"),
-    **dict.fromkeys(("Failure", "Finding", "Report"), "properties"),
+    **dict.fromkeys(("Finding", "Report"), "properties"),
     "check_simulator": "conformance",
     "problems": "mechanisms",
 }
 
-__all__ = ["Failure", "Finding", "KnownBody", "KnownJoint", "KnownProblem", "Motion", "Report", "check_simulator"]
+__all__ = ["Finding", "KnownBody", "KnownJoint", "KnownProblem", "Motion", "Report", "check_simulator"]
 __all__ += ["problems"]
 
 

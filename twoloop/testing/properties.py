@@ -44,29 +44,6 @@ class Finding:
     passed: bool
     hint: str = ""
 
-
-@dataclass(frozen=True)
-class Failure:
-    """A failed property: problem, property, measured and allowed value, and a hint.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from twoloop.testing import check_simulator
-    >>> def simulate(problem, times, tolerance):
-    ...     rows = np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
-    ...     return rows
-    >>> report = check_simulator(simulate, "pendulum", tolerances=(1e-4, 1e-6))
-    >>> report.failures[0].problem
-    'pendulum'
-    """
-
-    problem: str
-    property: str
-    measured: float | str
-    allowed: float | str
-    hint: str
-
     def __str__(self) -> str:
         return f"{self.problem}: {self.property}: {outcome_text(self)}. {self.hint}".rstrip()
 
@@ -103,13 +80,9 @@ class Report:
         return not self.failures
 
     @property
-    def failures(self) -> tuple[Failure, ...]:
+    def failures(self) -> tuple[Finding, ...]:
         """The failed properties, in the order of the problems."""
-        return tuple(
-            Failure(finding.problem, finding.property, finding.measured, finding.allowed, finding.hint)
-            for finding in self.findings
-            if not finding.passed
-        )
+        return tuple(finding for finding in self.findings if not finding.passed)
 
     def __str__(self) -> str:
         names = _unique(finding.problem for finding in self.findings)
@@ -133,16 +106,16 @@ class Report:
             verdict = "passed" if finding.passed else "**failed**"
             lines.append(_table_row(finding, verdict))
         for problem, name, reason in self.skipped:
-            lines.append(_table_row(Failure(problem, name, "not measured", "", ""), reason))
+            lines.append(_table_row(Finding(problem, name, "not measured", "", False), reason))
         return "\n".join(lines) + "\n"
 
 
-def _table_row(row: Finding | Failure, last: str) -> str:
+def _table_row(row: Finding, last: str) -> str:
     cells = (row.problem, row.property, _format_value(row.measured), _format_value(row.allowed), last)
     return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
 
 
-def outcome_text(row: Finding | Failure) -> str:
+def outcome_text(row: Finding) -> str:
     """Return the measured and the allowed value as text."""
     return f"{_format_value(row.measured)}, allowed {_format_value(row.allowed)}"
 
