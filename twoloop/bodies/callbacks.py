@@ -30,13 +30,14 @@ from twoloop.bodies.geometry import (
     turn_row,
     vector,
 )
-from twoloop.bodies.program_results import result, results_within
 from twoloop.bodies.read_tables import (
     fill_entries,
     joint_at,
     joint_places,
     n_bodies,
     put_entries,
+    result,
+    results_within,
 )
 from twoloop.bodies.rotors import put_rotors
 from twoloop.kernels.compile.caches import helper

@@ -28,8 +28,7 @@ from twoloop.bodies.geometry import (
     twist_row,
     vector,
 )
-from twoloop.bodies.program_results import results_within
-from twoloop.bodies.read_tables import force_at, force_places, n_bodies
+from twoloop.bodies.read_tables import force_at, force_places, n_bodies, results_within
 from twoloop.bodies.rotation import half_spin
 from twoloop.bodies.rotors import put_rotor_force
 from twoloop.kernels.compile.caches import helper

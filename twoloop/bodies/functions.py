@@ -64,7 +64,7 @@ class RowFunction:
 
     def at(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate the results."""
-        from twoloop.bodies.program_results import results  # compiled on import
+        from twoloop.bodies.read_tables import results  # compiled on import
 
         n = 1 + max(self.columns)
         return np.asarray(results(0, t, q[:n].copy(), v[:n].copy(), self.traced)[: self.n_results])
@@ -132,7 +132,7 @@ class Function:
             error.add_note(f"raised by {self.name} at t = {t!r}")
             raise
         if self.traced is not None:
-            from twoloop.bodies.program_results import results  # compiled on import
+            from twoloop.bodies.read_tables import results  # compiled on import
 
             values.append(results(0, t, np.zeros(0), np.zeros(0), self.traced)[1:3])
         return np.concatenate(values)

@@ -269,7 +269,7 @@ def _check_finite(function: Function | RowFunction, value: Array, t: float) -> N
 @QUIET
 def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
     """Return a message that names the function whose program gives other values; "" if all agree."""
-    from twoloop.bodies.program_results import results as evaluate  # compiled on import
+    from twoloop.bodies.read_tables import results as evaluate  # compiled on import
 
     head, p = tables.p[tables.p.size - layout.HEAD :], tables.p
     generic = np.random.default_rng(8)

@@ -67,7 +67,7 @@ class Gaps:
 
     def at(self, t: float, q: Array, v: Array) -> Gap:
         """Evaluate the gaps at a state."""
-        from twoloop.bodies.program_results import results  # compiled on import
+        from twoloop.bodies.read_tables import results  # compiled on import
 
         state = t, q.tobytes(), v.tobytes()
         if self._last is not None and self._last[0] == state:  # the events of all stops evaluate the same state

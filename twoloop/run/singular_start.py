@@ -54,14 +54,13 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None
     try:
-        return _branch_at(system, t, *np.split(state[: 3 * system.n_q], 3), rank, allowed)
+        return _branch_at(system, t, state, rank, allowed)
     except Exception:  # callbacks may fail beside the start
         return None
 
 
-def _branch_at(
-    system: ConstrainedSystem, t: float, q: Array, v: Array, a: Array, rank: int, allowed: Array
-) -> Branch | bool | None:
+def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
+    q, v, a = np.split(state[: 3 * system.n_q], 3)
     way = v if v.any() else a
     if not way.any():
         return None
