@@ -164,7 +164,7 @@ def test_a_run_beyond_the_end_of_a_table_is_no_success(force, method):
         with pytest.raises(IndexError) as caught:
             solve_dae(system, (0.0, end), [0.0], [0.0], method)
         (note,) = caught.value.__notes__
-        assert "compiled callback of system 'table'" in note and "beyond the end of a table" in note
+        assert "compiled callback of system 'table'" in note and "beyond the end of an array" in note
 
 
 CAM = """

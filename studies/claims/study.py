@@ -46,7 +46,7 @@ def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:
         for key, (claim, found) in pairs.items()
     ]
     findings = findings_of(pairs) | {"experiments": dict(rows.experiments)}
-    findings["procedures"] = experiments.table_of_procedures(rows.experiments)
+    findings["procedures"] = experiments.iterations_of_procedures(rows.experiments)
     output.save_findings(findings)
     output.save_rows(pd.DataFrame(lines), line)
     output.write("claims.md", render("claims", findings, {}, lines=lines, stamp=line, quick=output.call.quick))
