@@ -13,12 +13,11 @@ from tests.bodies.random_models import Both
 from tests.marks import slow
 from tests.problems import assert_same, quick, worst
 from twoloop import mechanisms, solve_dae
-from twoloop.bodies import PlanarModel
+from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.generate.compile_equations import generated_code, write_accelerations, write_function
 from twoloop.generate.elimination import Elimination, PivotChoice
 from twoloop.generate.lane_series import LaneEmitter
 from twoloop.generate.llvm_text import BIT, Module
-from twoloop.generate.null_space import MIN_PIVOT_SQUARE
 from twoloop.generate.program import Coefficients
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
 from twoloop.kernels.lanes.layout import LANES
@@ -27,17 +26,8 @@ from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, choos
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 
 READY = ["four_bar", "andrews", "spatial_slider_crank", "redundant_slider_crank"]
-READY += [
-    "sundials_slider_crank",
-    "driven_slider_crank",
-    "driven_crank",
-    "n_four_bar",
-    "spatial_four_bar",
-    "bricard",
-    "governor",
-    "heavy_top",
-]
-READY += ["closed_chain", "double_pendulum", "pendulum", "knife_edge", "rolling_disc"]
+READY += ["sundials_slider_crank", "driven_slider_crank", "driven_crank", "n_four_bar", "spatial_four_bar", "bricard"]
+READY += ["governor", "heavy_top", "closed_chain", "double_pendulum", "pendulum", "knife_edge", "rolling_disc"]
 KIND = BIT, ["double", *["double*"] * 4]
 
 
@@ -269,10 +259,6 @@ def test_in_lanes_no_run_depends_on_those_beside_it():
             assert np.abs(together[:n, k] - expected).max() < 1e-9 * np.abs(expected).max()
 
 
-def test_the_limit_of_pivots_leaves_nine_digits():
-    assert MIN_PIVOT_SQUARE**-1.5 * 2.0**-52 < 1e-9
-
-
 @pytest.mark.parametrize("inertia", quick([2e-5, 1e-6]))
 def test_little_inertia_on_long_bars(inertia):
     """A parallelogram of bars whose mass is in their middle: its coupler does not turn."""
@@ -285,3 +271,16 @@ def test_little_inertia_on_long_bars(inertia):
     problem = model.problem((0.0, 5.0))
     result = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, compiled=True, rtol=1e-9, atol=1e-9)
     assert result.success and np.abs(result.a[5]).max() < 1e-9 and result.stats.n_rejected_error < 10
+
+
+def test_little_inertia_far_from_a_joint():
+    """Without refinement the equations hold to 3e-8 of their terms only."""
+    model, motion = SpatialModel(), {"position": (3.0, 1.5, -1.0), "angular_velocity": (1.0, 2.0, 3.0)}
+    model.spherical("ground", model.body("bob", mass=1e4, inertia=(1e-5, 2e-5, 1.5e-5), **motion), at=(0.0, 0.0, 0.0))
+    problem = model.problem((0.0, 0.01))
+    for method in ("auto", "DOP853"):
+        result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, method, compiled=True)
+        for t, q, v, a, lam in zip(result.t, *(x.T for x in (result.q, result.v, result.a, result.lam)), strict=True):
+            M, GT = problem.system.mass(t, q), problem.system.jacobian(t, q).T
+            left, terms = M @ a + GT @ lam - problem.system.force(t, q, v), abs(M) @ abs(a) + abs(GT) @ abs(lam)
+            assert (np.abs(left) <= 1e-13 * terms).all()

@@ -25,7 +25,16 @@ from numpy.typing import NDArray
 
 from twoloop.checks.structure import mass_and_rows
 from twoloop.generate.graph import Affine, Graph, Untraceable, is_zero
-from twoloop.generate.null_space import Block, DependentCoordinates, Factors, NotReduced, reduced_accelerations, solve
+from twoloop.generate.null_space import (
+    Block,
+    DependentCoordinates,
+    Factors,
+    NotReduced,
+    loses_digits,
+    reduced_accelerations,
+    solve,
+    solve_refined,
+)
 from twoloop.generate.parameter_expressions import elementwise
 from twoloop.generate.program import Program
 from twoloop.generate.trace import Equations, only_quantity, shared_cache
@@ -72,6 +81,8 @@ class PivotChoice:
     blocks : tuple of (rows, columns)
         Pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which these
         rows are solved. Empty if expressing dependent coordinates saves no operations, or no pivots are suitable.
+    refined : bool or None
+        Whether solutions are improved by one step of refinement. None: no, at every position with these choices.
     """
 
     rows: tuple[int, ...]
@@ -79,6 +90,7 @@ class PivotChoice:
     scale: float
     least: float
     blocks: Blocks = ()
+    refined: bool | None = None
 
     @classmethod
     def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
@@ -91,6 +103,9 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choice(mass, G)
+        # with larger pivots, unless rows are added because of them, random models kept 10 digits
+        if choice.rows and choice.least <= LEAST[-1] and choice.refined is None:
+            choice = replace(choice, refined=loses_digits(mass, G, choice))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
 
@@ -184,7 +199,7 @@ class PivotChooser:
         G: the independent rows. A body may have little inertia about its joints, as a rod with its mass in the middle.
         Then the rows are nearly dependent in the metric of M: if the smallest pivot is 10^-k, accelerations lose up to
         2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times as large as
-        M, k digits are lost. `index`: of the smallest pivot in BOUNDS.
+        M, k digits are lost, which refinement finds again. `index`: of the smallest pivot in BOUNDS.
         """
         last = self._last
         rows = G[list(last.rows)]
@@ -193,7 +208,8 @@ class PivotChooser:
         new = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, scratch, chosen)
         if not 0 <= new <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
             return last
-        return replace(last, added=last.rows, scale=float(scale), least=float(LEAST[new]))
+        least = float(LEAST[new])
+        return replace(last, added=last.rows, scale=float(scale), least=least, refined=True)
 
     def _decode(self, index: int) -> PivotChoice:
         """Return the choice that the kernel wrote to `self._chosen`; raise Untraceable if `index` is an error code."""
@@ -328,6 +344,10 @@ class Elimination:
                     matrix[n + k, i] = matrix[i, n + k] = row[i]
         return matrix
 
+    def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> list[Affine]:
+        """Return a and the multipliers of the independent rows for M a + G^T lam = r, G a = c, with all rows of G."""
+        return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
+
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
         """Return Q (n_q,), and the right-hand sides (n_c + n_a,) of all rows of G a = gamma, at velocities v."""
         return list(self._values_of("force", v)), [
@@ -375,11 +395,7 @@ class Elimination:
 
     def _accelerations(self, v: Sequence[Affine]) -> list[Affine]:
         """Return a list of the accelerations and the multipliers of the independent rows, at velocities v."""
-        right, gamma = self._right_sides(v)
-        for k in self.choice.added:
-            for i, entry in enumerate(self.all_rows[k]):
-                right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
-        return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
+        return self._solve(*self._right_sides(v))
 
     def _on_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
         """Return a list with one value for each row of G: those of `independent`, and 0 for dependent rows."""
@@ -497,7 +513,9 @@ class Solution:
         factors, self._choice, self._n = equations.factors, equations.choice, equations.system.n_q
         n_rows, rows = len(equations.all_rows), self._choice.rows
         dependent = [k for k in range(n_rows) if k not in rows] if more else []
-        forms = [form for k in (*self._choice.added, *dependent) for form in equations.all_rows[k]]
+        refined, mass = self._choice.refined, equations.mass
+        used = {*self._choice.added, *dependent, *(rows if refined else ())}
+        forms = [form for k in used for form in equations.all_rows[k]] + [*(mass.flat if refined else ())]
         forms += [form for block in factors.blocks for row in block.inverse for form in row]
         forms += [form for block in factors.blocks for _, row in block.below for form in row]
         factors_kept = sorted({i for form in forms for i in form.terms})
@@ -520,7 +538,8 @@ class Solution:
             )
             for block in factors.blocks
         ]
-        self._rows = {k: [here(x) for x in equations.all_rows[k]] for k in (*self._choice.added, *dependent)}
+        self._rows = {k: [here(x) for x in equations.all_rows[k]] for k in used}
+        self._mass = [[here(x) for x in row] for row in mass] if refined else []
         self._nothing = Affine(self.graph, 0.0, {})
         self.solved = self._solution_program()
 
@@ -536,10 +555,8 @@ class Solution:
         return [self._c[k] for k in self._choice.rows]
 
     def _solution_program(self) -> Program:
-        r, lam = self._r, [self._nothing] * len(self._c)
-        for k in self._choice.added:
-            r = [entry + (x * self._c[k]).times(self._choice.scale) for entry, x in zip(r, self._rows[k], strict=True)]
-        solution = self._solve([*r, *self._independent()])
+        lam = [self._nothing] * len(self._c)
+        solution = solve_refined(self._solve, self._choice, self._mass, self._rows, self._r, self._c)
         for k, value in zip(self._choice.rows, solution[self._n :], strict=True):
             lam[k] = value
         return Program(self.graph, {"a": solution[: self._n], "lam": lam})

@@ -6,12 +6,25 @@ may be singular in directions that the constraints exclude.
 
 Pivots are chosen once. If a pivot becomes small during a run, a condition of the generated code fails, and a is
 computed by the elimination that begins with M.
+
+Bodies of little inertia beside heavy ones make pivots of very different size, whatever rows are added to M. There, one
+step of refinement solves for the residual of the solution, and restores the digits that elimination loses.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
 from twoloop.generate.graph import Affine, is_zero
+
+Array = NDArray[np.float64]
+
+# relative: largest change of accelerations or multipliers by a step of refinement that counts as rounding. Along a run
+# the loss grew by up to 300 in random models. That of the governor, 6e-11, is 4e-12 along its run.
+ROUNDING_OF_SOLUTION = 1e-10
 
 
 class Block(NamedTuple):
@@ -365,3 +378,67 @@ def _add_products(total: Affine, pairs: Any) -> Affine:
 
 def _nonzero(entries: Terms) -> Terms:
     return {j: entry.value() for j, entry in entries.items() if not is_zero(entry)}
+
+
+def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
+    """Return whether the elimination loses more digits at a position than rounding: then solutions are refined.
+
+    The loss is the change of a solution by one step of refinement, for forces, and for motion that the rows prescribe.
+    """
+    rows, added, n = G[list(choice.rows)], G[list(choice.added)], len(mass)
+    more = mass + choice.scale * added.T @ added
+    factors = np.block([[more, rows.T], [rows, np.zeros((len(rows), len(rows)))]])
+    for k in range(len(factors)):
+        if not 0.0 < abs(factors[k, k]) < np.inf:
+            return True
+        factors[k + 1 :, k] /= factors[k, k]
+        factors[k + 1 :, k + 1 :] -= np.outer(factors[k + 1 :, k], factors[k, k + 1 :])
+
+    def solve(right: Array) -> Array:
+        halfway = solve_triangular(factors, right, lower=True, unit_diagonal=True, check_finite=False)
+        return np.asarray(solve_triangular(factors, halfway, check_finite=False))
+
+    a, b = np.random.default_rng(1).choice((-1.0, 1.0), (2, n))
+    force, gamma = np.column_stack([mass @ a, np.zeros(n)]), np.outer(rows @ b, (0.0, 1.0))
+    solution = solve(np.vstack([force + choice.scale * added.T @ np.outer(added @ b, (0.0, 1.0)), gamma]))
+    r, c = force - mass @ solution[:n] - rows.T @ solution[n:], np.outer(added @ b, (0.0, 1.0)) - added @ solution[:n]
+    change = solve(np.vstack([r + choice.scale * added.T @ c, gamma - rows @ solution[:n]]))
+    (moved, turned), (largest, forces) = ((abs(x[:n]).max(), abs(x[n:]).max(axis=0)) for x in (change, solution))
+    return not (moved <= ROUNDING_OF_SOLUTION * largest and (turned <= ROUNDING_OF_SOLUTION * forces).all())
+
+
+def solve_refined(
+    solve: Callable[[Sequence[Affine]], list[Affine]],
+    choice: Any,
+    mass: Any,
+    rows: Any,
+    r: Sequence[Affine],
+    c: Sequence[Affine],
+) -> list[Affine]:
+    """Return a and the multipliers of the independent rows for M a + G^T lam = r, G a = c, refined if `choice` says so.
+
+    `solve` uses factors with rows added to M, as by `choice`; `mass` and `rows` are M and G without them.
+    """
+
+    def once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:
+        right = list(r)
+        for k in choice.added:
+            for i, entry in enumerate(rows[k]):
+                right[i] = right[i] + (entry * c[k]).times(choice.scale)
+        return solve([*right, *(c[k] for k in choice.rows)])
+
+    def minus(total: Affine, products: Iterable[tuple[Affine, Affine]]) -> Affine:
+        for x, y in products:
+            total = total if is_zero(x) else total - x * y
+        return total.value()
+
+    solution, n = once(r, c), len(r)
+    if not choice.refined:
+        return solution
+    a, lam = solution[:n], dict(zip(choice.rows, solution[n:], strict=True))
+    left = [
+        minus(force, [*zip(row, a, strict=True), *((rows[k][i], x) for k, x in lam.items())])
+        for i, (force, row) in enumerate(zip(r, mass, strict=True))
+    ]
+    off = {k: minus(c[k], zip(rows[k], a, strict=True)) for k in {*choice.rows, *choice.added}}
+    return [x + change for x, change in zip(solution, once(left, off), strict=True)]

@@ -444,7 +444,8 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    index = int(np.searchsorted(-LEAST, -choice.least))
+    # a choice that also depends on the loss of digits, which kernels do not measure, equals none of theirs
+    index = int(np.searchsorted(-LEAST, -choice.least)) if choice.refined is None else len(LEAST)
     numbers = index, len(choice.rows), len(choice.added), *choice.rows, *choice.added
     return np.array(numbers, dtype=np.int64), choice.scale
 
