@@ -112,7 +112,8 @@ def collect(
             if repeat < run.repeats:
                 kept.made(run.key(repeat), partial(make, run, repeat, built))
                 lines.step(run.label(repeat), always=False)
-    keys = [run.key(k) for run in todo for k in range(run.repeats)]
+    # a setting that was passed over at first may have been asked for later, and then stands in the list twice
+    keys = dict.fromkeys(run.key(k) for run in todo for k in range(run.repeats))
     return pd.DataFrame([kept[key] for key in keys if key in kept])
 
 

@@ -73,7 +73,7 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
         row |= {name: run[name] for name in ("used", "calibration", "calibration_s") if name in run}
         row |= {name: run[column] for name, column in columns.items()}
         row |= {name: abs(run[name]) for name in QUALITY if run[name] is not None}
-        row["astray"] = True if run["astray"] in (True, "True") else None
+        row["astray"] = True if run.get("astray") in (True, "True") else None
     known = {name: value for name, value in row.items() if value not in (None, "") and value == value}
     return {name: value if name in EXACT else rounded(value) for name, value in known.items()}
 

@@ -19,7 +19,7 @@ from references.minimal.solvers import has_minimal
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import adaptive, headline
 from studies.bench.cli import Call, StudyError
-from studies.bench.collector import REPEATS, Run, Warm, warm_up
+from studies.bench.collector import Run, Warm, warm_up
 from studies.bench.end_states import case_of, row_of
 from studies.bench.four_bar import SECOND
 from studies.bench.solvers import CATALOGUE, HEYOKA, MINIMAL, OTHER_SOLVERS, OWN, TAYLOR
@@ -47,6 +47,7 @@ BUILT = (1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each toleran
 STEPS = (100, 300, 1000, 3000, 10_000)  # of those of fixed steps
 QUICK_TOLERANCES = (1e-3, 1e-5)
 TIMED = 0.01  # s; a shorter run is called several times more: cold caches cost up to 20 us, nothing in a longer one
+REPEATS = 3  # the fewest of which a range can be told: each takes a quarter of an hour
 TIME_LIMIT = 1.0  # s of CPU of a run
 COMPILING = 30.0  # s of what is built before
 TIGHT = 1e-12  # tolerance of the reference of the second geometry, well above rounding, which a third way holds ...

@@ -10,13 +10,12 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from studies.bench import figures, headline, study, tables
-from studies.bench.collector import REPEATS
 from studies.bench.index import short
 from studies.bench.render import number, power, render
 from studies.bench.row_files import versions
 from studies.bench.store import Output
 from studies.work_precision import first_calls, mechanisms, processors
-from studies.work_precision.mechanisms import HEADLINE, RESOLVED
+from studies.work_precision.mechanisms import HEADLINE, REPEATS, RESOLVED
 from twoloop.rows.row_format import CALIBRATION, calibration_s
 
 MARKS = {"alone": "ours", "missed": "others", "none": "–"}  # cells of the picture without a ratio

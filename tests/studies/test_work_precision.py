@@ -16,7 +16,7 @@ from studies.bench.collector import Run
 from studies.bench.end_states import case_of
 from studies.bench.render import number, render
 from studies.bench.solvers import CATALOGUE, MINIMAL, MINIMAL_FAMILY, OTHER_SOLVERS, OWN
-from studies.bench.store import KeptRows
+from studies.bench.store import KeptRows, read_rows
 from studies.work_precision import first_calls, mechanisms, processors, study
 from tests.studies.of_study import median
 from twoloop.mechanisms import andrews
@@ -149,7 +149,7 @@ def test_every_solver_has_its_settings_and_every_mechanism_is_there():
     assert {run.solver.name for run in todo} == {*OWN, *OTHER_SOLVERS} <= set(CATALOGUE)
     assert len({run.key(0) for run in todo}) == len(todo) and len({run.case.name for run in todo}) >= 23
     heyoka = [run.value for run in todo if run.solver.name == "heyoka" and run.case.name == FOUR_BAR]
-    assert heyoka == list(mechanisms.BUILT) and all(run.repeats == 5 for run in todo)
+    assert heyoka == list(mechanisms.BUILT) and all(run.repeats == mechanisms.REPEATS for run in todo)
     assert mechanisms.problems(False)["four-bar, second"].reference.digits["q"] > 11.5
 
 
@@ -289,7 +289,8 @@ def test_the_first_call_ends_where_that_of_a_user_ends(marks, spent, monkeypatch
 def test_the_committed_report_is_that_of_the_committed_findings():
     found = json.loads((REPORTS / "work_precision.json").read_text())
     text = (REPORTS / "work_precision.md").read_text()
-    assert text == render("work_precision", found, {}, stamp="", quick=False)
+    stamp = read_rows(REPORTS / "work_precision.csv")[1].removeprefix("# full work_precision; ")
+    assert text == render("work_precision", found, {}, stamp=stamp, quick=False)
     for line in found["typical"]:  # and these follow from the cells of the picture
         column = mechanisms.RESOLVED.index(line["error"])
         ratios = [each["ratio"][column] for each in found["cells"] if not each["singular"]]
