@@ -1,10 +1,10 @@
 """Time the first call on a mechanism: nothing built, caches cold, a process of its own.
 
-A part of `studies.work_precision`. The process has an empty folder of caches, but for the kernels of twoloop, which are
-compiled once an installation; the callbacks of the ready mechanisms are compiled anew. It loads the packages by a run
-on another mechanism. CPU time, with that of compilers, is from the making of the mechanism, which compiles its
-callbacks, until the end of the call. For solvers that read the equations from the callbacks, and call none of them, it
-is without that: their users write equations instead.
+A part of `studies.work_precision`. The process has an empty folder of caches, but for the kernels of twoloop and the
+callbacks that all models of bodies share, which are compiled once an installation; callbacks written for a mechanism
+are compiled anew. It loads the packages by a run on another mechanism. CPU time, with that of compilers, is from the
+making of the mechanism, which compiles its callbacks, until the end of the call. For solvers that read the equations
+from the callbacks, and call none of them, it is without that: their users write equations instead.
 """
 
 import importlib
@@ -78,11 +78,10 @@ def times_of(name: str, solver: str) -> Row:
     """Time the first call and later ones in this process."""
     attempt(run_of(mechanisms.double_pendulum(), solver), 0)
     make = getattr(mechanisms, MECHANISMS[name])
-    callbacks = [function.py_func.__module__ for function in make().system.given.values()]
-    modules = [importlib.import_module(each) for each in dict.fromkeys([*callbacks, make.__module__])]
+    module = importlib.import_module(make.__module__)
     user_call.ended = None
     began = cpu_time()
-    run = run_of(getattr(_compiled_anew(modules), MECHANISMS[name])(), solver)
+    run = run_of(getattr(_compiled_anew(module), MECHANISMS[name])(), solver)
     if run.solver.traces and run.solver.family != "two-loop":
         start = run.case.problem
         check_start(start.system, 0.0, start.q0, start.v0)
@@ -103,13 +102,13 @@ def run_of(problem: mechanisms.Problem, solver: str) -> Run:
     return Run(replace(case_of(problem), time_limit=LIMIT, timed=TIMED), CATALOGUE[solver], TOLERANCE)
 
 
-def _compiled_anew(modules: list[ModuleType]) -> ModuleType:
-    """Load modules again with all callbacks compiled anew, as a user's are, and return the last."""
+def _compiled_anew(module: ModuleType) -> ModuleType:
+    """Load a module again with its callbacks compiled anew, as a user's are."""
     kept = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     with tempfile.TemporaryDirectory(prefix="twoloop-callbacks-") as numba.config.CACHE_DIR:  # type: ignore[attr-defined]
-        modules = [importlib.reload(module) for module in modules]
+        module = importlib.reload(module)
     numba.config.CACHE_DIR = kept  # type: ignore[attr-defined]
-    return modules[-1]
+    return module
 
 
 def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
