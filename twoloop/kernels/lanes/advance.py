@@ -52,10 +52,10 @@ def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, st
     state, new, _, _, _, _, own, _ = places_of(n, n_rows, numbers.shape[1])
     n_fresh, n_running = 0, 0
     for k in range(LANES):
-        last = int(work[RUN * LANES + k])
-        # the generated code of a series ends a run without storing a reason
-        if work[RUNNING * LANES + k] == 0.0 and last >= 0 and status[last] == UNDECIDED:
-            status[last] = OFTEN_REFUSED if work[REFUSED * LANES + k] < np.inf else NO_VALUES
+        previous_run = int(work[RUN * LANES + k])
+        # the generated code of a series method clears RUNNING without storing a reason in `status`
+        if work[RUNNING * LANES + k] == 0.0 and previous_run >= 0 and status[previous_run] == UNDECIDED:
+            status[previous_run] = OFTEN_REFUSED if work[REFUSED * LANES + k] < np.inf else NO_VALUES
         work[FINE * LANES + k] = work[FRESH * LANES + k] = 0.0
         if work[RUNNING * LANES + k] == 0.0 and next_run < numbers.shape[0]:
             work[FINE * LANES + k] = work[FRESH * LANES + k] = work[RUNNING * LANES + k] = 1.0
@@ -85,18 +85,18 @@ def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, st
 
 @compiled
 def _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
-    """Store the states at output times within the accepted steps in out_q and out_v, or NaN if that fails."""
+    """Store the states at the output times within accepted steps in out_q and out_v; NaN where a projection fails."""
     while True:
         n_requested = 0
         for k in range(LANES):
-            next_time = int(work[REACHED * LANES + k])
+            i_time = int(work[REACHED * LANES + k])
             work[FINE * LANES + k] = work[X * LANES + k] = 0.0
-            if work[ACCEPTED * LANES + k] == 1.0 and next_time < times.size:
-                end = work[T * LANES + k] + work[H * LANES + k]
-                if times[next_time] < end and times[next_time] < control[T1]:
+            if work[ACCEPTED * LANES + k] == 1.0 and i_time < times.size:
+                step_end = work[T * LANES + k] + work[H * LANES + k]
+                if times[i_time] < step_end and times[i_time] < control[T1]:
                     work[FINE * LANES + k], n_requested = 1.0, n_requested + 1
-                    work[X * LANES + k] = times[next_time] - work[T * LANES + k]
-                    work[AHEAD * LANES + k] = times[next_time]
+                    work[X * LANES + k] = times[i_time] - work[T * LANES + k]
+                    work[AHEAD * LANES + k] = times[i_time]
             work[REQUESTED * LANES + k] = work[FINE * LANES + k]
         if n_requested == 0:
             return
@@ -104,12 +104,12 @@ def _write_within_steps(code, settings, control, options, work, n, new, times, o
         project_lanes(code, settings[ORDER], control, work)
         for k in range(LANES):
             if work[REQUESTED * LANES + k] == 1.0:
-                run, next_time = int(work[RUN * LANES + k]), int(work[REACHED * LANES + k])
+                run, i_time = int(work[RUN * LANES + k]), int(work[REACHED * LANES + k])
                 work[REACHED * LANES + k] += 1.0
                 for j in range(n):
-                    fine = work[FINE * LANES + k] == 1.0
-                    out_q[run, j, next_time] = work[(new + j) * LANES + k] if fine else np.nan
-                    out_v[run, j, next_time] = work[(new + n + j) * LANES + k] if fine else np.nan
+                    is_valid = work[FINE * LANES + k] == 1.0
+                    out_q[run, j, i_time] = work[(new + j) * LANES + k] if is_valid else np.nan
+                    out_v[run, j, i_time] = work[(new + n + j) * LANES + k] if is_valid else np.nan
 
 
 @compiled
@@ -125,22 +125,22 @@ def _write_ends(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, sta
         work[RUNNING * LANES + k], status[run] = 0.0, ENDED
         for j in range(n):
             out_q[run, j, last], out_v[run, j, last] = work[(new + j) * LANES + k], work[(new + n + j) * LANES + k]
-        for j in range(n + n_rows):  # LAM follows A
+        for j in range(n + n_rows):  # accelerations and multipliers, which are adjacent in `work`
             out_a[run, j] = work[(a + j) * LANES + k]
 
 
 @compiled
-def _count(settings, work, n_evaluations):
-    """Add the evaluations within a step, and the one at its end, to `n_evaluations` in lanes with a run."""
+def _count_evaluations(settings, work, n_evaluations):
+    """Add the number of evaluations in the last step to `n_evaluations` (n_runs) for the run of each lane."""
     for k in range(LANES):
         if work[RUNNING * LANES + k] == 1.0:
-            n_before = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
-            n_evaluations[int(work[RUN * LANES + k])] += n_before + 1
+            n_within = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
+            n_evaluations[int(work[RUN * LANES + k])] += n_within + 1  # one more at the end of the step
 
 
 @compiled
 def _advance_time(work, control, n_steps):
-    """Advance T and `n_steps` in lanes whose step was accepted."""
+    """Add the step to T and count it in `n_steps` (n_runs), in lanes whose step was accepted."""
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
             h, t = work[H * LANES + k], work[T * LANES + k]
@@ -167,7 +167,7 @@ def advance_lanes(
     """
     n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
     _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])
-    next_run, are_fresh = 0, False
+    next_run, has_new_runs = 0, False
     for field in (T, AHEAD, H, X, RUNNING, ACCEPTED):
         fill_field(work, field, 0.0)
     fill_field(work, UNIT, 1.0)
@@ -176,17 +176,17 @@ def advance_lanes(
         n_running = 0.0
         for k in range(LANES):
             n_running += work[RUNNING * LANES + k]
-        if n_running < LANES or are_fresh:
-            before = next_run
-            next_run, left = _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status)
-            are_fresh = next_run > before
-            if left == 0:
+        if n_running < LANES or has_new_runs:
+            first_new_run = next_run
+            next_run, n_occupied = _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status)
+            has_new_runs = next_run > first_new_run
+            if n_occupied == 0:
                 if next_run == numbers.shape[0]:
                     return
                 continue
         fill_field(work, EVALUATED, 0.0)
         code.step(code, settings, control, options, work, status, n_steps, False)
-        _count(settings, work, n_evaluations)
+        _count_evaluations(settings, work, n_evaluations)
         code.commit(order, control, work)
         _write_ends(work, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
         if times.size > 1:

@@ -57,20 +57,21 @@ from twoloop.kernels.lanes.layout import (
     project_lanes,
 )
 
-# indices in `options`, after the rule of step-size control. ROUGH: factor by which errors may exceed their estimates if
-# a force jumps; FIRST: first step, relative to the shortest time scale at the start; LEAST: the smallest tolerance.
-# The entries from N_HEAD on are the options that the method has outside the lanes
+# indices in `options`; its first N_RULE entries are the step-size rule. ROUGH: factor by which errors may exceed their
+# estimates if a force jumps; FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest
+# tolerance of a coordinate. From N_HEAD on, `options` contains the options of the method for a single run
 ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-# SUDDEN_ERROR: error, in tolerances, above which a force may have jumped. AFTER_REJECTION: largest ratio of the next
-# step size to the size of a rejected step. Both are as in kernels/advance.py. ROUNDING_OF_END: a step that is shorter
-# than the time to t1 by at most this fraction ends at t1, as in `off_grid`
-SUDDEN_ERROR, AFTER_REJECTION, ROUNDING_OF_END = 10.0, 0.95, 1e-10
-# ratio of H_LIMIT to the size of a step that failed, and number of accepted steps for which it applies, as in `Plan`
-LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0
+# error of a rejected step, in tolerances, above which a force is assumed to jump within the step, as in advance.py
+SUDDEN_ERROR = 10.0
+MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step, as in advance.py
+END_ROUNDING = 1e-10  # a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `off_grid`
+LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of a step that failed, as in `Plan`
+LIMIT_MEMORY = 10.0  # number of accepted steps after which H_LIMIT no longer applies, as in `Plan`
 LEAST_FIRST_STEP = 20.0 * SHORTEST  # smallest size of the first step, relative to |t0|
-MAX_REJECTED = 30  # largest number of successive rejected steps: in stiff motion, steps may remain far too long
-MOST_STEPS = 100_000  # largest number of steps of a run in lanes, because the user cannot interrupt a run there
+# number of successive rejected steps after which a run leaves its lane: in stiff motion, steps may remain far too long
+MAX_REJECTED = 30
+MOST_STEPS = 100_000  # largest number of steps of a run in a lane, where the user cannot interrupt the run
 
 
 @inlined
@@ -80,7 +81,7 @@ def _history(work, k):
 
 
 @compiled
-def _first_step(options, control, work, n, state, a, k):
+def _first_step_size(options, control, work, n, state, a, k):
     """Return the size, s, of the first step in lane k: options[FIRST] times the shortest time scale of the motion."""
     largest_q, largest_v, largest_a, least = 0.0, 0.0, 0.0, np.inf
     for j in range(n):
@@ -100,12 +101,12 @@ def _first_step(options, control, work, n, state, a, k):
 
 @compiled
 def begin_control(options, control, work, n, state, a, start):
-    """Initialize step-size control in lanes with FRESH = 1, and copy the accelerations `a` to `start` there."""
+    """Initialize step-size control, and copy the accelerations at offset `a` to `start`, in lanes with FRESH = 1."""
     for k in range(LANES):
         if work[FRESH * LANES + k] == 1.0:
             for j in range(n):
                 work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
-            work[H_NEXT * LANES + k] = _first_step(options, control, work, n, state, a, k)
+            work[H_NEXT * LANES + k] = _first_step_size(options, control, work, n, state, a, k)
             work[H_LIMIT * LANES + k], work[LIMIT_AGE * LANES + k] = np.inf, 0.0
             work[ROUGH_TO * LANES + k] = -np.inf
             for i in range(N_PAST):
@@ -114,31 +115,31 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Store the size of the next step, at most GAP, in H and X, 0 in lanes without a run; copy RUNNING to FINE."""
+    """Store the size of the next step, at most GAP, in H and X; 0 in lanes without a run. Copy RUNNING to FINE."""
     t1 = control[T1]
     for k in range(LANES):
         work[H * LANES + k], t = 0.0, work[T * LANES + k]
         if work[RUNNING * LANES + k] == 1.0:
             h_wanted = min(work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k], control[GAP])
-            h, left = h_wanted, t1 - t
-            if h >= left * (1.0 - ROUNDING_OF_END):
-                h = left
-            elif h > 0.5 * left:
-                h = 0.5 * left  # two equal steps rather than a long and a tiny one
+            h, time_left = h_wanted, t1 - t
+            if h >= time_left * (1.0 - END_ROUNDING):
+                h = time_left
+            elif h > 0.5 * time_left:
+                h = 0.5 * time_left  # two equal steps rather than a long and a tiny one
             if n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
                 leave_run(work, status, k, MANY_STEPS)
             elif h > SHORTEST * max(abs(t), abs(t1)):
                 work[H * LANES + k], work[H_FREE * LANES + k] = h, h_wanted
             else:
-                failed = work[H_LIMIT * LANES + k] < np.inf and work[LIMIT_AGE * LANES + k] == 0.0
-                leave_run(work, status, k, NO_VALUES if failed else OFTEN_REFUSED)
+                last_step_failed = work[H_LIMIT * LANES + k] < np.inf and work[LIMIT_AGE * LANES + k] == 0.0
+                leave_run(work, status, k, NO_VALUES if last_step_failed else OFTEN_REFUSED)
         work[X * LANES + k] = work[H * LANES + k]
         work[FINE * LANES + k] = work[RUNNING * LANES + k]
 
 
 @compiled
 def set_end(work, control):
-    """Set AHEAD to T + X, or exactly to t1 if this is the end of the run."""
+    """Set AHEAD to T + X, without a rounding error if this is t1."""
     for k in range(LANES):
         t, x = work[T * LANES + k], work[X * LANES + k]
         work[AHEAD * LANES + k] = control[T1] if x == control[T1] - t else t + x
@@ -171,25 +172,25 @@ def end_steps(code, settings, control, work, predicted_v):
 
 @merged
 def _accept_or_shorten(options, work, k):
-    """Store the size of the next step of lane k, H_NEXT; return whether its last step is accepted."""
+    """Store H_NEXT, the size of the next step in lane k; return whether the last step in this lane is accepted."""
     h, t, error = work[H * LANES + k], work[T * LANES + k], work[ERROR * LANES + k]
     if work[FINE * LANES + k] == 0.0 or not np.isfinite(error):
         work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[LIMIT_AGE * LANES + k] = 0.0
         return False
     # at a jump of a force, the error estimate may be small by chance: before ROUGH_TO, it is multiplied by ROUGH
-    factor = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
-    accepted = error * factor <= 1.0
-    if error > SUDDEN_ERROR and not accepted:
+    error_factor = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
+    is_accepted = error * error_factor <= 1.0
+    if error > SUDDEN_ERROR and not is_accepted:
         work[ROUGH_TO * LANES + k] = t + h
-    error *= factor
+    error *= error_factor
     past = _history(work, k)
-    proposal = min(h * factor_of(options, past, h, error), work[H_LIMIT * LANES + k])
-    if not accepted:
-        work[H_NEXT * LANES + k] = min(proposal, AFTER_REJECTION * h)
+    h_proposed = min(h * factor_of(options, past, h, error), work[H_LIMIT * LANES + k])
+    if not is_accepted:
+        work[H_NEXT * LANES + k] = min(h_proposed, MAX_RATIO_AFTER_REJECTION * h)
         return False
     record_accepted(options, past, h, error)
-    work[H_NEXT * LANES + k] = max(proposal, work[H_FREE * LANES + k]) if h < work[H_FREE * LANES + k] else proposal
+    work[H_NEXT * LANES + k] = max(h_proposed, work[H_FREE * LANES + k]) if h < work[H_FREE * LANES + k] else h_proposed
     work[LIMIT_AGE * LANES + k] += 1.0
     if work[LIMIT_AGE * LANES + k] > LIMIT_MEMORY:
         work[H_LIMIT * LANES + k] = np.inf

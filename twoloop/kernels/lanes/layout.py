@@ -31,7 +31,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     X,  # time from the beginning of the step to the state to be computed, s
     FINE,  # 1 in lanes in which a task has to run; it remains 1 if the task succeeds
     DEFECT,  # defect at the end of the step, relative to the allowed defect
-    OFF,  # departure of the step, see control/step_size.py
+    OFF,  # departure: difference of predicted and projected positions, relative to its limit, see control/step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
     LONGEST,  # largest allowed step size, s
     REQUESTED,  # 1 in lanes that begin a run, or for which a state within a step is requested
@@ -44,12 +44,12 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     MOVED_BEFORE,  # largest change of a position by the previous pass of a projection
     ACCEPTED,  # 1 in lanes whose step was accepted
     FRESH,  # 1 in lanes whose run has not taken a step yet
-    ERROR,  # error of a step, in units of the tolerances
+    ERROR,  # error estimate of the step, in units of the tolerances
     H_FREE,  # size of the step before it was shortened to reach the end of the run, s
     H_NEXT,  # size of the next step, s
     H_LIMIT,  # upper limit of the step size after a step that failed, s; infinite if there is no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
-    ROUGH_TO,  # end of the last step that was rejected because of a suddenly large error, s
+    ROUGH_TO,  # time at the end of the last step that was rejected because of a suddenly large error, s
     SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
     EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
     PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
@@ -73,16 +73,16 @@ TASKS_OF_SERIES = (
     "series",  # compute the coefficients of the series about STATE at T, in units of time UNIT
     "lengths",  # compute LENGTH, H and X of the step; it succeeds if the run can continue
     "check_within",  # compute WORST, the largest defect within a step H, and AHEAD, the time of its end
-    "evaluate",  # compute NEW, PREDICTED and FOUND, the accelerations, by the series after X units of time
+    "evaluate",  # compute NEW, PREDICTED and the accelerations SERIES_A by the series, X units of time after T
     "defect",  # compute DEFECT, the defect of A at NEW, the end of a step H
     "judge",  # set ACCEPTED, and choose the size of the next step
 )
-CODE = Reference("LaneKit", {})
+CODE = Reference("LaneKit", {})  # numba's type of a LaneKit
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
-# step of a method, (code, settings, control, options, work, status, n_steps, within): in each lane with a run, take a
-# step H, set ACCEPTED, and compute NEW, A and LAM at the end of the step. With `within`, instead compute the state NEW
-# at the time X after the beginning of the last accepted step, without a projection, in lanes with FINE = 1
+# signature of a method's step, (code, settings, control, options, work, status, n_steps, within): in each lane with a
+# run, take a step H, set ACCEPTED, and compute NEW, A and LAM at its end. If `within`, instead compute the state NEW at
+# the time X after the beginning of the last accepted step, without a projection, in lanes with FINE = 1
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
@@ -97,7 +97,7 @@ SHORTEST = 1e-13  # smallest step size, relative to the larger of |t| at its beg
 
 
 class LaneKit:
-    """Functions generated for a mechanism and the step of a method, which kernels get as a reference (`CODE`)."""
+    """Functions generated for a mechanism, and the step of a method, passed to kernels by reference (type `CODE`)."""
 
     def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
@@ -115,17 +115,17 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 def places(n, n_rows, n_numbers):
     """Return the offsets in `work`, in vectors, of the arrays that follow its fields.
 
-    These are STATE, NEW (q and v each), PREDICTED (q), FOUND (accelerations by a series), A, LAM, the data of the
+    These are STATE and NEW (q, v), PREDICTED (q), SERIES_A (accelerations by a series), A, LAM, the data of the
     generated code (n_numbers), and the memory of the method.
     """
     state = N_FIELDS
     new = state + 2 * n
     predicted = new + 2 * n
-    found = predicted + n
-    a = found + n
+    series_a = predicted + n
+    a = series_a + n
     lam = a + n
     numbers = lam + n_rows
-    return state, new, predicted, found, a, lam, numbers, numbers + n_numbers
+    return state, new, predicted, series_a, a, lam, numbers, numbers + n_numbers
 
 
 places_of = merged(places)
@@ -166,15 +166,15 @@ def copy_vectors(work, source, target, count):
 
 @compiled
 def sum_rows(weights, rows, total):
-    """Store the sum of weights[k] rows[k] over k in `total`, computed for four rows at once, which LLVM vectorises."""
-    first = weights.size % 4
+    """Store in `total` the sum over k of weights[k] rows[k]; four rows are added at once, so that LLVM vectorises."""
+    remainder = weights.size % 4
     for m in range(total.size):
         total[m] = 0.0
-    for k in range(first):
+    for k in range(remainder):
         weight, row = weights[k], rows[k]
         for m in range(total.size):
             total[m] += weight * row[m]
-    for k in range(first, weights.size, 4):
+    for k in range(remainder, weights.size, 4):
         a, b, c, d = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
         for m in range(total.size):
             total[m] += (a * rows[k, m] + b * rows[k + 1, m]) + (c * rows[k + 2, m] + d * rows[k + 3, m])
@@ -190,27 +190,27 @@ def _add_four(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign x y to the vector `target`; four lanes are read before any is written, because vectors may overlap."""
+    """Add sign x y to the vector `target`; four lanes are read before any is written, as LLVM assumes an overlap."""
     for k in range(0, LANES, 4):
         _add_four(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
 
 @merged
-def _larger(work, target, error, factor, before, after, atol, rtol):
-    """Return the new value of `target` in one lane, see `enlarge`; arguments are indices in `work`."""
-    scale = atol + rtol * max(abs(work[before]), abs(work[after]))
-    return max(work[target], abs(work[error]) * work[factor] / scale)
+def _enlarged(work, target, error, factor, before, after, atol, rtol):
+    """Return the value that `enlarge` stores in one lane; arguments `target` to `after` are indices in `work`."""
+    allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
+    return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
 
 @compiled
 def enlarge(work, target, error, factor, before, after, atol, rtol):
-    """Set `target` to |error| factor / (atol + rtol max(|before|, |after|)) in lanes in which that is larger."""
+    """Increase `target` to |error| factor / (atol + rtol max(|before|, |after|)) in lanes in which this is larger."""
     for k in range(0, LANES, 4):
         m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k
-        m0 = _larger(work, m, e, f, x, y, atol, rtol)
-        m1 = _larger(work, m + 1, e + 1, f + 1, x + 1, y + 1, atol, rtol)
-        m2 = _larger(work, m + 2, e + 2, f + 2, x + 2, y + 2, atol, rtol)
-        m3 = _larger(work, m + 3, e + 3, f + 3, x + 3, y + 3, atol, rtol)
+        m0 = _enlarged(work, m, e, f, x, y, atol, rtol)
+        m1 = _enlarged(work, m + 1, e + 1, f + 1, x + 1, y + 1, atol, rtol)
+        m2 = _enlarged(work, m + 2, e + 2, f + 2, x + 2, y + 2, atol, rtol)
+        m3 = _enlarged(work, m + 3, e + 3, f + 3, x + 3, y + 3, atol, rtol)
         work[m], work[m + 1], work[m + 2], work[m + 3] = m0, m1, m2, m3
 
 
@@ -231,7 +231,7 @@ def _scale(work, target, apart, x, imaginary):
 
 
 @merged
-def _subtract(work, target, x, y, imaginary, imaginary_y):
+def _subtract_product(work, target, x, y, imaginary, imaginary_y):
     """Subtract x y from the number `target` in each lane; if `imaginary` > 0, all three numbers are complex.
 
     Their imaginary parts are `imaginary` vectors after the real part of x, and `imaginary_y` vectors after the real
@@ -253,9 +253,9 @@ def _exchange(work, first, second, k):
 
 @merged
 def _absolute_value(work, entry, imaginary, k):
-    """Return the absolute value of a real number in lane k, or the sum of those of both parts of a complex number."""
-    size = abs(work[entry * LANES + k])
-    return size if imaginary == 0 else size + abs(work[(entry + imaginary) * LANES + k])
+    """Return |x| of a real number x in lane k, or |re x| + |im x| of a complex one; `entry` is the offset of x."""
+    magnitude = abs(work[entry * LANES + k])
+    return magnitude if imaginary == 0 else magnitude + abs(work[(entry + imaginary) * LANES + k])
 
 
 @compiled
@@ -265,26 +265,26 @@ def _choose_pivot(work, matrix, pivots, n, imaginary, c):
     Clear FINE in lanes in which the pivot is zero.
     """
     for k in range(LANES):
-        best, top = c, _absolute_value(work, matrix + c * n + c, imaginary, k)
+        best, largest = c, _absolute_value(work, matrix + c * n + c, imaginary, k)
         for i in range(c + 1, n):
-            size = _absolute_value(work, matrix + i * n + c, imaginary, k)
-            if size > top:
-                best, top = i, size
+            magnitude = _absolute_value(work, matrix + i * n + c, imaginary, k)
+            if magnitude > largest:
+                best, largest = i, magnitude
         work[(pivots + c) * LANES + k] = best
         if best != c:
             for j in range(n):
                 _exchange(work, matrix + c * n + j, matrix + best * n + j, k)
                 if imaginary > 0:
                     _exchange(work, matrix + c * n + j + imaginary, matrix + best * n + j + imaginary, k)
-        if not top > 0.0:
+        if not largest > 0.0:
             work[FINE * LANES + k] = 0.0
         re = (matrix + c * n + c) * LANES + k
         if imaginary == 0:
             work[re] = 1.0 / work[re]
         else:
             im = re + imaginary * LANES
-            square = work[re] * work[re] + work[im] * work[im]
-            work[re], work[im] = work[re] / square, -work[im] / square
+            squared_modulus = work[re] * work[re] + work[im] * work[im]
+            work[re], work[im] = work[re] / squared_modulus, -work[im] / squared_modulus
 
 
 @compiled
@@ -296,30 +296,30 @@ def factor_lanes(work, matrix, pivots, n, imaginary):
             _scale(work, matrix + i * n + c, imaginary, matrix + c * n + c, imaginary)
             for j in range(c + 1, n):
                 row, column = matrix + i * n + c, matrix + c * n + j
-                _subtract(work, matrix + i * n + j, row, column, imaginary, imaginary)
+                _subtract_product(work, matrix + i * n + j, row, column, imaginary, imaginary)
 
 
 @compiled
 def solve_lanes(work, matrix, pivots, n, imaginary, x):
-    """Replace a right-hand side x (n) by the solution, with the factors of `factor_lanes`.
+    """Replace a right-hand side x (n) in each lane by the solution, with the factors of `factor_lanes`.
 
     If `imaginary` > 0, the system is complex, and n imaginary parts follow the real parts of x.
     """
-    apart = n if imaginary > 0 else 0
+    imaginary_x = n if imaginary > 0 else 0
     for c in range(n):
         for k in range(LANES):
-            best = int(work[(pivots + c) * LANES + k])
-            if best != c:
-                _exchange(work, x + c, x + best, k)
+            pivot_row = int(work[(pivots + c) * LANES + k])
+            if pivot_row != c:
+                _exchange(work, x + c, x + pivot_row, k)
                 if imaginary > 0:
-                    _exchange(work, x + n + c, x + n + best, k)
+                    _exchange(work, x + n + c, x + n + pivot_row, k)
     for i in range(n):
         for j in range(i):
-            _subtract(work, x + i, matrix + i * n + j, x + j, imaginary, apart)
+            _subtract_product(work, x + i, matrix + i * n + j, x + j, imaginary, imaginary_x)
     for i in range(n - 1, -1, -1):
         for j in range(i + 1, n):
-            _subtract(work, x + i, matrix + i * n + j, x + j, imaginary, apart)
-        _scale(work, x + i, apart, matrix + i * n + i, imaginary)
+            _subtract_product(work, x + i, matrix + i * n + j, x + j, imaginary, imaginary_x)
+        _scale(work, x + i, imaginary_x, matrix + i * n + i, imaginary)
 
 
 MAX_PASSES = 10  # largest number of passes of a projection, each with the task "refine"

@@ -69,8 +69,8 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     LARGEST_Q,  # largest correction of positions, over the square of the step size
     LARGEST_V,  # largest correction of velocities, over the step size
     H_PREVIOUS,  # size of the step with the accelerations PREVIOUS, s; 0 if there is no such step
-    CONSTANT,  # 1: the stages are predicted to have the accelerations at the beginning of the step
-    DURATION,  # s, duration of an error of the velocities, see velocity_errors.py; 0: not known
+    CONSTANT,  # 1: the predicted accelerations of all stages are those at the beginning of the step; else 0
+    DURATION,  # duration of an error of the velocities, s, see velocity_errors.py; 0: not known
     N_OF_LANES,
 ) = range(11)
 # indices of the blocks of n vectors: accelerations at STATE; q, v and a at the beginning of the step; sums; q, v and a
@@ -146,8 +146,8 @@ def _evaluate_middle(code, settings, control, c, work, new, a, memory):
         x = node * work[X * LANES + k]
         work[AHEAD * LANES + k] = work[T * LANES + k] + x
         for j in range(n):
-            at = (begin + j) * LANES + k
-            q, v, a0 = work[at], work[at + n * LANES], work[at + 2 * n * LANES]
+            index = (begin + j) * LANES + k
+            q, v, a0 = work[index], work[index + n * LANES], work[index + 2 * n * LANES]
             work[(new + j) * LANES + k] = q + x * (v + 0.5 * x * a0)
             work[(new + n + j) * LANES + k] = v + x * a0
     code.approach(order, control, work)
@@ -160,7 +160,7 @@ def _evaluate_middle(code, settings, control, c, work, new, a, memory):
 def find_derivatives(code, settings, control, c, work):
     """Store the derivatives BY_Q and BY_V of the accelerations in the middle of the step, in lanes with FINE = 1.
 
-    They are computed at the time of a stage, because a force between two stages might act at no stage.
+    The middle is the time of a stage: between two stages a force may act that no stage contains.
     """
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -170,20 +170,20 @@ def find_derivatives(code, settings, control, c, work):
     for column in range(2 * n):
         copy_vectors(work, middle, new, 2 * n)
         for k in range(LANES):
-            at = (new + column) * LANES + k
-            work[at] += RELATIVE_DISPLACEMENT * max(1.0, abs(work[at]))
+            index = (new + column) * LANES + k
+            work[index] += RELATIVE_DISPLACEMENT * max(1.0, abs(work[index]))
         code.accelerate(order, control, work)
         matrix = matrix_at(memory, n, s, BY_Q if column < n else BY_V) + column % n
         for k in range(LANES):
-            inverse = 1.0 / (work[(new + column) * LANES + k] - work[(middle + column) * LANES + k])
+            per_displacement = 1.0 / (work[(new + column) * LANES + k] - work[(middle + column) * LANES + k])
             for i in range(n):
                 change = work[(a + i) * LANES + k] - work[(middle_a + i) * LANES + k]
-                work[(matrix + i * n) * LANES + k] = change * inverse
+                work[(matrix + i * n) * LANES + k] = change * per_displacement
 
 
 @compiled
 def factor_systems_of_lanes(settings, method_options, s, work):
-    """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one eigenvalue l of each pair."""
+    """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one l of each complex pair."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_at(s)
@@ -207,10 +207,10 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Predict STAGES, the stage accelerations, by the polynomial through PREVIOUS if the step is not too long for it.
+    """Store predicted stage accelerations in STAGES: values of the polynomial through PREVIOUS.
 
-    Otherwise, they are predicted to be constant. `begins`: beginning of the step, relative to the step of PREVIOUS: 1
-    if PREVIOUS is of the last step, 0 if PREVIOUS is of this step, within which a state is computed.
+    If the step is longer than MAX_STEP_RATIO steps of PREVIOUS, the prediction is constant. `begins`: beginning of the
+    step in units of the step of PREVIOUS: 1 if PREVIOUS is of the last step, 0 if it is of this step.
     """
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
@@ -218,18 +218,18 @@ def predict_stages(settings, c, work, begins):
     weights, stages = _weights_at(memory, n, s), block_at(memory, n, s, STAGES)
     previous, a = block_at(memory, n, s, PREVIOUS), vector_at(memory, n, BEGIN_A)
     for k in range(LANES):
-        before = work[(memory + H_PREVIOUS) * LANES + k]
-        ratio = work[X * LANES + k] / before if before > 0.0 else np.inf
+        h_previous = work[(memory + H_PREVIOUS) * LANES + k]
+        ratio = work[X * LANES + k] / h_previous if h_previous > 0.0 else np.inf
         has_previous = 1.0 if ratio <= MAX_STEP_RATIO else 0.0
         work[(memory + CONSTANT) * LANES + k] = 1.0 - has_previous
         for j in range(s):
             theta = begins + ratio * c[j] if has_previous == 1.0 else 0.0
             for i in range(s):
-                product = has_previous
+                weight = has_previous
                 for l in range(s):
                     if l != i:
-                        product *= (theta - c[l]) / (c[i] - c[l])
-                work[(weights + j * s + i) * LANES + k] = product
+                        weight *= (theta - c[l]) / (c[i] - c[l])
+                work[(weights + j * s + i) * LANES + k] = weight
     for j in range(s):
         for m in range(n):
             offset = stages + j * n + m
@@ -274,7 +274,7 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
 
 
 @compiled
-def _correct(settings, method_options, s, work):
+def _correct_stages(settings, method_options, s, work):
     """Store the corrections of the stage accelerations in CHANGES; add them to STAGES in lanes with ITERATING = 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
@@ -309,14 +309,14 @@ def _correct(settings, method_options, s, work):
 def _store_largest(work, target, begin, n):
     """Increase the vector `target` to the largest |value| of the n vectors from `begin` on, or to NaN if one is NaN."""
     for i in range(n * LANES):
-        size, at = abs(work[begin * LANES + i]), target * LANES + i % LANES
-        if size > work[at] or size != size:
-            work[at] = size
+        magnitude, at = abs(work[begin * LANES + i]), target * LANES + i % LANES
+        if magnitude > work[at] or magnitude != magnitude:
+            work[at] = magnitude
 
 
 @compiled
-def _largest_corrections(settings, A, A2, work):
-    """Store LARGEST_Q and LARGEST_V, the largest corrections of the stages by CHANGES for a step of size 1."""
+def _store_largest_corrections(settings, A, A2, work):
+    """Store LARGEST_Q and LARGEST_V, the largest corrections of q and v by CHANGES at the stages, for a step size 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = A.shape[0]
@@ -334,7 +334,7 @@ def _largest_corrections(settings, A, A2, work):
 def _end_iteration(options, work, memory, iteration, k):
     """Set DONE to 1 if the iteration of lane k has converged, otherwise to 0; return whether the iteration ends."""
     x, tolerance = work[X * LANES + k], options[N_HEAD + OUTER_TOL]
-    floor = MAX_ROUNDING_CORRECTION * options[LEAST]
+    rounding_limit = MAX_ROUNDING_CORRECTION * options[LEAST]
     change_v = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
     change_q = x * x * work[(memory + LARGEST_Q) * LANES + k] / work[(memory + SCALE_Q) * LANES + k]
     change, before = max(change_v, change_q), work[(memory + CHANGE_BEFORE) * LANES + k]
@@ -347,12 +347,12 @@ def _end_iteration(options, work, memory, iteration, k):
         converged = change <= 1e-3 * tolerance
         ended = converged
     elif contraction >= 0.9:
-        converged, ended = change <= floor, True
+        converged, ended = change <= rounding_limit, True
     elif contraction / (1.0 - contraction) * change <= tolerance:
         converged, ended = True, True
     else:
-        too_slow = change * contraction**n_left / (1.0 - contraction) > max(tolerance, floor)
-        converged, ended = n_left == 0 and not too_slow and change <= floor, too_slow or n_left == 0
+        too_slow = change * contraction**n_left / (1.0 - contraction) > max(tolerance, rounding_limit)
+        converged, ended = n_left == 0 and not too_slow and change <= rounding_limit, too_slow or n_left == 0
     work[(memory + DONE) * LANES + k] = 1.0 if converged else 0.0
     return ended
 
@@ -375,8 +375,8 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
         if n_left == 0.0:
             break
         _compute_residuals(code, settings, control, A, A2, c, work)
-        _correct(settings, method_options, c.size, work)
-        _largest_corrections(settings, A, A2, work)
+        _correct_stages(settings, method_options, c.size, work)
+        _store_largest_corrections(settings, A, A2, work)
         for k in range(LANES):
             if work[iterating * LANES + k] == 1.0 and _end_iteration(options, work, memory, iteration, k):
                 work[iterating * LANES + k] = 0.0
@@ -405,8 +405,8 @@ def state_from_stages(settings, b, bA, work):
 @merged
 def _allowed(control, work, state, new, j, entry, k):
     """Return the allowed error, in lane k, of entry `entry` of a state [q, v], which belongs to coordinate j."""
-    size = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
-    return control[ATOL + j] + control[RTOL] * size
+    magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
+    return control[ATOL + j] + control[RTOL] * magnitude
 
 
 @compiled
@@ -434,7 +434,7 @@ def _embedded_estimate(settings, method_options, A, work, memory):
 
 
 @compiled
-def _filter(settings, method_options, s, work, memory):
+def _filter_errors(settings, method_options, s, work, memory):
     """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), z = gamma0 H, where J is the Jacobian of (v, F)."""
     n = settings[N]
     gamma0 = method_options[newton_options_at(s) + GAMMA0]
@@ -458,17 +458,17 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
     """Return the error, in units of the tolerances, that a velocity error causes in lane k, see velocity_errors.py."""
     raw, once, twice = vector_at(memory, n, UNFILTERED), vector_at(memory, n, FILTERED_ONCE), vector_at(memory, n, E_V)
     begin = vector_at(memory, n, BEGIN_V)
-    largest = curvature = largest_v = largest_a = 0.0
+    largest_error = largest_difference = largest_v = largest_a = 0.0
     for j in range(n):
         largest_v = max(largest_v, abs(work[(begin + j) * LANES + k]))
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
-        largest = max(largest, abs(work[(twice + j) * LANES + k]))
+        largest_error = max(largest_error, abs(work[(twice + j) * LANES + k]))
         second_difference = (
             work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
         )
-        curvature = max(curvature, abs(second_difference))  # (z J)^2 e
-    if largest > 0.0:
-        work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest / curvature)
+        largest_difference = max(largest_difference, abs(second_difference))  # (z J)^2 e
+    if largest_error > 0.0:
+        work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]
     if duration * largest_a * SLOW_FACTOR > largest_v:
         duration *= min(SLOW_FACTOR, duration * largest_a * SLOW_FACTOR / largest_v) if largest_v > 0.0 else SLOW_FACTOR
@@ -499,20 +499,20 @@ def _motion_time(control, work, n, memory, k):
 
 
 @compiled
-def _error_in_slow_directions(settings, control, method_options, s, work):
+def _add_error_in_slow_directions(settings, control, method_options, s, work):
     """Increase ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
-    any_slow = False
+    has_large_error = False
     for k in range(LANES):
         error = 0.0
         if work[ERROR * LANES + k] <= 1.0:
-            longest = _motion_time(control, work, n, memory, k)
-            error = _velocity_error(control, work, n, e_v, longest, state, new, k)
+            motion_time = _motion_time(control, work, n, memory, k)
+            error = _velocity_error(control, work, n, e_v, motion_time, state, new, k)
         work[most * LANES + k], work[fine * LANES + k] = error, work[FINE * LANES + k]
-        any_slow = any_slow or error > 1.0
-    if not any_slow:
+        has_large_error = has_large_error or error > 1.0
+    if not has_large_error:
         return
     by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
     matrix = matrix_at(memory, n, s, SYSTEMS)
@@ -526,24 +526,24 @@ def _error_in_slow_directions(settings, control, method_options, s, work):
     solve_lanes(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[most * LANES + k]
-        if work[FINE * LANES + k] == 1.0:  # if the motion is unstable, the solution may be too large
-            longest = _motion_time(control, work, n, memory, k)
-            error = min(error, _velocity_error(control, work, n, e_v, longest, state, new, k))
+        if work[FINE * LANES + k] == 1.0:  # in unstable motion the filtered error may be larger: the smaller one counts
+            motion_time = _motion_time(control, work, n, memory, k)
+            error = min(error, _velocity_error(control, work, n, e_v, motion_time, state, new, k))
         work[FINE * LANES + k] = work[fine * LANES + k]
         if work[most * LANES + k] > 1.0:
             work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
 
 
 @compiled
-def _estimate(settings, control, method_options, A, work):
-    """Store the error estimate, filtered to suppress stiff components and in units of the tolerances, in ERROR."""
+def _estimate_error(settings, control, method_options, A, work):
+    """Store in ERROR the error estimate, in units of the tolerances, with stiff components suppressed by filters."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     offset = newton_options_at(s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
     _embedded_estimate(settings, method_options, A, work, memory)
     copy_vectors(work, e_v, vector_at(memory, n, UNFILTERED), n)
-    _filter(settings, method_options, s, work, memory)
+    _filter_errors(settings, method_options, s, work, memory)
     tests_velocities = method_options[offset + VELOCITIES] == 1.0
     fill_field(work, ERROR, 0.0)
     for j in range(n):
@@ -554,17 +554,17 @@ def _estimate(settings, control, method_options, A, work):
     if tests_velocities:
         return
     copy_vectors(work, e_v, vector_at(memory, n, FILTERED_ONCE), n)
-    _filter(settings, method_options, s, work, memory)
+    _filter_errors(settings, method_options, s, work, memory)
     for k in range(LANES):
         z = method_options[offset + GAMMA0] * work[H * LANES + k]
         error = _filtered_velocity_error(control, work, n, memory, z, state, new, k)
         work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
-    _error_in_slow_directions(settings, control, method_options, s, work)
+    _add_error_in_slow_directions(settings, control, method_options, s, work)
 
 
 @compiled
 def _store_stages(work, memory, n, s):
-    """Copy STAGES of accepted steps to PREVIOUS, which predicts STAGES of the next step, and of parts of this step."""
+    """Copy STAGES of accepted steps to PREVIOUS, the basis of predictions for the next step and within this step."""
     stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
@@ -599,7 +599,7 @@ def step_by_newton(code, settings, control, options, work, status, n_steps, with
     state_from_stages(settings, b, bA, work)
     set_end(work, control)
     if not within:
-        _estimate(settings, control, method_options, A, work)
+        _estimate_error(settings, control, method_options, A, work)
         end_steps(code, settings, control, work, vector_at(memory, n, SUMS))
         judge_steps(options, work, n, a, start, status)
         _store_stages(work, memory, n, s)

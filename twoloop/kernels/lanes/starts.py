@@ -44,7 +44,7 @@ GOLDEN = 0.6180339887498949  # fractional parts of its multiples are irregular s
 
 @merged
 def _subtract_four(work, target, x, dx, y, dy, count):
-    """Do the same as `subtract_products` in four adjacent lanes; `target`, x, y, dx, dy are indices in `work`."""
+    """Apply `subtract_products` to four adjacent lanes; `target`, x, y, dx and dy count numbers, not vectors."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -58,7 +58,7 @@ def _subtract_four(work, target, x, dx, y, dy, count):
 
 @compiled
 def subtract_products(work, target, x, dx, y, dy, count):
-    """Subtract the sum of x_i y_i over `count` vectors from the vector `target`, at offsets x + i dx and y + i dy."""
+    """Subtract from the vector `target` the sum over i < `count` of the products of vectors x + i dx and y + i dy."""
     for k in range(0, LANES, 4):
         _subtract_four(work, target * LANES + k, x * LANES + k, dx * LANES, y * LANES + k, dy * LANES, count)
 
@@ -114,27 +114,27 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
     """
     n_entries = pattern[n_rows] - pattern[0]
     for i in range(n_rows):
-        length = factors + n_entries + i
-        fill_field(work, length, 0.0)
+        reciprocal_norm = factors + n_entries + i
+        fill_field(work, reciprocal_norm, 0.0)
         for e in range(pattern[i], pattern[i + 1]):
             entry = e - pattern[0]
             if moves[pattern[e]] == 1:
                 copy_vectors(work, G + entry, factors + entry, 1)
-                subtract_products(work, length, G + entry, 1, G + entry, 1, 1)
+                subtract_products(work, reciprocal_norm, G + entry, 1, G + entry, 1, 1)
             else:
                 fill_field(work, factors + entry, 0.0)
         for k in range(LANES):
-            square = -work[length * LANES + k]
-            work[length * LANES + k] = 1.0 / np.sqrt(square) if square != 0.0 else 1.0
+            squared_norm = -work[reciprocal_norm * LANES + k]
+            work[reciprocal_norm * LANES + k] = 1.0 / np.sqrt(squared_norm) if squared_norm != 0.0 else 1.0
         for e in range(pattern[i], pattern[i + 1]):
-            _scale(work, factors + e - pattern[0], length)
+            _scale(work, factors + e - pattern[0], reciprocal_norm)
     if n_redundant > 0:
-        _find_redundant(work, pattern, n_rows, n_redundant, row, factors)
+        _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors)
     _cholesky(work, pattern, n_rows, n_redundant, row, factors, LEAST)
 
 
 @compiled
-def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
+def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
     """Store Z, eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one is not below MAX_REDUNDANT."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
@@ -156,7 +156,7 @@ def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
 
 @compiled
 def normalise(work, x, n_rows, scratch):
-    """Scale x (n_rows) to norm 1; set `scratch` to the reciprocal of its previous norm."""
+    """Scale x (n_rows) to norm 1; store the reciprocal of the norm of x on entry in the vector `scratch`."""
     fill_field(work, scratch, 0.0)
     subtract_products(work, scratch, x, 1, x, 1, n_rows)
     for k in range(LANES):
@@ -179,14 +179,14 @@ def _remove_redundant(work, n_rows, n_redundant, Z, x, scratch):
 
 
 @compiled
-def _solve(work, n_rows, gram, x):
-    """Replace x (n_rows) by the solution y of G G^T y = x, with the Cholesky factor at the offset `gram`."""
+def _solve(work, n_rows, factor, x):
+    """Replace x (n_rows) by the solution y of G G^T y = x; `factor`: offset of the Cholesky factor of G G^T."""
     for i in range(n_rows):
-        subtract_products(work, x + i, gram + i * n_rows, 1, x, 1, i)
-        _scale(work, x + i, gram + i * n_rows + i)
+        subtract_products(work, x + i, factor + i * n_rows, 1, x, 1, i)
+        _scale(work, x + i, factor + i * n_rows + i)
     for i in range(n_rows - 1, -1, -1):
-        subtract_products(work, x + i, gram + (i + 1) * n_rows + i, n_rows, x + i + 1, 1, n_rows - 1 - i)
-        _scale(work, x + i, gram + i * n_rows + i)
+        subtract_products(work, x + i, factor + (i + 1) * n_rows + i, n_rows, x + i + 1, 1, n_rows - 1 - i)
+        _scale(work, x + i, factor + i * n_rows + i)
 
 
 @compiled
@@ -216,13 +216,14 @@ def least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # largest residual of a constraint that holds, in rounding errors of its terms
-# largest difference between the projection of a displaced state and its prediction by C_q, relative to the displacement
+# difference between the projection of displaced positions and its prediction by C_q, relative to the displacement,
+# above which another assembly may be as near
 MAX_CURVATURE = 0.25
 SINGULAR = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
 WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `places_of_starts`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
-# other guesses for the same start: each is displaced from the projected positions by a multiple of the projection's
-# change of the first guess, and by a multiple of the weakest direction
+# displacements of other guesses from the projected positions: factors of `correction`, the change from the first guess
+# to the projected positions, and of the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
@@ -243,33 +244,34 @@ def places_of_starts(n, n_rows, n_entries, n_redundant):
     weakest = correction + n
     displacement = weakest + n
     row = displacement + n
-    at_found = row + n
-    size = n_entries + n_rows * (1 + n_rows + n_redundant) + 1
-    return G, x, change, nearest, correction, weakest, displacement, row, at_found, at_found + size, at_found + 2 * size
+    at_nearest = row + n
+    n_factors = n_entries + n_rows * (1 + n_rows + n_redundant) + 1
+    at_new = at_nearest + n_factors
+    return G, x, change, nearest, correction, weakest, displacement, row, at_nearest, at_new, at_new + n_factors
 
 
-_places = merged(places_of_starts)
+_offsets = merged(places_of_starts)
 
 
 @merged
-def _largest(work, offset, count, k):
+def _largest_value(work, offset, count, k):
     """Return the largest absolute value of `count` numbers in lane k, or NaN if one of the numbers is NaN."""
     largest = 0.0
     for j in range(count):
-        size = abs(work[(offset + j) * LANES + k])
-        largest = largest if size <= largest else size  # NaN remains NaN
+        magnitude = abs(work[(offset + j) * LANES + k])
+        largest = largest if magnitude <= largest else magnitude  # NaN remains NaN
     return largest
 
 
 @merged
 def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
     """Return whether every constraint holds in lane k, up to rounding errors of its terms."""
-    allowed = ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest(work, new, n, k)
+    tolerance = ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, new, n, k)
     for i in range(n_rows):
         off, terms = abs(work[(C + i) * LANES + k]), 0.0
         for e in range(pattern[i], pattern[i + 1]):
             terms += abs(work[(G + e - pattern[0]) * LANES + k])
-        if off != 0.0 and not off <= allowed * terms:
+        if off != 0.0 and not off <= tolerance * terms:
             return False
     return True
 
@@ -279,7 +281,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
     """Project the positions of NEW onto the constraints by steps of least change; clear RUNNING in lanes that fail."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, row, _, at_new, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    G, x, change, _, _, _, _, row, _, at_new, _ = _offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + at_new
     for k in range(LANES):
         work[LEFT_TO_MOVE * LANES + k] = work[RUNNING * LANES + k]
@@ -293,7 +295,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
         for k in range(LANES):
             if work[LEFT_TO_MOVE * LANES + k] == 0.0:
                 continue
-            if work[FINE * LANES + k] == 0.0 or not _largest(work, change, n, k) < np.inf:
+            if work[FINE * LANES + k] == 0.0 or not _largest_value(work, change, n, k) < np.inf:
                 work[LEFT_TO_MOVE * LANES + k] = work[RUNNING * LANES + k] = 0.0
                 continue
             for j in range(n):
@@ -311,12 +313,12 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 
 @compiled
-def _change_velocities(code, settings, control, pattern, moves, work):
-    """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` there."""
+def _project_velocities(code, settings, control, pattern, moves, work):
+    """Project the velocities of NEW so that C_q v + C_t = 0; store `factor_gram` of NEW at the offset `at_nearest`."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, row, at_found, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + at_found
+    G, x, change, _, _, _, _, row, at_nearest, _, _ = _offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + at_nearest
     fill_field(work, FINE, 1.0)
     code.rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
@@ -330,7 +332,7 @@ def _change_velocities(code, settings, control, pattern, moves, work):
         for j in range(n * LANES):
             work[(new + n) * LANES + j] += work[change * LANES + j]
     for k in range(LANES):
-        if work[FINE * LANES + k] == 0.0 or not _largest(work, new, 2 * n, k) < np.inf:
+        if work[FINE * LANES + k] == 0.0 or not _largest_value(work, new, 2 * n, k) < np.inf:
             work[RUNNING * LANES + k] = 0.0
 
 
@@ -347,25 +349,25 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
         normalise(work, x, n_rows, scratch)
         along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest)
     normalise(work, x, n_rows, scratch)
-    least = SINGULAR if n_redundant == 0 else MAX_REDUNDANT * n_rows
+    min_eigenvalue = SINGULAR if n_redundant == 0 else MAX_REDUNDANT * n_rows
     for k in range(LANES):
-        if not work[scratch * LANES + k] > least:  # `scratch` is now the smallest eigenvalue
+        if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` is now the smallest eigenvalue
             work[RUNNING * LANES + k] = 0.0
-        factor = _largest(work, correction, n, k) / max(_largest(work, weakest, n, k), LEAST)
+        factor = _largest_value(work, correction, n, k) / max(_largest_value(work, weakest, n, k), LEAST)
         for j in range(n):
             work[(weakest + j) * LANES + k] *= factor
 
 
 @compiled
-def _compare_with_other_starts(code, settings, control, pattern, moves, work):
-    """Clear RUNNING in lanes in which the projection of another guess differs much from its prediction by C_q."""
+def _check_other_guesses(code, settings, control, pattern, moves, work):
+    """Clear RUNNING in lanes in which the projection of one of OTHER_GUESSES is far from its prediction by C_q."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    _, x, change, nearest, correction, weakest, displacement, _, at_found, _, _ = _places(
+    _, x, change, nearest, correction, weakest, displacement, _, at_nearest, _, _ = _offsets(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
     x, change, nearest, correction = memory + x, memory + change, memory + nearest, memory + correction
-    weakest, displacement, factors = memory + weakest, memory + displacement, memory + at_found
+    weakest, displacement, factors = memory + weakest, memory + displacement, memory + at_nearest
     _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest)
     for own, other in OTHER_GUESSES:
         for j in range(n * LANES):
@@ -378,12 +380,12 @@ def _compare_with_other_starts(code, settings, control, pattern, moves, work):
         # the component of the displacement that is normal to the constraints
         along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
-            apart, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest(work, nearest, n, k)
+            distance, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, nearest, n, k)
             for j in range(n):
                 m = j * LANES + k
                 expected = work[nearest * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
-                apart = max(apart, abs(work[new * LANES + m] - expected))
-            if not apart <= MAX_CURVATURE * _largest(work, displacement, n, k) + rounding:
+                distance = max(distance, abs(work[new * LANES + m] - expected))
+            if not distance <= MAX_CURVATURE * _largest_value(work, displacement, n, k) + rounding:
                 work[RUNNING * LANES + k] = 0.0
 
 
@@ -399,7 +401,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])
-    _, _, _, nearest, correction, _, _, row, _, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    _, _, _, nearest, correction, _, _, row, _, _, _ = _offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     fill_field(work, AHEAD, control[T0])
     for j in range(n):
         fill_field(work, memory + row + j, 0.0)
@@ -412,13 +414,13 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
             for i in range(numbers.shape[1]):
                 work[(own + i) * LANES + k] = numbers[run, i]
         _gauss_newton(code, settings, control, pattern, moves, work)
-        _change_velocities(code, settings, control, pattern, moves, work)
+        _project_velocities(code, settings, control, pattern, moves, work)
         copy_vectors(work, new, memory + nearest, n)
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
             for j in range(n):
                 work[(memory + correction + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
-        _compare_with_other_starts(code, settings, control, pattern, moves, work)
+        _check_other_guesses(code, settings, control, pattern, moves, work)
         for k in range(min(LANES, n_runs - first)):
             fine[first + k] = int(work[RUNNING * LANES + k])
             for j in range(n):
@@ -440,11 +442,11 @@ def _relative_residual(value, allowed):
 
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, f8, INTEGERS, TABLE, STATES, STATES, TABLE, VECTOR, VECTOR))
-def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, states_v, ends, scratch, worst):
-    """Store in `worst` (n_rows,) the largest residual of the equations at the end of each run, over the allowed one.
+def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states_v, ends, scratch, worst):
+    """Store in `worst` (n_rows,) the largest residual of the equations at the end of each run, relative to its limit.
 
-    The equations are C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q. The allowed residual is `share`
-    times the terms of the equation, and for constraints also the effect of errors `atol` of coordinates and velocities.
+    The equations are C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q. The limit is `rtol` times the
+    terms of the equation, and for constraints also the effect of errors `atol` of coordinates and velocities.
     sizes : n, n_c and the first index in p of the parameters; runs : (n_rows,) index of the run of each row, or -1 to
     omit the row; parameters : (n_runs, n_p); states_q, states_v : (n_rows, n, n_t), where the last time is the end;
     ends : (n_rows, n + n_c) a and lam at the end; scratch : (n (n + 3) + n_c (n + 3),) overwritten.
@@ -461,7 +463,7 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
     )
     offset += 3 * n_c
     q, v, last = scratch[offset : offset + n], scratch[offset + n : offset + 2 * n], states_q.shape[2] - 1
-    gamma_given = f.flags[GAMMA_GIVEN] == 1
+    has_gamma = f.flags[GAMMA_GIVEN] == 1
     for k in range(runs.size):
         if runs[k] < 0:
             continue
@@ -478,7 +480,7 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
         f.constraint(t, q, f.p, C)
         f.jacobian(t, q, f.p, G)
         f.constraint_rate(t, q, f.p, rate)
-        if gamma_given:
+        if has_gamma:
             f.gamma(t, q, v, f.p, gamma)
         for i in range(n_c):
             row, sum_v, off, terms = 0.0, rate[i], -gamma[i], abs(gamma[i])
@@ -487,11 +489,11 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
                 sum_v += G[i, j] * v[j]
                 off += G[i, j] * a[j]
                 terms += abs(G[i, j] * a[j])
-            largest = max(largest, _relative_residual(C[i], row * (share * largest_q + atol)))
-            largest = max(largest, _relative_residual(sum_v, row * (share * largest_v + atol) + share * abs(rate[i])))
-            if gamma_given:
-                largest = max(largest, _relative_residual(off, share * terms + row * atol))
-        size, apart = 0.0, 0.0
+            largest = max(largest, _relative_residual(C[i], row * (rtol * largest_q + atol)))
+            largest = max(largest, _relative_residual(sum_v, row * (rtol * largest_v + atol) + rtol * abs(rate[i])))
+            if has_gamma:
+                largest = max(largest, _relative_residual(off, rtol * terms + row * atol))
+        largest_force, residual = 0.0, 0.0
         for j in range(n):
             total, largest_term = -Q[j], abs(Q[j])
             for m in range(n):
@@ -500,18 +502,18 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
             for i in range(n_c):
                 term = G[i, j] * lam[i]
                 total, largest_term = total + term, max(largest_term, abs(term))
-            size = max(size, largest_term)
-            apart = max(apart, abs(total)) if np.isfinite(total) else np.inf
-        largest = max(largest, _relative_residual(apart, share * size))
+            largest_force = max(largest_force, largest_term)
+            residual = max(residual, abs(total)) if np.isfinite(total) else np.inf
+        largest = max(largest, _relative_residual(residual, rtol * largest_force))
         worst[k] = largest
 
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, TABLE, TABLE, TABLE, VECTOR, VECTOR))
-def constraint_residuals(f, sizes, t, slow, parameters, q, v, scratch, worst):
+def constraint_residuals(f, sizes, t, min_speed, parameters, q, v, scratch, worst):
     """Store in `worst` the largest relative residual of C = 0 and C_q v + C_t = 0 for each state, a row of q and v.
 
-    Residuals are relative to the sum of a row of |C_q| times the largest entry of q or v. slow : lower bound of the
-    largest velocity in this product, for states at rest; scratch : (n_c (n + 2),) overwritten.
+    Residuals are relative to the sum of a row of |C_q| times the largest entry of q or v. min_speed : lower bound of
+    the largest velocity in this product, for states at rest; scratch : (n_c (n + 2),) overwritten.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     C, rate, G = scratch[:n_c], scratch[n_c : 2 * n_c], scratch[2 * n_c :].reshape((n_c, n))
@@ -522,7 +524,7 @@ def constraint_residuals(f, sizes, t, slow, parameters, q, v, scratch, worst):
         f.constraint(t, q[k], f.p, C)
         f.jacobian(t, q[k], f.p, G)
         f.constraint_rate(t, q[k], f.p, rate)
-        largest_q, largest_v, worst[k] = 0.0, slow, 0.0
+        largest_q, largest_v, worst[k] = 0.0, min_speed, 0.0
         for j in range(n):
             largest_q, largest_v = max(largest_q, abs(q[k, j])), max(largest_v, abs(v[k, j]))
         for i in range(n_c):
