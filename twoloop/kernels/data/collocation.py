@@ -7,8 +7,8 @@ numbers: one number for each unknown node, or one for each of eight steps that a
 LANES = 8  # numbers in a group of lanes
 ORDER = 12.0  # the error estimate is proportional to this power of the step size
 NOISE = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
-# results of the iteration for the stages. REFUSED: the step is rejected. GUESSED: the step size was a guess, and must
-# be replaced by another one. NOT_COMPUTED: accelerations at the nodes could not be computed
+# codes: how the iteration of the stages ended. REFUSED: the step is rejected. GUESSED: the step size was a guess, and
+# must be replaced by another one. NOT_COMPUTED: accelerations at the nodes could not be computed
 CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
 
 (
@@ -20,17 +20,17 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     CURRENT,  # index (0 or 1) of the polynomial of the last accepted step
     TRIED,  # 1: the other polynomial is that of the step just attempted
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
-    KEPT_DEGREE,  # value of DEGREE before a step was rejected, to be restored; 0: no step was rejected
+    KEPT_DEGREE,  # value of DEGREE before a step was rejected, which a later step restores; 0: no step was rejected
     MAY_GUESS,  # 1: the step size is a guess: try another one if the contraction is far from its target
-    CAREFUL,  # number of further steps that use the elimination that begins with M
+    CAREFUL,  # number of next steps that use the elimination that begins with M
     STARTS,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
-    LIMITED,  # number of steps whose size convergence limited, minus the number of other steps; at least 0
+    LIMITED,  # number of steps whose size was limited by the convergence, minus the number of other steps; at least 0
     FAILURES,  # twice the number of steps that did not converge, minus the number of accepted steps; at least 0
     DEFECT,  # largest defect between nodes, relative to the allowed defect; -1: not evaluated
     RHO,  # contraction by a sweep: ratio of successive changes of the velocities
     SWEEPS,  # number of sweeps in the step
-    TARGETED,  # target number of sweeps
+    TARGETED,  # number of sweeps for which the next step size is chosen
     CHANGE,  # change of velocities by the last sweep, relative to the tolerances
     ERROR,  # error of the step, relative to the tolerances
     CURVED,  # largest Legendre coefficient of degree 5 or 6 of the accelerations, relative to the tolerances
@@ -39,7 +39,7 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR_OF_DEFECT,  # ratio of the next step size to this one that the defect allows
     ALLOWED_H,  # step size that the error would have allowed in the last step, s
     SIZE,  # largest sum of a velocity and its change in the step, relative to the tolerances
-    STRICTER,  # ratio by which tolerances of the coordinates that are not iterated are stricter
+    STRICTER,  # ratio of the largest of WEIGHTS to the largest of those of iterated coordinates
 ) = range(28)
 # offsets of the arrays that follow the scalars
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE

@@ -58,15 +58,15 @@ class Work(NamedTuple):
     W: Any  # (r_v, n_q) rows G M^-1 of the independent rows
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
-    D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T, then the dependent velocities if v_i = 0; columns in elimination order
+    D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T; last row: dependent velocities for v_i = 0; columns in elimination order
     Gx: Any  # (n_c + n_a, n_q) C_q and A at a displaced position (for Gamma by differences); scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) value of G from which S and W were computed, for constant M; NaN: not computed yet
     pattern: Any  # (n_c + n_a, n_q) 1 where G has had a nonzero entry, else 0
     mass_pattern: Any  # (n_q, n_q) 1 where M has had a nonzero entry, else 0; empty without the augmented form
-    places: Any  # index of the first entry of each row of G (n_c + n_a + 1), then the columns of the entries
+    places: Any  # (n_c + n_a + 1) index of the first entry of each row of G, then the columns of all entries
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the present step, and with the step tried before
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
-    changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b ahead, see discontinuities.py
+    changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b at later times, see discontinuities.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
@@ -92,10 +92,10 @@ class Work(NamedTuple):
     right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix, and scratch
     order: Any  # (n_q) scratch: column order of the full pivoting
     row_order: Any  # (n_c + n_a) scratch: row order of the full pivoting
-    counters: Any  # (N_COUNTERS) see indices.py
+    counters: Any  # (N_COUNTERS) numbers of steps, iterations and evaluations in the run, see indices.py
     lapack: Any  # addresses of band.ROUTINES; 0 where linear algebra is dense
     predicted: Any  # (r) dependent positions predicted by the integration formula, before they are projected
-    notes: Any  # (N_NOTES) see indices.py
+    notes: Any  # (N_NOTES) values that one kernel stores for another, see indices.py
     nodes: Any  # results of the operations of a traced program
     matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
     # the fields from here to `solutions` are those of the static form, and are empty in other forms; N is n_q + n_c
@@ -167,20 +167,20 @@ KIT = Reference(
 )
 for _name, _kind in KINDS.items():
     KIT.add_function(_name, _kind.signature)
-# (kit, work, task, t, q, v, tolerance, a, lam) -> code, see inner_loop.py
+# signature of an inner loop: (kit, work, task, t, q, v, tolerance, a, lam) -> code, see inner_loop.py
 INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
 for _name in ("inner", "general"):
     KIT.add_function(_name, INNER)
-# (kit, work, options, memory, t, h, tolerances, state, new_state) -> Attempt
+# signature of `Step.attempt`: (kit, work, options, memory, t, h, tolerances, state, new_state) -> Attempt
 ATTEMPT = types.NamedTuple((i8, f8, f8), Attempt)(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
 for _name in ("attempt", "attempt_first", "attempt_second"):
     KIT.add_function(_name, ATTEMPT)
-# (kit, work, options, memory, tolerances, accepted)
+# signature of `Step.settle`: (kit, work, options, memory, tolerances, accepted) -> None
 SETTLE = types.void(KIT, WORK, VECTOR, VECTOR, VECTOR, types.boolean)
 for _name in ("settle", "settle_first", "settle_second"):
     KIT.add_function(_name, SETTLE)
-# (kit, work, options, memory, tolerances, control, clock, goal, state, new_state, times, states, steps)
-# -> number of steps taken
+# signature of `Step.many`: (kit, work, options, memory, tolerances, control, clock, goal, state, new_state, times,
+# states, steps) -> number of steps
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
@@ -238,18 +238,18 @@ def _imports(text: str) -> set[str]:
 @cache
 def stamp(module: str) -> str:
     """Return a digest of the callback signatures and of all sources that a module, such as "steps.stages", needs."""
-    known: set[str] = set()
+    modules: set[str] = set()
     pending = {module}
     while pending:
-        known |= pending
-        pending = {name for each in pending for name in _imports(_text(each)) if name not in known}
+        modules |= pending
+        pending = {name for each in pending for name in _imports(_text(each)) if name not in modules}
     digest = hashlib.sha256(repr((KIT.functions, GIVEN)).encode())
-    for each in sorted(known):
+    for each in sorted(modules):
         digest.update(_text(each).encode())
     return digest.hexdigest()
 
 
-def _module(function: Callable[..., Any]) -> str:
+def _module_name(function: Callable[..., Any]) -> str:
     """Return the name of the module that defines a kernel, such as "steps.stages"."""
     path = Path(inspect.getfile(function)).with_suffix("")
     return ".".join(path.relative_to(_FOLDER).parts) if path.is_relative_to(_FOLDER) else path.stem
@@ -265,7 +265,7 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
         return compile_cached(
             function,
             signature,
-            (stamp(_module(function)), ""),
+            (stamp(_module_name(function)), ""),
             announcement=_ANNOUNCEMENT,
             pipeline_class=VectorizingCompiler if vectorized else KernelCompiler,
             **OPTIONS,
@@ -300,7 +300,7 @@ inlined = _helper(inline="always")  # inlined by numba; only a helper of this ki
 merged = _helper(forceinline=True)
 
 
-NONE = np.zeros(0)  # empty data of generated functions
+NO_NUMBERS = np.zeros(0)  # data of generated functions that read none
 
 
 class Kit:
@@ -327,8 +327,8 @@ class Kit:
     ):
         self.__dict__.update(functions._asdict())
         self.functions, self.inner, self.general, self.own = functions, inner, general, own
-        self.numbers = NONE if numbers is None else numbers
-        self.own_numbers = NONE if own_numbers is None else own_numbers
+        self.numbers = NO_NUMBERS if numbers is None else numbers
+        self.own_numbers = NO_NUMBERS if own_numbers is None else own_numbers
         self.attempt, self.settle, self.attempt_many = step or Step()
         self.attempt_first, self.settle_first, _ = first or Step()
         self.attempt_second, self.settle_second, _ = second or Step()
@@ -376,7 +376,7 @@ def finite(A):
 
 @compiled
 def not_finite(notes, kind, t, q):
-    """Store in `notes` that callback `kind` (-1 if q is not finite) returned a non-finite value; return NOT_FINITE."""
+    """Store t and `kind` in `notes`: the callback that is not finite, or -1 if q is not finite; return NOT_FINITE."""
     notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
     notes[FAULT_TIME] = t
     return NOT_FINITE
@@ -399,7 +399,7 @@ def faulty_callback(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-SLACK = 1e-9  # amount, relative to GAP, by which a step may be longer than GAP because of rounding
+SLACK = 1e-9  # excess of a step size over GAP, relative to GAP, that counts as a rounding error
 
 
 @merged

@@ -59,17 +59,17 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known yet
     ORIENTATION_NEW,  # sign of det C_qd at the end of the attempted step; 0: not known yet
     FAULT_KIND,  # index in Functions of the callback that returned a value that is not finite; -1: none known
-    FAULT_TIME,  # time at which a callback returned a value that is not finite
+    FAULT_TIME,  # time at which a callback returned a value that is not finite, s
     GAMMA_REQUIRED,  # required relative accuracy of Gamma by differences, see evaluation/constraints.py
-    GAMMA_STEP_RATIO,  # step of the differences for Gamma, relative to largest_difference_step
+    GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to largest_difference_step
     GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_STEP_RATIO was chosen
     GAMMA_SCALE,  # largest entry of Gamma so far
-    REUSE,  # largest last correction of positions after which the factors of C_qd are not renewed
+    REUSE,  # the factors of C_qd are not renewed if the last correction of positions is at most this
     ROUNDED,  # rounding error of positions: value of REUSE for states that may be accepted
     GENERATION,  # number of partitions so far
     RANK,  # rank of C_q, if it differs from the rank for which the workspace is allocated
     RANK_V,  # rank of C_q and A together, if it differs from the rank for which the workspace is allocated
-    CONTRADICTION,  # index of a row that was considered redundant but is violated
+    CONTRADICTION,  # index of a violated row that was considered redundant
     PIVOT,  # smallest pivot of the last full pivoting, with rows scaled to 1: small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check for singular positions
     NEAR_NOW,  # 1: the last check found a singular position nearby; 2: the next check must renew the partition first
@@ -82,8 +82,8 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     LARGEST_DEFECT,  # largest value of DEFECT in the accepted steps
     UNCHECKED,  # number of accepted steps for which no defect was evaluated
     WIDEST_GAP,  # longest time between two evaluations within accepted steps, s
-    KINK_BEFORE,  # time of the last known jump of C_t or b
-    KINK_AFTER,  # time of the next known jump of C_t or b
+    KINK_BEFORE,  # time of the last known jump of C_t or b, s
+    KINK_AFTER,  # time of the next known jump of C_t or b, s
     LEANING,  # largest coefficient of an independent row in a redundant one, when this partition was chosen
     SMALLEST,  # static form: smallest squared sine of the angle of a row to previous rows, see linalg/sparse_ldl.py
     TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
@@ -100,7 +100,7 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     ATOL,  # first index of the absolute tolerances: one for each coordinate and its velocity
 ) = range(6)
 LONGEST_UNSEEN = 0.01  # value of GAP, relative to the duration of the run
-REPORTED_ERROR = 30.0  # error of velocities beside a singular position, in tolerances, above which it is reported
+REPORTED_ERROR = 30.0  # largest error of velocities near a singular position, in tolerances, that is not reported
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
 # kinds of intervals between accepted states, for dense output: which values of the states the polynomials interpolate
