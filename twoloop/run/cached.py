@@ -74,7 +74,7 @@ FIRST_CHUNKS = 4
 CALLS_SKIPPED = 16  # number of calls that do not use an integrator after a callback raised an exception in it
 STEP_FIELDS = (*OF_STEPS, "stats")  # fields of a result that are computed from the array of steps
 OTHER_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # CPU time of the last run, s, below which elapsed instead of CPU time is recorded: a faster clock
+SHORT_RUN = 1e-3  # CPU time of the last run, s, below which elapsed time is recorded, as reading CPU time takes long
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
 
@@ -82,13 +82,13 @@ class Output(NamedTuple):
     """Requested output of a cached run."""
 
     times: Array | None  # output times; None: the ends of all steps
-    at_ends: bool  # whether all output times are ends of the run
+    at_ends: bool  # whether each output time is the start or the end of the run
     dense: bool  # whether `sol` is requested, too
     time_limit: float | None  # limit of elapsed time, s
 
     @property
     def between(self) -> Array | None:
-        """Output times if states must be interpolated at them, else None."""
+        """Output times if they require interpolation, else None."""
         return None if self.at_ends else self.times
 
     def request(self, run: Run) -> OutputRequest:
@@ -151,7 +151,7 @@ class CachedIntegrator:
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.between = OutputInterpolation(run)
         self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether generated code is called
-        self.independent = self.arrays.start_rows.tobytes()  # the independent rows of `run_fields`
+        self.independent = self.arrays.start_rows.tobytes()  # bytes of the indices of independent rows
         self.redundancy = {self.independent: (run.redundant, run.rows_warning)}
 
     @staticmethod
@@ -379,7 +379,7 @@ RECHECK_PIVOT = 0.1
 
 
 def first_chunk(run: Run) -> int:
-    """Return the largest number of attempted steps in the first chunk, which is its largest number of states, too."""
+    """Return the largest number of attempted steps, which is the largest number of states, in the first chunk."""
     return max(LANES, run.chunk * (FIRST_CHUNKS if run.plan.stable_to is None else 1))
 
 
@@ -577,7 +577,7 @@ def _trace_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
-    """Cache a setup for systems that differ in their parameters, when the second of these systems is integrated."""
+    """Cache a SharedSetup for systems that differ in their parameters, once the second of them is integrated."""
     key, functions, cached = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
     if key not in cached:
         system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {key: functions}
@@ -595,7 +595,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a copy of a cached run at another start; None if this start needs other code or another form."""
+    """Return a copy of a cached run at another start; None if other code or another form of algebra is needed."""
     _check_start(system, t0, q0, v0, options.check_derivatives)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None

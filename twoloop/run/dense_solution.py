@@ -30,11 +30,11 @@ Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
 
 MAX_DIVIDED = 512  # largest number of intervals whose interior states are cached
-MAX_ACCURATE = 65536  # largest number of intervals in the cache of intervals with accurate polynomials
+MAX_ACCURATE = 65536  # largest number of intervals that are cached as accurate without interior states
 # largest accepted residual of a polynomial in the constraints and the equations of motion, relative to the tolerances;
-# MAX_ERROR_ACROSS: in steps across singular positions, where the residual was a tenth of the error of velocities
+# MAX_ERROR_ACROSS in steps across singular positions, where errors of velocities were ten times the residual
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
-N_REPAIR = 4  # number of steps into which an interval is divided if its polynomial has a larger residual
+N_REPAIR = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
 
 
 class Table(NamedTuple):
@@ -73,7 +73,7 @@ class Interpolator:
     ranks : (int, int)
         Rank of C_q, and rank of [C_q; A].
     plans : dict, optional
-        By kind of interval: the plan with which such an interval is divided into `plan.parts` equal steps. Intervals of
+        By kind of interval, the plan that divides intervals of this kind into `plan.parts` equal steps. Intervals of
         other kinds are not divided.
     """
 
@@ -100,7 +100,10 @@ class Interpolator:
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
-        self.failures, self.warns = 0, True  # number of times at which the last call failed; whether failures warn
+        self.failures, self.warns = (
+            0,
+            True,
+        )  # number of output times at which the last call failed; whether failures warn
         # times and states that divide an interval, including its ends, by the time at which the interval begins
         self.filled: dict[float, tuple[Array, Array]] = {}
         # memory arrays of steps across singular positions, with their polynomials, by the first times of the intervals
@@ -132,7 +135,7 @@ class Interpolator:
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
 
     def begin(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
-        """Reset the interpolator for another run with the same kits; `pattern`: 1 at entries of constraint rows."""
+        """Reset the interpolator for another run with the same kits; `pattern`: 1 at entries of [C_q; A], else 0."""
         self.arguments = (system, t0, row.copy(), *self.arguments[3:])
         self.system, self.judges = system, True
         self.filled, self.across, self.accurate = {}, {}, set()
@@ -176,9 +179,9 @@ class Interpolator:
         undivided = []
         for block in _blocks(groups):
             self._divide_where_needed(table, block)
-            divided, own, rest = self._split_divided(table, block)
-            failures += self._interpolate(divided, own, times, out)
-            undivided.append(rest)
+            divided, divided_groups, other_groups = self._split_divided(table, block)
+            failures += self._interpolate(divided, divided_groups, times, out)
+            undivided.append(other_groups)
         failures += self._interpolate(table, np.concatenate(undivided), times, out)
         self._record_failures(failures, len(times))
         return out
@@ -188,8 +191,8 @@ class Interpolator:
         groups = _groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, indices.END_TIME] = 1
         self._divide_where_needed(table, groups)
-        divided, own, rest = self._split_divided(table, groups)
-        source, group = (divided, own) if len(own) else (table, rest)
+        divided, divided_groups, other_groups = self._split_divided(table, groups)
+        source, group = (divided, divided_groups) if len(divided_groups) else (table, other_groups)
         time, out = np.empty(1), np.empty((1, 2 * self.system.n_q))
 
         def row(t: float) -> Array:
@@ -205,7 +208,7 @@ class Interpolator:
             _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
     def _interpolate(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
-        """Store rows [q, v] at the times of the groups in `out`; return the number of times without a valid state."""
+        """Store rows [q, v] at the times of the groups in `out` (n, 2 n_q); return the number of failed projections."""
         states = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.scratch, out)
         failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *states, *rest))
@@ -215,7 +218,7 @@ class Interpolator:
         return failures
 
     def _divide_where_needed(self, table: Table, groups: Groups) -> None:
-        """Cache interior states of each interval that is not cached yet, unless it is accurate without such states."""
+        """Compute and cache interior states of each interval whose polynomial is not accurate without them."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
         is_new = np.array([t not in self.accurate and t not in self.filled for t in begins])
         if not self.judges or not is_new.any():
@@ -227,15 +230,15 @@ class Interpolator:
             self.accurate.clear()
         groups = groups[is_new & (groups[:, indices.KIND] != indices.JUMP)]
         for kind, plan in self.plans.items():
-            of_kind = groups[:, indices.KIND] == kind
-            self.filled.update(self._divide(table, plan, self.kits[kind], groups[of_kind, indices.FIRST_OWN]))
+            has_kind = groups[:, indices.KIND] == kind
+            self.filled.update(self._divide(table, plan, self.kits[kind], groups[has_kind, indices.FIRST_OWN]))
         for i in groups[:, indices.FIRST_OWN].tolist():
             if (memory := self.across.get(float(table.t[i]))) is not None:
                 self.filled[float(table.t[i])] = self._states_of_crossing(table, i, memory)
         is_divided = np.array([t in self.filled for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool)
-        divided, own, rest = self._split_divided(table, groups)
+        divided, own_groups, undivided = self._split_divided(table, groups)
         errors = np.zeros(len(groups))
-        errors[is_divided], errors[~is_divided] = self._errors(divided, own), self._errors(table, rest)
+        errors[is_divided], errors[~is_divided] = self._errors(divided, own_groups), self._errors(table, undivided)
         # if the plan for this kind of interval failed to divide it, the interval is too long for a polynomial
         errors[~is_divided & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
         is_accurate = errors <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
@@ -251,9 +254,10 @@ class Interpolator:
         return out
 
     def _repair(self, table: Table, group: Groups, smallest: float) -> None:
-        """Cache other states for the polynomial of an interval if they reduce its residual, which is `smallest` so far.
+        """Cache other states for the polynomial of an interval if they reduce its residual, `smallest` on entry.
 
-        Three sets are tried: the states of a step across a singular position, those of N_REPAIR steps, the ends alone.
+        Three sets are tried: the states of a step across a singular position, the states of N_REPAIR steps, and only
+        the two ends of the interval.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
@@ -276,7 +280,7 @@ class Interpolator:
             self.accurate.add(begin)
 
     def _cross_interval(self, table: Table, i: int) -> tuple[Array, Array] | None:
-        """Return times and states in interval i, computed by a step across a singular position; None if it fails."""
+        """Return times and states in interval i, computed by a crossing step, see crossing_step.py; None on failure."""
         from twoloop.kernels.steps import crossing_step as kernels
 
         if self.static is not None:
@@ -293,7 +297,7 @@ class Interpolator:
         return self._states_of_crossing(table, i, plan.memory) if succeeded else None
 
     def _states_of_crossing(self, table: Table, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states in interval i, by the polynomial in `memory` of a step across a singular position."""
+        """Return times and states in interval i from the polynomial of a crossing step, which is stored in `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
@@ -305,13 +309,13 @@ class Interpolator:
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
         """Return plan and kit of N_REPAIR steps that divide an interval of this kind with an inaccurate polynomial."""
-        stiff = kind == indices.VELOCITIES
-        if stiff not in self.repairs:
+        is_stiff = kind == indices.VELOCITIES
+        if is_stiff not in self.repairs:
             from twoloop.methods.dop853 import DOP853
             from twoloop.methods.runge_kutta import RungeKutta
             from twoloop.methods.tableaux import radau_iia
 
-            method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
+            method = RungeKutta(radau_iia(3), outer="newton") if is_stiff else DOP853()
             atol = float(self.tolerances[ATOL:].min())
             plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=N_REPAIR)
             q0 = self.arguments[2][: self.system.n_q]
@@ -320,45 +324,45 @@ class Interpolator:
                 if self.static is not None:
                     self.static = static_form(self.system, self.arguments[1], q0, *self.plans.values(), plan)
                 self._prepare()
-            self.repairs[stiff] = plan, kit_of(self.system, self.arguments[1], q0, plan, self.static)
-        return self.repairs[stiff]
+            self.repairs[is_stiff] = plan, kit_of(self.system, self.arguments[1], q0, plan, self.static)
+        return self.repairs[is_stiff]
 
     def _split_divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
-        """Return a table of cached interior states, the groups of these intervals in it, and the other groups."""
+        """Return a Table of the cached interior states, the groups of its intervals, and the groups without states."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
-        filled = np.array([t in self.filled for t in begins], dtype=bool)
+        is_divided = np.array([t in self.filled for t in begins], dtype=bool)
         pairs = [self.filled[t] for t in begins if t in self.filled]
-        own = groups[filled]
+        own_groups = groups[is_divided]
         if not pairs:
-            return Table(table.t[:0], table.states[:0], table.kinds), own, groups
+            return Table(table.t[:0], table.states[:0], table.kinds), own_groups, groups
         t, states = zip(*pairs, strict=True)
         sizes = np.array(list(map(len, t)), dtype=np.int64)
-        own[:, indices.LAST_OWN] = own[:, indices.HIGH] = np.cumsum(sizes) - 1
-        own[:, indices.FIRST_OWN] = own[:, indices.LOW] = own[:, indices.LAST_OWN] - sizes + 1
-        return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
+        own_groups[:, indices.LAST_OWN] = own_groups[:, indices.HIGH] = np.cumsum(sizes) - 1
+        own_groups[:, indices.FIRST_OWN] = own_groups[:, indices.LOW] = own_groups[:, indices.LAST_OWN] - sizes + 1
+        return Table(np.concatenate(t), np.concatenate(states), table.kinds), own_groups, groups[~is_divided]
 
     def _divide(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
-        """Divide intervals into `plan.parts` steps, or fewer if steps fail; return (times, states) by first times."""
+        """Divide intervals into `plan.parts` steps, or fewer if steps fail; return {first time: (times, states)}."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
         vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
-        filled = {}
+        interior_states = {}
         for parts in range(plan.parts, 1, -1):
             if len(intervals) == 0:
                 break
-            rows = parts + 1
-            out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
+            n_states = parts + 1
+            out_t, out = np.empty(n_states * len(intervals)), np.empty((n_states * len(intervals), 3 * n))
             entry_point(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
-            times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
-            filled_in = np.isfinite(times[:, 0])
+            times, states = out_t.reshape(-1, n_states), out.reshape(-1, n_states, 3 * n)
+            succeeded = np.isfinite(times[:, 0])
             begins = times[:, 0].tolist()
-            filled.update({begins[k]: (times[k], states[k]) for k in filled_in.nonzero()[0].tolist()})
-            intervals = intervals[~filled_in]
-        return filled
+            interior_states.update({begins[k]: (times[k], states[k]) for k in succeeded.nonzero()[0].tolist()})
+            intervals = intervals[~succeeded]
+        return interior_states
 
     def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
-        """Yield the interior states of all divided intervals, in blocks to be stored in a file; `keep` restores them.
+        """Yield the interior states of all divided intervals, in blocks, for a file; `keep` restores these states.
 
         A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q) of m intervals; missing states are NaN.
         """
@@ -374,7 +378,7 @@ class Interpolator:
             yield t, states
 
     def keep(self, t: Array, states: Array) -> None:
-        """Replace the cached interior states by those that `interiors` yielded; from now on none are computed."""
+        """Replace the cached interior states by those that `interiors` yielded; compute no others from now on."""
         self.parts, self.judges = t.shape[1] - 1, False
         self._allocate()
         sizes = np.isfinite(t).sum(axis=1).tolist()
@@ -383,7 +387,7 @@ class Interpolator:
         }
 
     def complete(self, times: Array, states: Array, out: Array) -> None:
-        """Store [a, lam] at times and rows [q, v] on the constraints in `out`; NaN where the computation fails."""
+        """Store [a, lam] in `out` for states on the constraints, given `times` and rows [q, v]; NaN on failure."""
         complete, times, states = entry_point(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
         failures = complete(self.kit, self.work, times, states, out)
         if failures > 0 and self.static is not None:
@@ -400,7 +404,7 @@ def _blocks(groups: Groups) -> list[Groups]:
 
 
 def _groups(table: Table, intervals: Groups) -> Groups:
-    """Return a group (row of indices for kernels) for each of `intervals`; indices of output times are 0."""
+    """Return for each of `intervals` its group, a row of indices for kernels; those of output times are 0."""
     groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
     groups[:, indices.KIND] = table.kinds[intervals]
@@ -420,8 +424,8 @@ def _groups(table: Table, intervals: Groups) -> Groups:
     return groups
 
 
-def _warn(what: str, stacklevel: int = 4) -> None:
-    warnings.warn(f"the constraint Jacobian has lost rank: {what}", ConstraintWarning, stacklevel)
+def _warn(consequence: str, stacklevel: int = 4) -> None:
+    warnings.warn(f"the constraint Jacobian has lost rank: {consequence}", ConstraintWarning, stacklevel)
 
 
 class OutputInterpolation:
@@ -459,7 +463,7 @@ class OutputInterpolation:
             return None
         added = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.complete(times, rows, added)
-        if interpolator.static is not None or interpolator.repairs:  # its workspace may have changed
+        if interpolator.static is not None or interpolator.repairs:  # the interpolator may have another workspace
             self._interpolator = None
         return np.concatenate([rows, added], axis=1) if interpolator.failures == 0 else None
 
@@ -528,12 +532,12 @@ class DenseSolution:
     polynomial of its own, through v and a (order 8).
 
     The steps of `RungeKutta` of order 6 and more (by Newton's method of order 7 and more) and of `Taylor`, in `auto`
-    too, are too long for this. Each is divided into 2 to 6 equal steps of the method when a time within it is first
-    evaluated; this costs about as much as the run. If the last of its states changes a polynomial by more than the
-    tolerances, the polynomial is compared with the constraints and the equations at two times in the interval. Beside
-    a singular position, or a force that jumps, a polynomial may violate them. Then the interval gets the interior
-    states of a step across the position, or of four steps of `DOP853` (or a Radau method, where Newton's method was
-    used), or none, whichever fits best. The evaluations for all this are not counted.
+    too, are too long for such polynomials. Each is divided into 2 to 6 equal steps of the method when a time within it
+    is first evaluated; this costs about as much as the run. If the last of its states changes a polynomial by more than
+    the tolerances, the polynomial is compared with the constraints and the equations at two times in the interval.
+    Beside a singular position, or a force that jumps, a polynomial may violate them. Then the interval gets the
+    interior states of a step across the position, or of four steps of `DOP853` (or a Radau method, where Newton's
+    method was used), or none, whichever fits best. The evaluations for all this are not counted.
 
     The solution takes 8 (2 + 3 n_q) bytes of memory per step.
 

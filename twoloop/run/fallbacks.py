@@ -1,7 +1,7 @@
 """Continue a run where its own steps cannot: with another method, across a singular position, or over a jump.
 
 A run in which forces changed for a short time is repeated with more evaluations, at most MAX_REPETITIONS times: changes
-caused by noise have no shortest duration, so that every repetition would find shorter ones. The last one warns.
+caused by noise have no shortest duration, so that every repetition would find shorter ones. The last repetition warns.
 """
 
 from typing import NamedTuple
@@ -20,17 +20,17 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import Place, least_singular_value
 from twoloop.run.workspace import kit_for_plan, kit_of
 
-# limits of the shortest duration of a change of forces or drives in a run, relative to the longest time between two
-# evaluations. Below REPEAT_BELOW, the run is repeated, as it may have missed shorter changes. Below WARN_BELOW, a run
-# that is not repeated warns, as such a change may be between two evaluations
+# limits of a ratio: shortest change of forces or drives in a run, over the longest time between two evaluations. Below
+# REPEAT_BELOW, the run is repeated, as it may have missed shorter changes. Below WARN_BELOW, a run that is not repeated
+# warns, as a change of the same duration may lie between two evaluations
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
-EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations in a repetition during the shortest change of the repeated run
+EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations of a repetition within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
 MAX_REPETITIONS = 2  # largest number of repetitions of a run
 
 
 def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
-    """Return whether forces or drives changed for so short a time, relative to `limit`, that others may be missed."""
+    """Return whether the shortest change of forces or drives is below `limit` times the longest evaluation gap."""
     a, clock = run.a, run.clock
     return bool(clock[a.SHORTEST_CHANGE] < limit * clock[a.WIDEST_SAMPLING])
 
@@ -56,7 +56,7 @@ def warn_of_missed_changes(run: Run) -> str:
 
 Array = NDArray[np.float64]
 
-CORRECTIONS = 3  # number of Newton corrections of positions whose error is already below the tolerances
+CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
 NEGLIGIBLE = 1e-12  # singular value, relative to the largest, below which it counts as zero (because of redundant rows)
 MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to their right-hand side
 
@@ -68,8 +68,8 @@ def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     v in the metric of M.
     """
     q = corrected_positions(system, t, q)
-    equations, lengths, size = scaled_equations(system, t, q)
-    right_side = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / lengths * size])
+    equations, norms, largest = scaled_equations(system, t, q)
+    right_side = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / norms * largest])
     change = np.linalg.lstsq(equations, right_side, rcond=NEGLIGIBLE)[0]
     if not np.abs(equations @ change - right_side).max() <= MAX_RESIDUAL * np.abs(right_side).max():
         return None
@@ -86,44 +86,44 @@ def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
     """Return [M G^T; G 0] with each row of G scaled to norm max|M|, the norms of the rows before, and max|M|."""
     mass, rows = system.mass(t, q), system.rows(t, q)
-    lengths, size = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
-    lengths[lengths == 0.0] = 1.0
-    scaled = rows / lengths[:, None] * size
-    return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), lengths, size
+    norms, largest = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
+    norms[norms == 0.0] = 1.0  # rows of zeros are not scaled
+    scaled = rows / norms[:, None] * largest
+    return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
 
 
-# sizes of steps to try across a singular position, relative to H_LONG, the longest of the last steps: several, because
-# no node of the step should be at the position
-SIZES = tuple(0.85**k for k in range(28))
-# larger sizes, relative to H_LONG, which are tried if too few nodes of a step are beyond the position
-LARGER_SIZES = tuple(1.4**k for k in range(1, 7))
+# step sizes to try across a singular position, relative to H_LONG, the longest of the last steps: several, because no
+# node of the step should be at the position
+STEP_RATIOS = tuple(0.85**k for k in range(28))
+# larger step sizes, relative to H_LONG, to try if too few nodes of a step are beyond the singular position
+LARGER_STEP_RATIOS = tuple(1.4**k for k in range(1, 7))
 # The distance of a state from a singular position is its smallest pivot of C_q over the largest such pivot so far.
 FAR = 0.2  # distance from which on a state may be the base of the polynomial
-# in the last attempts, factors of the longest time without an evaluation (WIDER; no limit if forces cannot be short),
-# and then of the tolerances, too (LOOSER)
+# limits of steps across a singular position. STRICT: those of the run. WIDER: the longest time without an evaluation
+# is GAP_FACTOR times as long, or unlimited if forces cannot be short. LOOSER: as WIDER, with larger tolerances
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 STRICT, WIDER, LOOSER = range(3)
 
 
 class Origin(NamedTuple):
-    """Origin of polynomials across a singular position, and their limits: `beyond`, they may end beyond the run."""
+    """Origin and limits of polynomials across a singular position, for one series of attempts."""
 
-    earliest: float
-    base: Place | None
-    limits: int = STRICT
-    beyond: bool = False
+    earliest: float  # earliest time at which nodes may lie, s
+    base: Place | None  # earlier state through which the polynomial goes; None: it begins at the current state
+    limits: int = STRICT  # STRICT, WIDER or LOOSER
+    beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# largest age of a base: LONGEST_PAST times H_LONG, or FARTHEST times twice the time to the position, if that is longer
+# largest age of a base, s: LONGEST_PAST times H_LONG, or if longer, FARTHEST times the mirrored step size of _find_base
 LONGEST_PAST, FARTHEST = 1.5, 4.0
-# distance, relative to that of the base, below which an earlier state is beyond another singular position
+# ratio of the distance of an earlier state to that of the base below which it is beyond another singular position
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
 CLEAR = 0.3  # distance from which on the run continues with steps of its own method
 
 
 def may_cross(run: Run, code: int) -> bool:
-    """Return whether the next steps are to cross a singular position, given the code that `advance` returned."""
+    """Return whether the code that `advance` returned requires steps across a singular position."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
@@ -134,7 +134,7 @@ def may_cross(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Replace the plan of a run by its substitute, as its method is unsuitable or its values are not finite."""
+    """Replace a run's plan, whose steps fail or are unsuitable, by the substitute plan; retry the failed step size."""
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` never changes, and needs no copy
@@ -148,7 +148,7 @@ def switch_method(run: Run) -> None:
 
 
 def load_next_step(run: Run) -> None:
-    """Compile, or load from the disk, the step to which the run switches, and renew the kit."""
+    """Compile, or load from disk, the second step of a pair of methods, and renew the run's kit."""
     loaded(run.plan.second)
     _renew_kit(run)
 
@@ -163,7 +163,7 @@ def _renew_kit(run: Run) -> None:
 
 
 def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
-    """Return plan and controls of steps across a singular position, and prepare the first one.
+    """Return the plan and the array `control` of steps across a singular position, and prepare the first step.
 
     See kernels/steps/crossing_step.py. `past`: states of the last accepted steps, oldest first; may be empty.
     """
@@ -175,16 +175,18 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     base, run.mirrored = None, 0.0
     if not fixed:
         base, run.mirrored = _find_base(run, [place for place in past if place[0] >= earliest])
-    # earlier accelerations may precede a jump of a force, and be too few near the start, as later ones are near the
-    # end; from an old base the polynomial may be too long: try other origins, too
+    # try several origins: earlier accelerations may precede a jump of a force; there may be too few of them near the
+    # start, or too few later ones near the end; from an old base the polynomial may be too long
     longest, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
-    early = compiled and clock[a.T] - clock[a.T_START] < longest
-    near_end = compiled and clock[a.T] + LARGER_SIZES[-1] * longest > run.t1
-    places = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(early)]
+    near_start = compiled and clock[a.T] - clock[a.T_START] < longest
+    near_end = compiled and clock[a.T] + LARGER_STEP_RATIOS[-1] * longest > run.t1
+    places = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
     run.origins = [*[Origin(*place) for place in places], Origin(np.inf, None)]
     if not fixed:
-        others = [(limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]]
-        run.origins += [Origin(*place, *other) for other in others[1:] for place in places]
+        limit_pairs = [
+            (limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]
+        ]
+        run.origins += [Origin(*place, *limit_pair) for limit_pair in limit_pairs[1:] for place in places]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
@@ -199,7 +201,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
-    """Remove the first of `run.origins`, store it for the next polynomial, and set the step sizes to try."""
+    """Remove the first of `run.origins`, store it in the plan's memory, and set the step sizes and limits to try."""
     from twoloop.kernels.steps.crossing_step import begin
 
     a, clock = run.a, run.clock
@@ -214,13 +216,15 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
         run.looser[indices.ATOL :] *= TOLERANCE_FACTOR
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.looser[indices.GAP] / control[a.MAX_EVALUATION_GAP])
-    longest, allowed, left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
-    least = left if beyond else 0.0
+    longest, allowed, time_left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
+    min_size = time_left if beyond else 0.0
     if not beyond and control[a.FIXED_STEP] == 0.0:
-        allowed = min(allowed, left)
-    first_size = max(longest, min(run.mirrored, LARGER_SIZES[-1] * longest))
-    run.lengths = [size for size in sizes_across(first_size, allowed) if size > least]
-    run.longer = [longest * part for part in LARGER_SIZES if max(first_size, least) < longest * part <= allowed]
+        allowed = min(allowed, time_left)
+    first_size = max(longest, min(run.mirrored, LARGER_STEP_RATIOS[-1] * longest))
+    run.lengths = [size for size in sizes_across(first_size, allowed) if size > min_size]
+    run.longer = [
+        longest * part for part in LARGER_STEP_RATIOS if max(first_size, min_size) < longest * part <= allowed
+    ]
     if not run.lengths:
         run.lengths, run.longer = run.longer or [min(first_size, allowed)], []
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
@@ -239,23 +243,23 @@ def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     farthest = present = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
     scale = present / singular_value if singular_value > 0.0 else np.inf
     base: Place | None = None
-    step_size, oldest = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
+    step_size, max_age = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
     for time, state in reversed(past):
         distance = scale * least_singular_value(run.system, time, state[:n], run.rank)
-        if (farthest >= FAR and step_size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > oldest:
+        if (farthest >= FAR and step_size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > max_age:
             break
         if distance > farthest:
             step_size = 2.0 * present * (t - time) / (distance - present)
-            oldest = max(oldest, FARTHEST * step_size)
+            max_age = max(max_age, FARTHEST * step_size)
             if farthest < FAR:
                 farthest, base, step_size = distance, (time, state.copy()), step_size + t - time
     return base, step_size
 
 
 def sizes_across(longest: float, allowed: float) -> list[float]:
-    """Return the sizes of steps to try across a singular position, s: `longest` times SIZES, at most `allowed`."""
+    """Return the step sizes, s, to try across a singular position: `longest` times STEP_RATIOS, at most `allowed`."""
     first_size = min(longest, allowed)
-    return [first_size, *(longest * part for part in SIZES if longest * part < first_size)]
+    return [first_size, *(longest * part for part in STEP_RATIOS if longest * part < first_size)]
 
 
 def crossing_kit(kit: Kit) -> Kit:
@@ -293,8 +297,8 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.pieces[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.pieces, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
-    in_singular = run.starts_singular and clock[a.T] == run.t0  # where no partition can be renewed after an attempt
-    if in_singular and code == a.RANK_LOST:
+    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # no partition can be renewed at such a state
+    if at_singular_start and code == a.RANK_LOST:
         code = a.PAUSED
     if n_accepted > 0:  # the whole polynomial counts as one step
         clock[a.H_LONG] = max(clock[a.H_LONG], run.crossed)
@@ -317,7 +321,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
-    if in_singular:
+    if at_singular_start:
         return run.plan, run.control, a.RANK_LOST
     if n_accepted == 0:  # all attempts failed: the run's own steps continue as far as they can
         run.control[a.BRIDGE] = a.SUSPENDED

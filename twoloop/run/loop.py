@@ -74,7 +74,7 @@ from twoloop.run.singular_positions import Place, velocities_turned_last
 
 Array = NDArray[np.float64]
 
-MAX_STORED_SIGNALS = 3  # number of signals of Ctrl-C that are stored; the next one raises, although the result is lost
+MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next one raises, and the result is lost
 
 
 class Interrupts:
@@ -122,23 +122,23 @@ class Interrupts:
 def describe_interrupt(t: float, table: Array) -> str:
     """Return the message of a run that Ctrl-C ended at t; `table`: its rows [q, v, a, lam]."""
     n_missing = int(np.isnan(table[:, -1:]).sum())  # [a, lam] of a row is either complete or NaN
-    unknown = f" Accelerations and multipliers are NaN at {n_missing} of its times." if n_missing else ""
-    return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
+    nan_note = f" Accelerations and multipliers are NaN at {n_missing} of its times." if n_missing else ""
+    return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{nan_note}"
 
 
 def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Record:
-    """Return the record of a run that Ctrl-C ended before the accelerations at its start were known."""
-    n_q, none = system.n_q, np.zeros(0)
+    """Return the record, without states, of a run that Ctrl-C ended before the accelerations at its start."""
+    n_q, empty = system.n_q, np.zeros(0)
     columns = np.zeros((n_q, 0))
-    occurrences = None if events is None else [none for _ in events]
+    occurrences = None if events is None else [empty for _ in events]
     states = None if events is None else [np.zeros((0, n_q)) for _ in events]
     return Record(
-        t=none,
+        t=empty,
         q=columns,
         v=columns.copy(),
         a=columns.copy(),
         lam=np.zeros((system.n_c + system.n_a, 0)),
-        h=none.copy(),
+        h=empty.copy(),
         status=Status.INTERRUPTED,
         message=describe_interrupt(t0, columns.T) + failure_link(Status.INTERRUPTED),
         stats=Statistics(n_accepted=0),
@@ -157,10 +157,12 @@ CHUNK_TIME = 0.05  # CPU time of a chunk, s, from which on the next chunk is not
 # statuses whose message may say that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 MAX_BASE_CANDIDATES = 16  # largest number of last states that may be the base of a step across a singular position
-FAR_BEYOND = 100.0  # the end of the run does not shorten attempts across a singular position: it is so many runs later
+# attempts across a singular position are not shortened to end at t1, but at t1 + FAR_BEYOND times the run's duration
+FAR_BEYOND = 100.0
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
-MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs, and of floats in a buffer
-_spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for later runs, by their sizes
+# largest number of sets of buffers kept for later runs, and of floats in the buffer of states of such a set
+MAX_SPARE, MAX_SPARE_FLOATS = 16, 250_000
+_spare: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for later runs, by their sizes
 
 
 class IntegrationLoop:
@@ -183,7 +185,7 @@ class IntegrationLoop:
     start : ndarray, optional
         The row [q, v, a, lam] at the start. None: the state of the run, which must be at its start.
     system : ConstrainedSystem, optional
-        System of the result. None: the run's system. To be given if that is a copy whose arrays will be overwritten.
+        System of the result. None: the run's system, which must not be a copy whose arrays will be overwritten.
     """
 
     def __init__(
@@ -214,10 +216,14 @@ class IntegrationLoop:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
         # number of attempts from one check of progress to the next, and total number of attempts at the next check
         self.check_interval = self.next_check = run.chunk
-        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # others in steps across a singular position
+        self.plan, self.control, self.kit = (
+            run.plan,
+            run.control,
+            run.kit,
+        )  # replaced while steps cross a singular position
         self.counts = INITIAL_COUNTS.copy()
         self.latest: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
-        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, and rows of steps not stored yet
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet
         if self.request.store.finished:
             self._store_step_fields()
         self.filled = np.zeros(2, dtype=np.int64)
@@ -230,7 +236,7 @@ class IntegrationLoop:
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
 
     def resume(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
-        """Record copies of the first chunk (times, rows and steps by `advance`), and act on the code of `advance`."""
+        """Record copies of the first chunk's times, states and steps, and act on the code that `advance` returned."""
         self.code, self.cpu = code, cpu_time
         self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._interval_kinds(steps, False, False))
         self._handle_code(steps, False, cpu_time)
@@ -262,9 +268,9 @@ class IntegrationLoop:
             self._handle_code(steps, across, spent)
             if not copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
                 buffers = self._buffers()
-        if copied and buffers[1].size <= LARGEST_SPARE:
+        if copied and buffers[1].size <= MAX_SPARE_FLOATS:
             _spare[buffers[0].size, buffers[1].size, len(buffers[2])] = buffers
-            for oldest in list(_spare)[:-MOST_SPARE]:
+            for oldest in list(_spare)[:-MAX_SPARE]:
                 _spare.pop(oldest, None)
         if self.request.between_steps:
             began = time.process_time()
@@ -275,7 +281,7 @@ class IntegrationLoop:
         return self._record(check_derivatives)
 
     def _handle_code(self, steps: Array, across: bool, spent: float) -> None:
-        """Act on the code of `advance`; set it to PAUSED if the loop is to continue. `spent`: CPU time of the chunk."""
+        """Act on `self.code`; set it to PAUSED if the loop is to continue. `spent`: CPU time of the chunk, s."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness.samples:
                 self.stiffness.add_steps(steps[:, self.run.a.H])
@@ -286,12 +292,12 @@ class IntegrationLoop:
         self.report(self.run.clock[self.run.a.T])
 
     def _advance(self, buffers: Buffers) -> None:
-        """Take one chunk of steps by the compiled `advance`, which fills `buffers`, and store the code."""
+        """Take one chunk of steps by the compiled `advance`, which fills `buffers`; store its code in `self.code`."""
         run, a = self.run, self.run.a
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.attempts()))
         outputs = self.outputs
-        tries = self.plan is not run.plan and not run.pieces and run.control[a.FIXED_STEP] == 0.0
-        if tries:  # attempts across a singular position have their own lengths
+        is_crossing = self.plan is not run.plan and not run.pieces and run.control[a.FIXED_STEP] == 0.0
+        if is_crossing:  # the next output time does not shorten attempts across a singular position
             outputs = np.append(outputs[:-1], self.t1 + FAR_BEYOND * (self.t1 - run.t0))
         self.filled[:] = 0  # Ctrl-C may arrive before `advance` sets it
         try:
@@ -301,11 +307,11 @@ class IntegrationLoop:
             self.code = INTERRUPTED
         except Exception as error:
             # Raised by a callback. A sample of forces ahead may be at a state that the motion never reaches: then
-            # continue without such samples. Otherwise `to_end` raises it again, unless an event has ended the run
+            # continue without such samples. Else `to_end` raises the exception again, unless an event has ended the run
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
-            elif tries and not run.system.called_in_python and not self.interrupts.n_signals:
-                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # nodes may be where the motion never comes
+            elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
+                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # a node may be beyond the reach of the motion
             else:
                 self.code, self.raised = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:
@@ -408,7 +414,7 @@ class IntegrationLoop:
         return states[-MAX_BASE_CANDIDATES:]
 
     def _correct_last_state(self) -> None:
-        """Replace [q, v, a] of the last recorded state by the state of the run, from the more accurate polynomial."""
+        """Replace [q, v, a] of the last recorded state by the run's state, which is on the polynomial of a crossing."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)
@@ -416,7 +422,7 @@ class IntegrationLoop:
             self.latest[-1][1][-1, : len(row)] = row
 
     def _is_stalled(self, across: bool) -> bool:
-        """Return whether a method with a substitute cannot take a step, although no singular position is near."""
+        """Return whether a method with a substitute plan cannot take a step, and no singular position is near."""
         run, a = self.run, self.run.a
         stalls = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return stalls and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
@@ -479,7 +485,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if velocities_turned_last(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[Place]:
-        """Return the states at which steps had to end if one of these is near a singular position; else []."""
+        """Return all states at which steps had to end if the run passed near a singular position; else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (equal_steps or (request.times is not None and request.lands)):
@@ -496,7 +502,7 @@ class IntegrationLoop:
         return np.empty(n_rows), np.empty((n_rows, width)), np.empty((n_steps, self.run.a.N_STEP_COLUMNS))
 
     def _recorder(self) -> Recorder:
-        """Return a new recorder, with an interpolator if states between steps are requested."""
+        """Return a new Recorder, with an Interpolator if states between steps are requested."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
         spacing = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
@@ -521,5 +527,5 @@ def ignore_progress(t: float) -> None:
 
 def _error_note(name: str, t: float, error: Exception) -> str:
     """Return the note to be added to an exception of a compiled callback: name of the system, and time."""
-    beyond = ": it reads beyond the end of an array, such as a table" * isinstance(error, IndexError)
-    return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{beyond}"
+    hint = ": it reads beyond the end of an array, such as a table" * isinstance(error, IndexError)
+    return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{hint}"

@@ -1,4 +1,4 @@
-"""Validate the options of a call of `solve_dae`; integrators are cached by a key, which is equal for equal options."""
+"""Validate the options of a call of `solve_dae`; equal options have the same key, by which integrators are cached."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,7 +19,7 @@ SMALLEST_TOLERANCE = 1e-15  # rtol and atol must not both be smaller: rounding w
 
 @lru_cache(maxsize=1024)
 def _key(*_: Any) -> object:
-    """Return the same object for equal arguments: as a key of a dict it is faster than a tuple of the arguments."""
+    """Return one object for all equal arguments: as a key of a dict it is faster than a tuple of the arguments."""
     return object()
 
 
@@ -57,12 +57,12 @@ class Options:
 
     def set_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
-        run.work.notes[indices.KINK_AFTER] = t1  # no jump of C_t before t1 is known yet
+        run.work.notes[indices.KINK_AFTER] = t1  # no jump of C_t is known so far
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None
+NO_OPTIONS: Any = (None,) * 12, None  # arguments and options of the last call, if there was none
 
 
 def options_of(

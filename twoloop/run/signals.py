@@ -14,14 +14,14 @@ from twoloop.problem.system import ConstrainedSystem
 
 # code objects of the functions of twoloop that call functions of the user
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
-COMPILERS = ("numba", "llvmlite")  # packages that exceptions between two of their instructions break
+COMPILERS = ("numba", "llvmlite")  # packages that break if an exception is raised between two of their instructions
 # signals whose handlers are replaced; not all of them exist on Windows
 SIGNAL_NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")
 SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr(signal, name)]
 
 
 class SignalHandlers:
-    """Substitutes for the user's signal handlers: they call these at safe points, and raise their exceptions again.
+    """Substitutes for the user's signal handlers, which they call at safe points, and whose exceptions they re-raise.
 
     Python calls a handler at its next instruction, which may be one of numba. In Python code called by machine code, an
     exception becomes a `SystemError`; during compilation, it breaks numba for the rest of the process. So the call of a
@@ -67,7 +67,7 @@ class SignalHandlers:
             raise self._raised from None
 
     def leave(self) -> None:
-        """Restore the handlers, except those that the user has changed since; then call `check`. To be called once."""
+        """Restore the user's handlers, except those that the user has changed since; call `check`. Call this once."""
         for number, handler in self._before.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)

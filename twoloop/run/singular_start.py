@@ -23,19 +23,19 @@ Array = NDArray[np.float64]
 
 TURN = 3e-3  # relative change of the rows from one sample to the next, for derivatives along the motion
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0  # first, second derivative
-NOTHING = 1e-8  # relative: smaller derivatives may be errors of differences
+NOTHING = 1e-8  # relative size up to which a derivative may be an error of the finite differences
 RISES = 1e-6  # relative derivative of the rows from which on the rank rises: v0 may violate constraints by 1e-8
-# derivatives of the rows must be so many times larger than those for velocities within the tolerances
+# factor by which derivatives of the rows must exceed the derivatives along velocities as small as the tolerances
 DETERMINED = 10.0
-BESIDE, LENGTH = 0.1, 0.6  # relative change of the rows up to the state beside, and within the first step to be tried
-HALVINGS, MOVED = 6, 0.2  # number of states beside to try; their largest correction, relative to the way to them
+BESIDE, LENGTH = 0.1, 0.6  # relative change of the rows up to the state beside the start, and in the first step to try
+HALVINGS, MOVED = 6, 0.2  # number of states beside the start to try; largest correction of one, over its displacement
 RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, relative to the right-hand side
 
 
 class Branch(NamedTuple):
     """Branch of the motion through a singular position: accelerations there, and a state on the branch beside it.
 
-    `rank`: that of the rows beside the position. `length`: of the first step to be tried, s.
+    `rank`: rank of the rows beside the position. `length`: first step size to try, s.
     """
 
     a: Array
@@ -46,10 +46,10 @@ class Branch(NamedTuple):
 
 
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
-    """Find the branch of the motion through a state [q, v, a], where the constraints have this rank.
+    """Find the branch of the motion through a state [q, v, a] at which C_q has the rank `rank`.
 
-    Return None if the rank does not rise along the motion: then this is no singular position, or the motion stays in
-    it. Return False if it rises, but other branches have velocities within `allowed`, (n_q,).
+    Return None if the rank does not rise along the motion: the position is not singular, or the motion stays in it.
+    Return False if the rank rises, but other branches have velocities within the tolerances `allowed` (n_q,) of v.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None
@@ -85,7 +85,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
     gained = np.linalg.svd(added @ free, compute_uv=False)
     if gained.max() <= RISES * size:
         return None
-    distance = step * float(np.abs(way).max())  # of displacements for differences
+    distance = step * float(np.abs(way).max())  # displacement for finite differences
     uncertain = np.linalg.norm(derivative_of_rows(allowed * signs(len(q)), distance / float(allowed.max())))
     clear = gained > max(DETERMINED * float(uncertain) / speed, RISES * size)
     if not v.any() or gained[~clear].max(initial=0.0) > RISES * size:
@@ -111,5 +111,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _duration(change: float, speed: float, acceleration: float) -> float:
-    """Return the time within which rows change so much, at this speed and acceleration of their change."""
+    """Return the time, s, in which rows change by `change`, given the speed (1/s) and acceleration of their change."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))
