@@ -100,10 +100,7 @@ class Interpolator:
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
-        self.failures, self.warns = (
-            0,
-            True,
-        )  # number of output times at which the last call failed; whether failures warn
+        self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of them
         # times and states that divide an interval, including its ends, by the time at which the interval begins
         self.filled: dict[float, tuple[Array, Array]] = {}
         # memory arrays of steps across singular positions, with their polynomials, by the first times of the intervals

@@ -96,7 +96,7 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
 # node of the step should be at the position
 STEP_RATIOS = tuple(0.85**k for k in range(28))
 # larger step sizes, relative to H_LONG, to try if too few nodes of a step are beyond the singular position
-LARGER_STEP_RATIOS = tuple(1.4**k for k in range(1, 7))
+LARGER_RATIOS = tuple(1.4**k for k in range(1, 7))
 # The distance of a state from a singular position is its smallest pivot of C_q over the largest such pivot so far.
 FAR = 0.2  # distance from which on a state may be the base of the polynomial
 # limits of steps across a singular position. STRICT: those of the run. WIDER: the longest time without an evaluation
@@ -179,14 +179,12 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     # start, or too few later ones near the end; from an old base the polynomial may be too long
     longest, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and clock[a.T] - clock[a.T_START] < longest
-    near_end = compiled and clock[a.T] + LARGER_STEP_RATIOS[-1] * longest > run.t1
+    near_end = compiled and clock[a.T] + LARGER_RATIOS[-1] * longest > run.t1
     places = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
     run.origins = [*[Origin(*place) for place in places], Origin(np.inf, None)]
     if not fixed:
-        limit_pairs = [
-            (limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]
-        ]
-        run.origins += [Origin(*place, *limit_pair) for limit_pair in limit_pairs[1:] for place in places]
+        variants = [(limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]]
+        run.origins += [Origin(*place, *variant) for variant in variants[1:] for place in places]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
@@ -220,11 +218,9 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     min_size = time_left if beyond else 0.0
     if not beyond and control[a.FIXED_STEP] == 0.0:
         allowed = min(allowed, time_left)
-    first_size = max(longest, min(run.mirrored, LARGER_STEP_RATIOS[-1] * longest))
+    first_size = max(longest, min(run.mirrored, LARGER_RATIOS[-1] * longest))
     run.lengths = [size for size in sizes_across(first_size, allowed) if size > min_size]
-    run.longer = [
-        longest * part for part in LARGER_STEP_RATIOS if max(first_size, min_size) < longest * part <= allowed
-    ]
+    run.longer = [longest * part for part in LARGER_RATIOS if max(first_size, min_size) < longest * part <= allowed]
     if not run.lengths:
         run.lengths, run.longer = run.longer or [min(first_size, allowed)], []
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.lengths.pop(0), np.inf

@@ -216,11 +216,7 @@ class IntegrationLoop:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
         # number of attempts from one check of progress to the next, and total number of attempts at the next check
         self.check_interval = self.next_check = run.chunk
-        self.plan, self.control, self.kit = (
-            run.plan,
-            run.control,
-            run.kit,
-        )  # replaced while steps cross a singular position
+        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # others while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
         self.latest: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet

@@ -80,9 +80,9 @@ class StallDetector:
 
 
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
-LAST_STEPS = 8  # number of steps before a sampled state whose median is the step size at this state
+LAST_STEPS = 8  # number of steps before a sampled state, the median of which is the step size of the sample
 ITERATIONS = 6  # number of power iterations at each sampled state
-INITIAL_FACTOR = 0.1  # factor of `initial_direction` when added to eigenvectors: it restores coordinates that are zero
+INITIAL_FACTOR = 0.1  # `initial_direction` times this is added to the last eigenvectors, so that no component stays 0
 # the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -ALIGNED
 ALIGNED = 0.9
 MIN_STEPS = 200  # number of accepted steps below which a message does not mention stiffness
@@ -164,10 +164,10 @@ def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: lis
 
     if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != indices.DONE:
         return 0.0, 0.0
-    squared, opposed_q = _dominant_eigenvalue(kit, work, sample, directions[0], work.independent, False)
-    rate, opposed_v = _dominant_eigenvalue(kit, work, sample, directions[1], work.independent_v, True)
-    vibration = np.sqrt(squared) if opposed_q else 0.0
-    return (vibration, rate) if opposed_v else (max(vibration, rate), 0.0)
+    squared, is_negative_q = _dominant_eigenvalue(kit, work, sample, directions[0], work.independent, False)
+    rate, is_negative_v = _dominant_eigenvalue(kit, work, sample, directions[1], work.independent_v, True)
+    vibration = np.sqrt(squared) if is_negative_q else 0.0
+    return (vibration, rate) if is_negative_v else (max(vibration, rate), 0.0)
 
 
 def _dominant_eigenvalue(
@@ -180,7 +180,7 @@ def _dominant_eigenvalue(
     from twoloop.kernels.evaluation import tasks
 
     displacement = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))
-    eigenvalue, opposed = 0.0, False
+    eigenvalue, is_negative = 0.0, False
     a = np.zeros_like(sample.a)
     for _ in range(ITERATIONS):
         Q, V = sample.q.copy(), sample.v.copy()
@@ -193,13 +193,13 @@ def _dominant_eigenvalue(
             return 0.0, False
         previous = direction[independent]
         cosine = float(image @ previous) / float(np.linalg.norm(image) * np.linalg.norm(previous))
-        eigenvalue, opposed = largest / (displacement * float(np.abs(previous).max())), cosine < -ALIGNED
+        eigenvalue, is_negative = largest / (displacement * float(np.abs(previous).max())), cosine < -ALIGNED
         direction[independent] = image / largest
-    return eigenvalue, opposed
+    return eigenvalue, is_negative
 
 
 NEARLY_SINGULAR = 1e-3  # ratio of singular values of C_q (or inertias) up to which the message of a failure mentions it
-# rounding error of velocities (or accelerations) in a run, over the tolerances, above which the rest is not trusted
+# ratio of the rounding error of velocities (or accelerations) to the tolerance above which a run is not trusted further
 MAX_LASTING_ERROR = 100.0
 LOST_AT_END = 1e-6  # ratio of singular values up to which constraints do not determine the velocities at the end
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
@@ -221,7 +221,7 @@ _REASONS = {
 
 
 def _describe_jumps_and_crossings(run: "Run") -> str:
-    """Return sentences about jumps, and CROSSINGS for singular positions, in a run that succeeded; "" if none."""
+    """Return a sentence about the jumps of a run, and CROSSINGS if steps crossed singular positions; else ""."""
     text = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(run.jumps)
     return text + (CROSSINGS if run.crossings else "")
 
@@ -263,12 +263,12 @@ def reject_turned_velocities(
 
 
 def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
-    """Describe the first of the states `places`, before `end`, whose velocities rounding may have changed; else ""."""
+    """Return words on the first of the states `places`, before `end`, whose velocities rounding changed, else ""."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
-        given = t == run.t0 and run.starts_singular  # positions and velocities at the start are given
-        if t >= end or given or surely_above(run.near, system.rows(t, q), run.rank):
+        at_singular_start = t == run.t0 and run.starts_singular  # positions and velocities at the start are given
+        if t >= end or at_singular_start or surely_above(run.near, system.rows(t, q), run.rank):
             continue
         excess = _velocity_error_ratio(run, t, q, v)
         if excess > MAX_LASTING_ERROR:
@@ -365,7 +365,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 
 def _describe_contradiction(run: "Run") -> str:
-    """Describe a redundant row that is violated although the independent rows are satisfied, and its dependence."""
+    """Return the message of a run that stopped as a redundant row is violated, or no branch leaves a singular start."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     if run.starts_singular:
         return (
@@ -435,7 +435,7 @@ def warn_user(text: str) -> str:
 
 
 def _velocity_error_ratio(run: "Run", t: float, q: Array, v: Array) -> float:
-    """Return the largest error of a velocity caused by rounding of positions (an estimate), over its tolerance."""
+    """Return the largest estimated error of velocities due to rounding of positions, divided by the tolerance."""
     allowed = run.tolerances[indices.ATOL :] + run.rtol * np.abs(v).max()
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
@@ -450,7 +450,7 @@ def _ratio_text(run: "Run", t: float, q: Array) -> str:
 
 
 def _describe_near_end(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped so near t1 that a step across would need nodes beyond t1, else ""."""
+    """Return a sentence if the run stopped so near t1 that a crossing step would need nodes beyond t1, else ""."""
     time_left = t1 - float(run.clock[run.a.T])
     if time_left > max(NEAR_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""
@@ -476,18 +476,18 @@ def _describe_near_massless(run: "Run") -> str:
 
 
 def describe_not_finite(run: "Run") -> str:
-    """Describe which callback returned a value that is not finite, and when; if that is unknown, where to look."""
-    kind, at = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
+    """Return words that name the callback that returned a value that is not finite, or that say where to look."""
+    kind, fault_time = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
         name = run.functions._fields[kind]
-        return f"{name} of {run.system.name!r} returned a value that is not finite at t = {at:.10g}"
+        return f"{name} of {run.system.name!r} returned a value that is not finite at t = {fault_time:.10g}"
     n, t = run.system.n_q, float(run.clock[run.a.T])
     q, v = run.state[:n], run.state[n : 2 * n]
     end = t + float(run.clock[run.a.H_FAILED])
     for instant in (t, end):
-        undefined = not_finite(run.system, instant, q, v)
-        if undefined is not None:
-            return f"{undefined} at t = {instant:.10g}"
+        reason = not_finite(run.system, instant, q, v)
+        if reason is not None:
+            return f"{reason} at t = {instant:.10g}"
     if run.plan.looks_within:
         return (
             "the callbacks are finite there, but not the Taylor series of the motion: one of their functions has "

@@ -49,7 +49,7 @@ class Run:
     Raises
     ------
     ValueError
-        If the accelerations at the start cannot be found.
+        If the accelerations at the start cannot be computed, or the constraints contradict one another.
     """
 
     def __init__(
@@ -116,11 +116,11 @@ class Run:
         self.lengths: list[float] = []  # sizes of steps that are still to be tried, s
         self.longer: list[float] = []  # larger sizes to be tried if too few nodes of a step are beyond the position, s
         self.crossed = 0.0  # size of the last attempted step across, s
-        self.pieces: list[float] = []  # times at which the next pieces of the polynomial end
-        self.origins: list[Any] = []  # origins of the polynomial that are still to be tried
+        self.pieces: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
+        self.origins: list[Any] = []  # `Origin`s of polynomials across the position that are still to be tried
         self.t1 = np.inf  # end of the run, s
-        self.starts_singular = False  # whether the start is a singular position from which the rank rises, ...
-        self.branch_known = False  # ... and whether it is known which branch the motion follows
+        self.starts_singular = False  # whether the start is a singular position from which the rank rises
+        self.branch_known = False  # whether the branch of the motion that the run follows from such a start is known
         self.jumps: list[float] = []  # times at which C_t or b jumped, and velocities with them
         self.compared_until = [-np.inf]  # time up to which callbacks were compared; copies of the run share the list
         self.region: CheckedRegion | None = None  # region in which callbacks were compared; integrators share it
@@ -138,9 +138,9 @@ class Run:
         return new_run
 
     def from_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Return a copy of this run at another start; None if the ranks of C_q differ there, or accelerations fail.
+        """Return a copy of this run at another start; None if ranks differ there, or accelerations cannot be computed.
 
-        The run must not use the static form.
+        The run must not use the static form of linear algebra.
         """
         new_run = self._copy()
         new_run.t0, new_run.compared_until = t0, [-np.inf]
@@ -155,7 +155,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to a state, without past steps; compute the accelerations; return a code."""
+        """Set the run to the state q, v at t, discard its past steps, compute the accelerations; return a code."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -164,7 +164,7 @@ class Run:
         return code
 
     def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, length: float) -> None:
-        """Move a run that begins beside a singular position to a start in it; a step of about `length` s follows."""
+        """Move the start of a run from beside a singular position into the position; `length`: first step size, s."""
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
@@ -192,7 +192,7 @@ class Run:
         filled: NDArray[np.int64],
         active: tuple[Plan, Array, Kit] | None = None,
     ) -> int:
-        """Take compiled steps until the last output time, or until Python must act; return the code of the reason.
+        """Take compiled steps to the last output time, or until Python must act; return a code for why steps ended.
 
         Parameters
         ----------
@@ -257,12 +257,12 @@ class Run:
         return work
 
     def _pattern(self, q: Array) -> Array:
-        """Return an array with 1 at the entries of the constraint rows, and 0 elsewhere."""
+        """Return the pattern (n_c + n_a, n_q) of [C_q; A]: 1 at entries that are not zero, else 0."""
         system, t0 = self.system, self.t0
         return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
     def is_lost_without_dense(self, code: int) -> bool:
-        """Return whether steps failed in the static form for a reason that may not apply in another form."""
+        """Return whether steps failed in the static form of linear algebra, but may succeed in another form."""
         reasons = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.static is not None
@@ -271,13 +271,13 @@ class Run:
         )
 
     def change_form(self) -> None:
-        """Change the form of the linear algebra at the current state, and replace kit and workspace.
+        """Change the form of linear algebra at the current state, and replace the run's kit and workspace.
 
         The new form is the static form with Newton's matrices, if these are missing, else a form of saddle_point.py.
         """
         n = self.system.n_q
-        before, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
-        rank = len(before.rows_v)
+        old_work, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
+        rank = len(old_work.rows_v)
         t, q = float(self.clock[self.a.T]), self.state[:n].copy()
         static, self.static = self.static, None
         if static is not None and static.newton is None and self.matrices > 0:
@@ -287,9 +287,9 @@ class Run:
         self.kit = kit_of(self.system, t, q, self.plan, self.static)
         self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)
-        self.work.counters[:] = before.counters
+        self.work.counters[:] = old_work.counters
         notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.KINK_BEFORE, indices.KINK_AFTER]
-        self.work.notes[notes] = before.notes[notes]
+        self.work.notes[notes] = old_work.notes[notes]
         self.control[self.a.BRIDGE] = self.static is None
         clock, a = self.clock, self.a
         if clock[a.FAILURE_CODE] != indices.DONE:
@@ -300,12 +300,12 @@ class Run:
         if code == indices.RANK_DIFFERS:  # the rank may be higher than at a start with dependent rows
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if before.notes[indices.PIVOT] > 0.0 and largest > 0.0:  # convert the largest pivot to the scale of this form
+        if old_work.notes[indices.PIVOT] > 0.0 and largest > 0.0:  # convert the largest pivot to the scale of this form
             pivot = self.work.notes[indices.PIVOT]
-            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[indices.PIVOT])
+            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / old_work.notes[indices.PIVOT])
 
     def _compute_start(self) -> None:
-        """Compute the accelerations at the start; if that fails, try another workspace, or another form."""
+        """Compute the accelerations at the start, if necessary with other ranks or another form of linear algebra."""
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
         if self.static is not None and code == indices.RANK_DIFFERS:
@@ -350,7 +350,7 @@ class Run:
         )
 
     def redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
-        """Return the indices of dependent rows of [C_q; A] at the start, and a warning; `rows`: [C_q; A], if known."""
+        """Return the indices of dependent rows of [C_q; A] at the start, and a warning; `rows`: [C_q; A] or None."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -396,16 +396,16 @@ class Run:
         return mass_and_rows(system, self.t0, q)[1]
 
     def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
-        """Describe the dependence of the rows with the indices `rows` on the other rows of `all_rows`."""
+        """Describe in words how the rows of `all_rows` with the indices `rows` depend on the other rows."""
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
         q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
         if self.static is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
-        shares, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
-        for row, share in zip(rows, shares, strict=False):
-            entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, share)
-        return equations_in_words(rows, counted, shares[:, counted], norms(all_rows))
+        factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
+        for row, factor in zip(rows, factors, strict=False):  # the factors of the other rows in the sum that equals it
+            entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
+        return equations_in_words(rows, counted, factors[:, counted], norms(all_rows))
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first step size and the limits of step sizes, s; first_step None: an estimate."""
@@ -417,13 +417,13 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
 
     def limit_steps(self) -> None:
-        """Set the largest step size so that no hundredth of the run passes without an evaluation.
+        """Set the largest step size so that the time between evaluations is at most a hundredth of the run.
 
-        If forces may be steep, a step is at most as long, because a single stage in a steep force may not reveal it.
+        If forces may be steep, the step size is at most a hundredth, too: a single stage may not reveal a steep force.
         """
         unseen = 1.0 if self.may_be_steep else self.plan.unseen
-        longest = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
-        self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, longest), unseen
+        max_size = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
+        self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), unseen
 
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
         """Return the first step size, s, from a state; if `longest` (max_step) > 0, also limit the later step sizes."""
@@ -432,15 +432,15 @@ class Run:
         return first
 
     def defect(self) -> float | None:
-        """Return the largest defect of the steps, or None if it was not evaluated in all steps."""
+        """Return the largest defect of the steps, or None if the defect was not evaluated in all steps."""
         notes = self.work.notes
         checked = self.work.counters[indices.N_ACCEPTED] > 0 and notes[indices.UNCHECKED] == 0.0
         return float(notes[indices.LARGEST_DEFECT]) if checked else None
 
     def passed_near_singular(self) -> bool:
-        """Return whether a step had to end so near a singular position that rounding may have changed velocities."""
-        near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and checks take long
-        return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < near)
+        """Return whether a step ended so near a singular position that rounding may have changed its velocities."""
+        threshold = self.near if self.static is None else LEAST  # pivots of static factors vary, and checks take long
+        return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 
     def attempts(self) -> int:
         """Return the number of attempted steps so far."""
