@@ -2,7 +2,7 @@
 
 Numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. For new parameters,
 choices that depend on these numbers are checked again, and callbacks are compared with their traces near the start. At
-states of the run callbacks are compared if states or parameters are outside the checked region.
+states of the run, callbacks are compared with their traces if states or parameters are outside the checked region.
 """
 
 import copy
@@ -29,7 +29,7 @@ from twoloop.run.workspace import is_diagonal, kit_for_plan
 Array = NDArray[np.float64]
 
 NUMBERS = ("options", "numbers", "own_numbers")  # fields of a plan: arrays that may depend on parameters
-SUBPLANS = ("interior", "substitute", "within_newton")  # fields of a plan that contain other plans
+SUBPLANS = ("interior", "substitute", "within_newton")  # fields of a plan whose values are plans
 
 
 class SharedSetup:
@@ -47,7 +47,7 @@ class SharedSetup:
     Raises
     ------
     ValueError
-        If a number of the run depends on the parameters, but not as a traced expression in the parameters.
+        If the system is large, a callback may branch on parameters, or numbers differ from their traced expressions.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -64,8 +64,8 @@ class SharedSetup:
         )
         self.exact = exact_derivatives(symbolic)
         self.definite = has_definite_mass(system, t, q)
-        new = system.given.keys() - self.family.traced
-        self.family.traced |= {kind for kind in new if runs_on_symbols(system, kind, self.family.parameters)}
+        untraced = system.given.keys() - self.family.traced
+        self.family.traced |= {kind for kind in untraced if runs_on_symbols(system, kind, self.family.parameters)}
         share_checked_bounds(system)
         if not self.family.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
@@ -74,7 +74,7 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region in which runs of all systems, with or without checks of derivatives, compared callbacks."""
+        """Return the region in which runs, with or without checks of derivatives, have compared callbacks so far."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
@@ -132,7 +132,7 @@ class ParametricRun:
             traced.trusted = False
 
     def agrees(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Return whether callbacks agree near the start, and M is definite or diagonal if the first M is, else not."""
+        """Return whether callbacks agree with traces near the start, and M is definite, diagonal as in the setup."""
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
@@ -147,7 +147,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _numbered(self, plan: Plan) -> Plan:
-        """Return a copy of the plan with the arrays of numbers that `_fill_arrays` fills instead of expressions."""
+        """Return a copy of a plan in which arrays that `_fill_arrays` fills replace arrays of expressions."""
         array, plan_fields = self._formulas.array, vars(plan)
         changes: dict[str, Any] = {name: array(plan_fields[name]) for name in NUMBERS if plan_fields[name] is not None}
         changes |= {name: self._numbered(plan_fields[name]) for name in SUBPLANS if plan_fields[name] is not None}

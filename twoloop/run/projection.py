@@ -1,4 +1,4 @@
-"""Project a guess onto the constraints (`consistent_state`); report how far it moved, and on which assembly it is.
+"""Project a guess onto the constraints (`consistent_state`); report how far the guess moved, and its assembly.
 
 Large systems are projected by sparse factors, except in three cases: rows that are dependent at consistent positions,
 but only nearly beside them; a position near a dead centre; a guess that may lead to another assembly.
@@ -30,14 +30,14 @@ from twoloop.run.workspace import kit_of, static_form, workspace
 Array = NDArray[np.float64]
 
 MIN_SINE = 1e-5  # sine of the angle of a row to the other rows below which a position may be near a dead centre
-# largest number of Newton iterations; largest correction, relative to the largest coordinate, at which they stop
+# largest number of Newton iterations by sparse factors; correction that ends them, relative to the largest coordinate
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# largest distance of a projection from its prediction by C_q, relative to the displacement, on the same assembly
+# largest distance between projection and prediction by C_q on the same assembly, relative to the guess's displacement
 MAX_NONLINEARITY = 0.5
 
 
-class _Metric:
-    """Sparse projection in the Euclidean metric, by the static form with the unit matrix in place of M."""
+class _SparseProjection:
+    """Projection onto the constraints by the least change, by the static form with the unit matrix in place of M."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, form: Any, rank: int | None = None):
         self.system, self.t, self.rank = system, t, rank
@@ -55,7 +55,7 @@ class _Metric:
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def allowed_part(self, displacement: Array) -> Array:
-        """Return the component (n_q,) of a displacement that the constraints at `position` allow."""
+        """Return the component (n_q,) of a displacement that the constraints at `self.position` allow."""
         rows = self.system.sparse_rows(self.t, self.position)
         change = np.zeros(len(displacement))
         zero, residual = np.zeros(len(displacement)), np.ascontiguousarray(rows @ displacement)
@@ -63,7 +63,7 @@ class _Metric:
         return displacement - change
 
     def onto_constraints(self, q: Array) -> Array | None:
-        """Return q projected onto the constraints by the independent rows; None if that fails or violates other rows.
+        """Return q projected by the independent rows of C_q; None on failure, or if other constraints are violated.
 
         The independent rows are not chosen anew: beside the constraints the other rows are only nearly dependent.
         """
@@ -79,7 +79,7 @@ class _Metric:
         return q if is_at_rounding(residual, self.system.sparse_rows(self.t, q), q) else None
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
-        """Return q and v projected onto the constraints, or None if that fails; store the position."""
+        """Return q and v projected onto the constraints, or None on failure; store q in `self.position`."""
         q, discarded = q.copy(), v.copy()
         if self.run_task(tasks.RENEW_PARTITION, q, v) != indices.DONE:
             return None
@@ -103,50 +103,50 @@ class Dependence(NamedTuple):
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
-    """Return rank and dependent rows of a large sparse system at q; None if sparse factors cannot decide reliably."""
+    """Return the Dependence of the rows of C_q of a large system at q; None if sparse factors are not reliable."""
     form, all_rows = static_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
-    metric, at_rest = _Metric(system, t, q, form), np.zeros_like(q)
-    code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), at_rest)
+    projection, at_rest = _SparseProjection(system, t, q, form), np.zeros_like(q)
+    code = projection.run_task(tasks.RENEW_PARTITION, q.copy(), at_rest)
     if code == indices.RANK_DIFFERS:
-        metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
-        code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), at_rest)
-    if code != indices.DONE or metric.work.notes[indices.PIVOT] < MIN_SINE:
+        projection = _SparseProjection(system, t, q, form, int(projection.work.notes[indices.RANK]))
+        code = projection.run_task(tasks.RENEW_PARTITION, q.copy(), at_rest)
+    if code != indices.DONE or projection.work.notes[indices.PIVOT] < MIN_SINE:
         return None
-    independent_rows, unused = set(metric.work.rows_v.tolist()), np.zeros_like(q)
+    independent, unused = set(projection.work.rows_v.tolist()), np.zeros_like(q)
     shares: dict[int, Array] = {}
     for row in range(system.n_c):
-        if row not in independent_rows:
+        if row not in independent:
             shares[row] = np.zeros(system.n_c)
-            metric.run_task(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), unused, shares[row])
-    metric.position = q
+            projection.run_task(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), unused, shares[row])
+    projection.position = q
     columns = units(system, t, q, all_rows, typical_sizes(q))
-    allowed = metric.allowed_part(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
+    allowed = projection.allowed_part(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
     norm = float((np.abs(allowed) / columns).max())
-    return Dependence(len(independent_rows), shares, allowed / norm if norm > 0.0 else allowed, metric.onto_constraints)
+    return Dependence(len(independent), shares, allowed / norm if norm > 0.0 else allowed, projection.onto_constraints)
 
 
 def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
-    """Return (q, v) projected onto the constraints by the least change; None if sparse factors are not reliable."""
+    """Return (q, v) projected onto the constraints by sparse factors; None if these, or the assembly, are in doubt."""
     form = static_form(system, t, q)
     if form is None:
         return None
     with np.errstate(all="ignore"):
-        metric = _Metric(system, t, q, form)
-    code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), v.copy())
+        projection = _SparseProjection(system, t, q, form)
+    code = projection.run_task(tasks.RENEW_PARTITION, q.copy(), v.copy())
     if code == indices.RANK_DIFFERS:
-        metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
+        projection = _SparseProjection(system, t, q, form, int(projection.work.notes[indices.RANK]))
     elif code != indices.DONE:
         return None
-    projected = metric.project(q, v)
-    if projected is None or metric.work.notes[indices.PIVOT] < MIN_SINE:
+    projected = projection.project(q, v)
+    if projected is None or projection.work.notes[indices.PIVOT] < MIN_SINE:
         return None
-    # rows that are independent at the guess must be independent at the projected position, too
-    metric_there = _Metric(system, t, projected[0], form, metric.rank)
-    if metric_there.run_task(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE:
+    # rows that are independent at the guess must also be independent at the projected position
+    projection_there = _SparseProjection(system, t, projected[0], form, projection.rank)
+    if projection_there.run_task(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE:
         return None
     rows, rate = system.sparse_rows(t, projected[0]), system.rates(t, projected[0])
     if not is_at_rounding(system.constraint(t, projected[0]), rows, projected[0]):
@@ -154,34 +154,34 @@ def project_sparsely(
     if not is_at_rounding(rows @ projected[1] + rate, rows, projected[1], rate):
         return None
     change = projected[0] - q
-    if check_assembly and np.abs(change).max() > 0.0 and not _other_guesses_agree(metric, projected[0], change):
+    if check_assembly and np.abs(change).max() > 0.0 and not _other_guesses_agree(projection, projected[0], change):
         return None
     return projected
 
 
-def _other_guesses_agree(metric: _Metric, position: Array, change: Array) -> bool:
-    """Return whether three other guesses, displaced by as much as `change`, are projected nearly as C_q predicts."""
+def _other_guesses_agree(projection: _SparseProjection, position: Array, change: Array) -> bool:
+    """Return whether three guesses, as far from `position` as `change`, are projected nearly to where C_q predicts."""
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     at_rest = np.zeros(len(position))
     for displacement in (-2.0 * change, distance * directions[0], distance * directions[1]):
-        if metric.project(position, at_rest) is None:
+        if projection.project(position, at_rest) is None:
             return False
-        expected = position + metric.allowed_part(displacement)
-        projected = metric.project(position + displacement, at_rest)
+        expected = position + projection.allowed_part(displacement)
+        projected = projection.project(position + displacement, at_rest)
         if projected is None or np.abs(projected[0] - expected).max() > MAX_NONLINEARITY * np.abs(displacement).max():
             return False
     return True
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-CONVERGED = 1e-2  # violation at which the iteration stops, relative to the violation that a start may have
+CONVERGED = 1e-2  # violation that ends the Gauss-Newton iteration, relative to the violation allowed at a start
 # singular values, relative to the largest, below which they count as zero: SINGULAR for ranks, NEGLIGIBLE for
 # least-squares solutions, WEAK for least-squares solutions with redundant rows
 SINGULAR, NEGLIGIBLE, WEAK = 1e-10, 1e-13, 1e-2
 DEAD_CENTRE = 0.01  # ratio of the smallest to the largest singular value up to which a position is near a dead centre
-SAME_POSITION = 0.1  # distance up to which two positions count as equal, relative to the change by the projection
-MAX_CHANGE = 1e8  # largest change of a coordinate, in its unit: after a larger one, the mechanism is lost in rounding
+SAME_POSITION = 0.1  # distance of two positions, relative to the change by the projection, up to which they are equal
+MAX_CHANGE = 1e8  # change of a coordinate, in units of `Scales.columns`, above which the iteration counts as diverged
 
 
 class Move(NamedTuple):
@@ -379,26 +379,26 @@ def _another_assembly(
     scales: Scales,
     cut: float,
 ) -> str | None:
-    """Describe where other guesses, about as far from `position` as `guess`, lead; None: to the same assembly.
+    """Describe where other guesses, about as far from `position` as `guess`, are projected; None: same assembly.
 
     On the same assembly, guesses are projected to points near those that C_q predicts to first order, with the same
     sign of the determinant. Two assemblies may differ in the dependent coordinates alone.
     """
-    moved = (position - guess) / scales.columns
-    far = float(np.abs(moved).max())
+    scaled_move = (position - guess) / scales.columns
+    largest_move = float(np.abs(scaled_move).max())
     jacobian = system.jacobian(t, position)
     dependent, sign, _ = _assembly(scales.scaled(jacobian), free)
-    columns = list(dependent)
+    dependent_columns = list(dependent)
 
     def distance(a: Array, b: Array) -> float:
         return float(np.abs((a - b) / scales.columns).max())
 
     def sign_at(q: Array) -> int:
-        block = scales.scaled(system.jacobian(t, q))[:, columns]
+        block = scales.scaled(system.jacobian(t, q))[:, dependent_columns]
         return int(np.linalg.slogdet(block)[0]) if sign != 0 else 0
 
-    weakest = far * _weakest_direction(scales.scaled(jacobian), free)
-    for direction in (-2.0 * moved, weakest, -weakest):
+    weakest = largest_move * _weakest_direction(scales.scaled(jacobian), free)
+    for direction in (-2.0 * scaled_move, weakest, -weakest):
         displacement = direction * scales.columns
         projected, excess, _ = _gauss_newton(system, t, position + displacement, free, cut)
         if projected is None or not excess <= 1.0:
@@ -409,19 +409,19 @@ def _another_assembly(
             and sign_at(projected) == sign
         ):
             continue
-        # due to curvature, or another assembly? Project a guess with the new dependent and the old other coordinates
+        # curvature may explain the distance: project a guess with the new dependent and the old other coordinates
         mixed = position.copy()
-        mixed[columns] = projected[columns]
-        mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
+        mixed[dependent_columns] = projected[dependent_columns]
+        mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cut)
         if mixed_projected is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
-        if distance(mixed_projected, position) > SAME_POSITION * far or sign_at(mixed_projected) != sign:
+        if distance(mixed_projected, position) > SAME_POSITION * largest_move or sign_at(mixed_projected) != sign:
             return f"ends on another one, which differs by {_describe_change(position, mixed_projected, scales)}"
     return None
 
 
 def _describe_change(before: Array, after: Array, scales: Scales) -> str:
-    """Describe the coordinate that changes most, with so many digits of both values that the change is visible."""
+    """Return words about the coordinate that changes most, with enough digits of both values to show the change."""
     j = int(np.abs((after - before) / scales.columns).argmax())
     size, change = max(abs(float(before[j])), abs(float(after[j]))), abs(float(after[j] - before[j]))
     digits = min(17, 3 + max(0, math.ceil(math.log10(size / change)))) if change > 0.0 else 3
@@ -431,7 +431,7 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
-    """Return the projected q (None: diverged), its violation over the allowed one, and the number of iterations."""
+    """Return the projected q (None: diverged), its violation over the allowed violation, and the iteration count."""
     best, nearest, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
@@ -454,7 +454,7 @@ def _gauss_newton(
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
-    """Return the smallest change (n_q,) of the free coordinates by which C changes by `values` to first order."""
+    """Return the smallest change (n_q,) of q in its `free` coordinates with C_q times the change equal to `values`."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
     change = np.zeros(jacobian.shape[1])
@@ -468,7 +468,7 @@ def _rank(scaled: Array) -> int:
 
 
 def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
-    """Return `dependent`, `determinant_sign` and `margin` of a ConsistentState, from the scaled C_q."""
+    """Return `dependent`, `determinant_sign` and `margin` of a ConsistentState, given the scaled C_q (n_c, n_q)."""
     rank = _rank(scaled[:, free])
     if rank == 0:
         return (), 0, 0.0

@@ -54,7 +54,7 @@ class MemoryStore:
         self._parts[name] = [self.array(name)[:n]]
 
     def array(self, name: str) -> NDArray[Any]:
-        """Return all rows."""
+        """Return all rows of an array."""
         first, *others = self._parts[name]
         return np.concatenate([first, *others]) if others else first
 
@@ -95,7 +95,7 @@ class FileStore:
             self._write_header(file, name, dtype, (min(n, before), *width))
 
     def array(self, name: str) -> NDArray[Any]:
-        """Return all rows as a memory map; writing to it does not change the file."""
+        """Return all rows of an array as a memory map; changes of the array do not change the file."""
         return memory_map(self._path(name))
 
     def _path(self, name: str) -> Path:
@@ -124,7 +124,7 @@ def memory_map(path: Path) -> NDArray[Any]:
 
 
 def read(folder: Path) -> dict[str, NDArray[Any]]:
-    """Return a dict of the arrays in a folder by name; arrays that belong together are cut to equal numbers of rows."""
+    """Return the arrays in a folder by name; arrays with one row per state or per step are cut to equal lengths."""
     arrays = {path.stem: memory_map(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
         present = [name for name in group if name in arrays]
@@ -135,7 +135,7 @@ def read(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-PENDING = 1024  # number of stored states above which their intervals are searched for events, and interpolated
+MAX_PENDING = 1024  # largest number of states that wait for the search for events, and for interpolation
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class OutputRequest:
 
     @property
     def every_step(self) -> bool:
-        """Whether the states at the ends of all steps are needed, be it for interpolation only."""
+        """Whether the states at the ends of all steps are needed, for output or for interpolation."""
         return self.times is None or self.between_steps
 
     @property
@@ -173,8 +173,8 @@ class OutputRequest:
         return (self.times is not None and not self.lands) or self.dense or self.events is not None
 
 
-class _Between(NamedTuple):
-    """Interpolation in a table of states, in the form that the search for events uses."""
+class _TableInterpolation(NamedTuple):
+    """Interpolation in a table of states, with the methods that `EventSearch` calls."""
 
     interpolator: Interpolator
     table: Table
@@ -209,13 +209,13 @@ class Recorder:
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps, self.last_step = 0, 0.0
         self.interrupted = False
-        # states at the ends of intervals not yet searched for events, and earlier states of their polynomials
+        # states at the ends of intervals still to be searched for events, and earlier nodes of their polynomials
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
         self._next = 0  # index of the first interval between these states that has not been searched
         self._n_outputs = 0
-        ends = request.events is not None and any(event.terminal < np.inf for event in request.events)
-        self._max_pending = 0 if ends or request.store.finished else PENDING
+        may_end_run = request.events is not None and any(event.terminal < np.inf for event in request.events)
+        self._max_pending = 0 if may_end_run or request.store.finished else MAX_PENDING
         self.search = None if request.events is None else EventSearch(request.events, t0, state[: 2 * n_q], every)
         self._store_output(self._t, self._rows, self._kinds)
         if request.times is not None and not request.lands:
@@ -235,12 +235,12 @@ class Recorder:
             self._search(len(self._t) - WINDOW)
 
     def correct_last_state(self, t: float, row: Array) -> None:
-        """Replace [q, v, a] of the last recorded state by `row` for interpolation, if the time of this state is t."""
+        """Replace [q, v, a] of the last state, as a node of interpolation, by `row`, if the time of this state is t."""
         if self.request.between_steps and len(self._t) and self._t[-1] == t:
             self._rows[-1, : len(row)] = row
 
     def store_crossing(self, memory: Array) -> None:
-        """Keep `memory` for the interval after the last recorded state, if its polynomial is across a singularity."""
+        """Copy the polynomial in a crossing step's `memory`, if there is one, for the interval after the last state."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -259,12 +259,12 @@ class Recorder:
             store.add("sol_kinds", kinds)
 
     def _store(self, t: Array, rows: Array) -> None:
-        """Store times and rows [q, v, a, lam], or rows [q, v] for which [a, lam] can be computed at the end."""
+        """Store times and rows [q, v, a, lam], or rows [q, v]; [a, lam] are then computed now or at the end."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._with_accelerations(t, rows) if self.request.store.finished else rows)
 
     def finish(self) -> None:
-        """Search the remaining intervals for events, and interpolate in them, at the end of the run."""
+        """At the end of the run, search the remaining intervals for events, and interpolate at their output times."""
         self._search(len(self._t) - 1)
 
     @property
@@ -291,30 +291,30 @@ class Recorder:
         if end < self._next or (end == self._next and len(self._t) > 1):
             return
         table = Table(self._t, np.ascontiguousarray(self._rows[:, : 3 * self._n_q]), self._kinds)
-        ends = self._t[self._next : end + 1]
+        node_times = self._t[self._next : end + 1]
         if self.search is not None:
             try:
-                self.search.search(_Between(interpolator, table), ends)
+                self.search.search(_TableInterpolation(interpolator, table), node_times)
             except KeyboardInterrupt:
                 self.interrupted = True
                 self.search.break_off()
-                ends = ends[ends <= self.search.reached]
+                node_times = node_times[node_times <= self.search.reached]
             if self.ended is not None:
-                n_before = int(np.searchsorted(ends, self.ended[1]))
-                self.last_step = float(self.ended[1] - ends[max(n_before - 1, 0)])
-                ends = np.append(ends[:n_before], self.ended[1])
-        self.n_steps += len(ends) - 1
+                n_before = int(np.searchsorted(node_times, self.ended[1]))
+                self.last_step = float(self.ended[1] - node_times[max(n_before - 1, 0)])
+                node_times = np.append(node_times[:n_before], self.ended[1])
+        self.n_steps += len(node_times) - 1
         if self.request.times is not None and not self.request.lands:
             times = self.request.times[self._n_outputs :]
-            times = times[times <= ends[-1]]
+            times = times[times <= node_times[-1]]
             try:
                 self._store(times, interpolator.states(table, times))
                 self._n_outputs += len(times)
             except KeyboardInterrupt:
                 self.interrupted = True
-        drop = max(0, end - WINDOW)
-        self._t, self._rows, self._kinds = self._t[drop:], self._rows[drop:], self._kinds[drop:]
-        self._next = end - drop
+        n_dropped = max(0, end - WINDOW)
+        self._t, self._rows, self._kinds = self._t[n_dropped:], self._rows[n_dropped:], self._kinds[n_dropped:]
+        self._next = end - n_dropped
 
     def output(self) -> tuple[Array, Array]:
         """Return times and rows [q, v, a, lam] of the result, up to the event or interruption that ended the run."""
@@ -331,7 +331,7 @@ class Recorder:
         return t, self._with_accelerations(t, store.array("states"))
 
     def _with_accelerations(self, times: Array, rows: Array) -> Array:
-        """Return rows [q, v, a, lam] for rows [q, v]; rows that are complete are returned unchanged."""
+        """Return rows [q, v, a, lam] for states given by rows [q, v]; rows [q, v, a, lam] are returned unchanged."""
         if self.interpolator is None or rows.shape[1] == self._width:
             return rows
         added = np.full((len(times), self._width - rows.shape[1]), np.nan)
@@ -355,13 +355,13 @@ class Recorder:
         if self.search is None:
             return None, None, None
         n = self._n_q
-        times = [np.array([t for t, _ in found]) for found in self.search.found]
-        rows = [np.array([row for _, row in found]).reshape(-1, 2 * n) for found in self.search.found]
-        return times, [each[:, :n] for each in rows], [each[:, n:] for each in rows]
+        times = [np.array([t for t, _ in occurrences]) for occurrences in self.search.found]
+        rows = [np.array([row for _, row in occurrences]).reshape(-1, 2 * n) for occurrences in self.search.found]
+        return times, [states[:, :n] for states in rows], [states[:, n:] for states in rows]
 
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
-Later = Callable[[str], dict[str, Any]]  # function of a deferred field's name: this field and related fields, by name
+Later = Callable[[str], dict[str, Any]]  # takes the name of a deferred field; returns this and related fields by name
 
 
 class Status(IntEnum):
@@ -597,7 +597,7 @@ INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record with one row per step; `counts`: totals, which are updated."""
+    """Return the fields of a record with one row per step; update `counts` (as INITIAL_COUNTS) to totals after them."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -610,7 +610,7 @@ def statistics(counters: Integers, cpu: float) -> Statistics:
 
 
 def fields_of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
-    """Return the fields of a record for a trajectory (`table`: rows [q, v, a, lam]), and for ranks, defect and gap."""
+    """Return the trajectory, ranks, defect and `widest_gap` as fields of a record; `table`: rows [q, v, a, lam]."""
     return {
         **state_fields(run.system.n_q, t, table),
         "rank": run.rank,
@@ -621,13 +621,13 @@ def fields_of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
 
 
 def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
-    """Return the fields t, q, v, a and lam of a record for n coordinates; `table`: rows [q, v, a, lam] at times t."""
+    """Return the fields t, q, v, a and lam of a record; `table`: rows [q, v, a, lam] at times t; n: number of q."""
     columns = table.T
     return {"t": t, "q": columns[:n], "v": columns[n : 2 * n], "a": columns[2 * n : 3 * n], "lam": columns[3 * n :]}
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kind of interval, for the dense solution, of each step of the run's own plan, given rows of steps."""
+    """Return the kind of interval, for the dense solution, of each step of the run's plan; `steps`: rows of steps."""
     if run.plan.apart:
         return np.full(len(steps), indices.APART)
     explicit = indices.ACROSS if run.substituted else indices.ACCELERATIONS

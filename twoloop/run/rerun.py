@@ -57,7 +57,7 @@ def compare_callbacks(
 
 
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
-    """Return the region in which runs of the same system, with equal traces and checks, compared callbacks."""
+    """Return the region in which runs of the system, with the same traces and checks, have compared callbacks."""
     if run.region is not None:
         return run.region
     key = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
@@ -75,7 +75,7 @@ def compare_callbacks_at(
 ) -> tuple[Status, str]:
     """Compare callbacks at states [t, q, v], latest first; return status and message, changed if a callback is wrong.
 
-    `everywhere`: at all states; else only at those outside the region. If callbacks agree, extend the region.
+    `everywhere`: compare at all states, not only at those outside `region`. If callbacks agree, extend the region.
     """
     first = states[-1]
     if not everywhere:
@@ -116,7 +116,7 @@ def _check_derivatives(run: Run, states: Array, first: Array, status: Status, me
 
 
 def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
-    """Evaluate a force called in Python twice at each of `states`, rows [t, q, v]; describe a difference, else None."""
+    """Return words if two calls of a Python force at one of `states` (rows [t, q, v]) give two values, else None."""
     n, forces = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -140,7 +140,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return arguments and value of a compiled force at the start; for a force called in Python clear its samples."""
+    """Return arguments and value of a compiled force at the start; for Python functions, clear samples, return None."""
     if functions := python_functions(system):
         functions.restart()
         return None
@@ -150,7 +150,7 @@ def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> t
 
 
 def describe_changed_force(run: Run) -> str | None:
-    """Describe how a force differs from an earlier value in the run for the same arguments; None if it does not.
+    """Return words if the force now differs from an earlier value in the run for the same arguments, else None.
 
     A force may change slowly (with the clock) or once (after 1000 calls): two calls after the run do not show that.
     """
@@ -213,13 +213,13 @@ def nonstiff_method() -> tuple[Method, Array]:
 
 
 def stiff_method(velocities: bool) -> tuple[Method, Array]:
-    """Return the method for reruns of stiff pieces, and its nodes; `velocities`: whether it tests their errors, too."""
+    """Return the method for reruns of stiff pieces, and its nodes; `velocities`: whether to test errors of v, too."""
     tableau = radau_iia(7)
     return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
 
 
 class RerunPiece(NamedTuple):
-    """Result of a piece: states [q, v] at the requested times, the largest step size, s, and the number of steps."""
+    """Result of a rerun of a piece: rows [q, v] at the requested times, largest step size, s, and number of steps."""
 
     states: Array
     longest: float
@@ -235,7 +235,7 @@ class IndependentRerun:
     t, q, v : float, ndarray (n_q,)
         A state of the run.
     method : (method object, ndarray)
-        The method of the pieces, and the nodes of its steps at which it evaluates the equations, from 0 to 1.
+        The method of the reruns, and the nodes (fractions of a step) at which it evaluates the equations.
     rtol, atol : float, ndarray (n_q,)
         Tolerances.
     max_step : float
@@ -267,13 +267,13 @@ class IndependentRerun:
         self.next_step = np.inf
 
     def integrate(self, t0: float, state: Array, times: Array, most: int) -> RerunPiece | None:
-        """Integrate from a state [q, v] at t0 to all `times`; return None on failure, or after `most` attempts."""
+        """Integrate from a state [q, v] at t0 to all `times`; return None on failure or after about `most` attempts."""
         run, a, n = self.run, self.run.a, len(state)
-        first_step, self.next_step = self.next_step, np.inf
+        proposed_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:
             return None
         t1 = float(times[-1])
-        run.clock[a.H_NEXT] = first_step if first_step < np.inf else FIRST_STEP * (t1 - t0)
+        run.clock[a.H_NEXT] = proposed_step if proposed_step < np.inf else FIRST_STEP * (t1 - t0)
         run.work.notes[indices.KINK_AFTER] = t1
         states: list[Array] = []
         longest, n_total = 0.0, 0

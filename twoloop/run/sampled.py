@@ -32,7 +32,7 @@ from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
-MAX_STEPS = 1024  # largest number of steps in one call of the compiled loop
+MAX_STEPS = 1024  # largest number of attempted steps in one call of `advance`; more steps are left to IntegrationLoop
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # callbacks that may depend on parameters that change at samples
 CHANGED = "the parameters changed at samples"  # value of the field `changes` of the result
 
@@ -146,15 +146,15 @@ class SampledRun:
         if not self.p.size:
             raise ValueError(f"inputs are parameters, of which {self.system.name!r} has none: make it with parameters=")
         if isinstance(inputs, Mapping):
-            for place, value in inputs.items():
-                if type(place) is not int or not 0 <= place < len(self.p):
+            for index, value in inputs.items():
+                if type(index) is not int or not 0 <= index < len(self.p):
                     raise ValueError(
                         f"inputs must map places in the parameters, whole numbers from 0 to {len(self.p) - 1}, to "
-                        f"numbers; given the place {shown(place)} (a name has its place by problem.place(name))"
+                        f"numbers; given the place {shown(index)} (a name has its place by problem.place(name))"
                     )
                 number = value if type(value) is float and abs(value) < np.inf else check_finite("inputs", value)
-                if number != self.p[place]:
-                    self._write(place, number)
+                if number != self.p[index]:
+                    self._write(index, number)
             return
         values = check_real("inputs", inputs)
         if values.shape != self.p.shape or not np.isfinite(values).all():
@@ -162,8 +162,8 @@ class SampledRun:
                 f"inputs must be all {len(self.p)} parameters, finite, or a mapping from places to numbers; given "
                 f"{shown(inputs)}"
             )
-        for place in np.flatnonzero(values != self.p).tolist():
-            self._write(place, float(values[place]))
+        for index in np.flatnonzero(values != self.p).tolist():
+            self._write(index, float(values[index]))
 
     def step(self, dt: float) -> SampledState:
         """Integrate over the time dt, s, from the last sample; store and return the state at the end, a new sample."""
@@ -178,7 +178,7 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate from the last sample to `end`; repeat it with more evaluations after a short change of forces."""
+        """Integrate from the last sample to the time `end`; if short changes may be missed, repeat more closely."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
@@ -244,12 +244,12 @@ class SampledRun:
         """Compute the accelerations at t with the new parameters, and restart the method without past steps."""
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
-        begin = 0
+        n_kept = 0
         if run.plan.first is not None:  # a pair of methods: do not reset the scalars that tell which is active
             from twoloop.kernels.control.stiffness import N_SCALARS
 
-            begin = N_SCALARS + 2 * run.system.n_q
-        run.plan.memory[begin:] = run.memory[begin:]
+            n_kept = N_SCALARS + 2 * run.system.n_q
+        run.plan.memory[n_kept:] = run.memory[n_kept:]
         run.clock[: a.N_PAST] = 0.0
         if code != indices.DONE:
             raise RuntimeError(
@@ -259,13 +259,13 @@ class SampledRun:
         self._changed = False
 
     def _return_to_sample(self) -> None:
-        """Replace the run, which failed or has to be repeated, by a new one that begins at the last sample."""
-        before, n = self.run, self.system.n_q
+        """Replace the run, which failed or has to be repeated, by a new run from the state at the last sample."""
+        old_run, n = self.run, self.system.n_q
         try:
             self.run = self._run_from(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
         except ValueError as error:
             raise RuntimeError(f"step goes on from the last sample, where it cannot begin: {error}") from None
-        self.run.work.counters[:] = before.work.counters
+        self.run.work.counters[:] = old_run.work.counters
         del self.steps[self._n_steps :]
         self._changed = False
 
@@ -286,31 +286,31 @@ class SampledRun:
         if record.status != Status.REACHED_END:
             raise RuntimeError(f"step of {self.system.name!r}: {record.message}")
 
-    def _write(self, place: int, value: float) -> None:
-        if place not in self._force_parameters:
-            self._check_enters_forces_only(place, value)
-        self.p[place] = value
+    def _write(self, index: int, value: float) -> None:
+        if index not in self._force_parameters:
+            self._check_enters_forces_only(index, value)
+        self.p[index] = value
         self._changed = True
 
-    def _check_enters_forces_only(self, place: int, value: float) -> None:
-        """Raise ValueError if other callbacks than forces depend on a parameter: positions or momenta would jump."""
-        before, n = float(self.p[place]), self.system.n_q
+    def _check_enters_forces_only(self, index: int, value: float) -> None:
+        """Raise ValueError if callbacks other than forces depend on a parameter: positions or momenta would jump."""
+        old_value, n = float(self.p[index]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         state = {"q": row[:n], "v": row[n : 2 * n]}
         for kind in sorted(self.system.given.keys() - self.system.scattered - FORCE_KINDS):
             if not set(KINDS[kind].state) <= set(state):
                 continue
             values = []
-            for each in (before, value, 0.5 * before + 1.37):
-                self.p[place] = each
+            for trial_value in (old_value, value, 0.5 * old_value + 1.37):
+                self.p[index] = trial_value
                 values.append(np.concatenate([np.ravel(x) for x in parts_of(self._evaluate(kind, t, state))]))
-            self.p[place] = before
-            if any((each != values[0]).any() for each in values[1:]):
+            self.p[index] = old_value
+            if any((output != values[0]).any() for output in values[1:]):
                 raise ValueError(
-                    f"inputs must enter forces alone; that at place {place} enters {kind} of {self.system.name!r}, "
+                    f"inputs must enter forces alone; that at place {index} enters {kind} of {self.system.name!r}, "
                     "which cannot change between samples: positions or momenta would jump; start anew with others"
                 )
-        self._force_parameters.add(place)
+        self._force_parameters.add(index)
 
     def _evaluate(self, kind: str, t: float, state: dict[str, Array]) -> Any:
         return self.system.evaluate(kind, t, *(state[name] for name in KINDS[kind].state))

@@ -21,7 +21,7 @@ Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
 LOST = 1e-2  # ratio of the smallest to the largest singular value below which messages say that constraints lose rank
 SAMPLES = 33  # number of positions between two states at which the ratio of singular values is evaluated
-SHOWN = 3  # largest number of singular positions that a message names
+SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DIFFERENCE = 1e-6
 MIN_ROW_NORM = 0.1  # smallest norm of a row, over the norm expected from its derivative, with which the row is scaled
@@ -33,7 +33,8 @@ TURNED, APPARENT = 3.0, 10.0
 def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int) -> str:
     """Return sentences about the singular positions that steps crossed.
 
-    `crossings`: states before and after each; the second is missing if the run ended between them, at the state `now`.
+    `crossings`: for each position the states before and after it; the latter is missing if the run ended, at the state
+    `now`, before the crossing was complete.
     """
     ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:SHOWN]}
     singular = {t: ratio for t, ratio in ratios.items() if ratio < LOST}
@@ -123,7 +124,7 @@ def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
 
 
 def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
-    """Yield, for each crossed singular position, the states before and after, and whether special steps crossed it."""
+    """Yield, for each crossed singular position, the states before and after, and whether crossing steps were taken."""
     before: Place | None = None
     for first, *behind in crossings:
         before = first if before is None else before
@@ -143,7 +144,7 @@ def _v_slice(n: int) -> slice:
 
 
 def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
-    """Return the largest acceleration without the rows whose singular values are below `near` times the largest."""
+    """Return the largest acceleration, computed without the singular values of rows below `near` times the largest."""
     mass, rows, norms, units = in_any_units(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     kept = values > near * values[0]
@@ -156,7 +157,7 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
 
 
 def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the ratio of `singular_ratio` for scaled rows: it does not depend on the units of coordinates and rows."""
+    """Return the ratio of `singular_ratio` for the rows of `in_any_units`, which does not depend on units."""
     values = np.linalg.svd(in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
@@ -192,7 +193,7 @@ def _measured(ratios: dict[float, float]) -> str:
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
 WEAK = 1e-2  # singular value, relative to the largest one, up to which rounding errors along it are estimated
-# ratio of pivots below which errors are always estimated; factor from ratios of singular values to ratios of pivots
+# ratio of pivots below which rounding errors are always estimated; factor that converts ratios of singular values to it
 LEAST, MARGIN = 1e-5, 30.0
 
 
@@ -248,7 +249,7 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
 def _displacement_to_singular(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
     """Return an estimated displacement (n_q,) to the nearest singular position, to first order; not finite if unknown.
 
-    Among the directions that the other constraints allow, the smallest singular value changes most in this one.
+    Among the directions that the other constraints allow, the smallest singular value changes most along this one.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, held = left[:, rank - 1], right[rank - 1], right[: rank - 1]

@@ -40,9 +40,9 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# displacement of a coordinate or velocity, relative to max(1, |value|), to find the forces that depend on it
+# displacement of a coordinate or velocity x, relative to max(1, |x|), by which forces that depend on x are found
 DISPLACEMENT = 1e-3
-# numbers of entries and operations, relative to those of dense factors, above which Newton's matrix is not sparse
+# largest number of entries, and of operations, of sparse factors of Newton's matrix, relative to those of dense factors
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -58,7 +58,7 @@ def newton_form(
     """Return the program that factorizes Newton's matrix, see sparse_lu.py, and the number of groups of its columns.
 
     The columns of a group are computed from one difference of forces. `mass`, `jacobian`: indices of nonzero entries.
-    `bodies`: coordinates of each body. `stiff`: rows of `_stiff_rows`. Return None if sparse factors do not pay.
+    `bodies`: coordinates of each body. `stiff`: indices of `_stiff_rows`. Return None if sparse factors do not pay.
     """
     entries: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
@@ -85,7 +85,7 @@ def _derivative_entries(
 ) -> set[tuple[int, int]]:
     """Return the indices of nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and of their transposes.
 
-    Further columns are not searched once there are more than `max_entries` entries.
+    The search for entries ends after the column with which there are more than `max_entries` entries.
     """
 
     def reaction(q: Array) -> Array:
@@ -94,13 +94,13 @@ def _derivative_entries(
         rows, columns = system.entries["jacobian"]
         return np.bincount(columns, system.jacobian_values(t, q) * lam[rows], len(q)).astype(np.float64)
 
-    force, of_rows = system.force(t, q, v), reaction(q)
+    force, undisplaced_reaction = system.force(t, q, v), reaction(q)
     entries: set[tuple[int, int]] = set()
     for j in range(len(q)):
         changed_q, changed_v = q.copy(), v.copy()
         changed_q[j] += DISPLACEMENT * max(1.0, abs(q[j]))
         changed_v[j] += DISPLACEMENT * max(1.0, abs(v[j]))
-        differs = (system.force(t, changed_q, v) != force) | (reaction(changed_q) != of_rows)
+        differs = (system.force(t, changed_q, v) != force) | (reaction(changed_q) != undisplaced_reaction)
         differs |= system.force(t, q, changed_v) != force
         for i in np.flatnonzero(differs).tolist():
             entries |= {(i, j), (j, i)}
@@ -109,12 +109,12 @@ def _derivative_entries(
     return entries
 
 
-SINGULAR = 1e-10  # eigenvalue of a body's M, relative to the largest one, up to which its direction counts as massless
-# norm of a row's component along massless directions, relative to the row's norm, above which the row gives one of them
-# a mass
+SINGULAR = 1e-10  # eigenvalue of a body's M, relative to the largest, up to which its eigenvector has no mass
+# norm of a row's component along the massless directions of a body, relative to the row's norm, above which the row is
+# used to give one of these directions a mass
 MIN_FRACTION_ALONG = 1e-3
-MIN_SIZE_NEWTON = 1.6  # number of coordinates, relative to LARGE, from which on Newton's matrices are sparse
-# numbers of entries and of operations, relative to those of dense factors, above which the static form is not used
+MIN_SIZE_NEWTON = 1.6  # number of coordinates, relative to LARGE, from which on Newton's matrix has sparse factors
+# largest number of entries, and of operations, of the static form, relative to those of dense factors
 MAX_STATIC_SHARE = 0.05
 
 
@@ -126,8 +126,8 @@ class StaticForm(NamedTuple):
     mass: Entries  # row and column indices of the nonzero entries of M
     pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else (0, n_q)
     mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else (0, 0)
-    newton_arguments: tuple[Any, ...]  # arguments of `newton_form` after t0 and q0
-    newton: NDArray[np.int32] | None = None  # program of Newton's matrix; None until a plan needs it
+    newton_arguments: tuple[Any, ...]  # arguments of `newton_form` that follow t0 and q0
+    newton: NDArray[np.int32] | None = None  # program that factorizes Newton's matrix; None until a plan needs it
     n_groups: int = 0  # number of groups of columns of Newton's matrix, each computed from one difference of forces
 
     def matrix_cost(self) -> float:
@@ -136,7 +136,7 @@ class StaticForm(NamedTuple):
         return self.n_groups + float(self.newton[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def n_matrices(self, matrices: int) -> int:
-        """Return the number of floats for Newton's matrices in sparse form, given a plan's number of dense matrices."""
+        """Return the number of floats in a plan's sparse Newton matrices; `matrices`: its number of dense matrices."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -160,7 +160,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
-    """Return a copy of `form` with the program of Newton's matrix; None if there is none, or it does not pay."""
+    """Return a copy of `form` with the program of Newton's matrix; None if sparse factors of this do not pay."""
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
     cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
@@ -194,7 +194,7 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body to which a joint refers, or of all bodies if these have seven coordinates.
+    """Return the coordinates of each body to which a joint refers; of all bodies, if each has seven coordinates.
 
     A joint refers to only one of its two bodies. So there may be bodies, at ends of chains, to which no joint refers.
     """
@@ -210,10 +210,10 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, bodies: list[tuple[int, ...]]
 ) -> list[int]:
-    """Return indices of rows g of single bodies, such as the norm of Euler parameters, that make a singular M definite.
+    """Return indices of rows g that, added to a singular M as g g^T, give a mass to massless directions of a body.
 
-    g g^T may have entries only where M has entries, see sparse_ldl.py. No more rows than necessary are returned: other
-    rows of single bodies, such as those of a hinge on the ground, are treated like the rows of joints.
+    See sparse_ldl.py. Such a row belongs to one body, as the norm of Euler parameters, and g g^T has entries only where
+    M has. No more rows than necessary are returned: others are treated like the rows of joints.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, bodies))
@@ -226,8 +226,8 @@ def _stiff_rows(
     for i, j, value in zip(*(each.tolist() for each in (*mass, values)), strict=True):
         blocks[int(body_of[i])][index_in_body[i], index_in_body[j]] += value
         mass_entries.add((i, j))
-    free = {body: directions for body, block in blocks.items() if (directions := _without_mass(block)).size > 0}
-    if not free:
+    massless = {body: vectors for body, block in blocks.items() if (vectors := _massless_directions(block)).size > 0}
+    if not massless:
         return []
     columns: dict[int, list[tuple[int, float]]] = {}
     values = system.jacobian_values(t0, q0) if "jacobian" in system.entries else system.jacobian(t0, q0)[jacobian]
@@ -236,19 +236,19 @@ def _stiff_rows(
     stiff_rows = []
     for i, own in columns.items():
         body = int(body_of[own[0][0]])
-        if body in free and all((j, k) in mass_entries for j, _ in own for k, _ in own):
+        if body in massless and all((j, k) in mass_entries for j, _ in own for k, _ in own):
             row = np.zeros(len(coordinates[body]))
             for j, value in own:
                 row[index_in_body[j]] += value
-            component = free[body] @ row
+            component = massless[body] @ row
             if np.linalg.norm(component) > MIN_FRACTION_ALONG * np.linalg.norm(row):
                 stiff_rows.append(i)
-                free[body] = np.linalg.svd(component[None, :])[2][1:] @ free[body]
+                massless[body] = np.linalg.svd(component[None, :])[2][1:] @ massless[body]
     return stiff_rows
 
 
-def _without_mass(block: Array) -> Array:
-    """Return the directions along which a body has no mass, as rows of an array; `block`: the body's block of M."""
+def _massless_directions(block: Array) -> Array:
+    """Return the eigenvectors, as rows, along which a body has no mass; `block`: the body's diagonal block of M."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)
@@ -256,12 +256,12 @@ def _without_mass(block: Array) -> Array:
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
-    """Return whether a matrix of a system has so few entries that it pays to search for an order of elimination."""
+    """Return whether a matrix has so few entries that it pays to search for an order of elimination."""
     return n_entries <= MAX_STATIC_SHARE * n_q * n_q + 24 * n_q
 
 
 def _dense_cost(n_q: int, n_c: int) -> float:
-    """Return the estimated number of multiplications of one evaluation by a dense Schur complement."""
+    """Return the estimated number of multiplications that one evaluation by a dense Schur complement takes."""
     return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
 
 
@@ -278,14 +278,14 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
             mass = system.mass(t0, q0 + scale * size * direction)
-        except Exception:  # outside the domain of the callbacks; missed entries are found during the run
+        except Exception:  # outside the domain of the callbacks; entries missed here are found during the run
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return pattern
 
 
 GAMMA_ACCURACY = 1e-11  # smallest relative error that may be required of a gamma computed by differences of C_q and C_t
-MOST_KITS = 16  # largest number of kits in the cache of a system
+MAX_KITS = 16  # largest number of kits in the cache of a system
 
 
 def kit_of(
@@ -300,13 +300,13 @@ def kit_of(
     if plan is not None:
         return kit_for_plan(system, flags, plan)
 
-    def make() -> tuple[Kit, Any]:
+    def create() -> tuple[Kit, Any]:
         functions = system.functions
         return Kit(functions._replace(flags=flags.copy()), inner_loop), functions
 
     if flags[FORM] == AUGMENTED:  # a run may change these flags
-        return make()[0]
-    cached: tuple[Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
+        return create()[0]
+    cached: tuple[Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), create)
     return cached[0]
 
 
@@ -363,7 +363,7 @@ def is_diagonal(mass: Array) -> bool:
 
 
 def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
-    """Return the kit for some flags and the steps of a plan; it is cached with the system for later runs."""
+    """Return the kit with these flags and the steps of a plan, from the system's cache if possible; else cache it."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     numbers = (plan.numbers, plan.own_numbers)
@@ -377,25 +377,25 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     flags = flags.copy()
     flags[STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
-    kernels = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *numbers)
-    if len(kits) == MOST_KITS:
+    kit = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *numbers)
+    if len(kits) == MAX_KITS:
         del kits[next(iter(kits))]
-    kits[key] = kernels, system.functions
-    return _with_own_flags(kernels) if run_changes_flags else kernels
+    kits[key] = kit, system.functions
+    return _with_own_flags(kit) if run_changes_flags else kit
 
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return the step of a plan, and the first and second step of a pair of methods; the second may not be loaded."""
+    """Return a plan's step, and the first and second step of its pair of methods; the second is loaded when needed."""
     return loaded(plan.step), loaded(plan.first), without_loading(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:
     """Return a copy of a kit with its own flags, which a run may change; a new kit would take ten times as long."""
-    other, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
+    new_kit, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.offsets["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
-    vars(other).update(vars(kit), functions=functions, flags=flags, table=table, address=table.ctypes.data)
-    return other
+    vars(new_kit).update(vars(kit), functions=functions, flags=flags, table=table, address=table.ctypes.data)
+    return new_kit
 
 
 def workspace(
@@ -419,7 +419,7 @@ def workspace(
     n_nodes = max((int(each[N_NODES]) for each in programs), default=0)
     n_q, n_c, n_a = system.n_q, system.n_c, system.n_a
     full = min(n_c, n_q), min(n_c + n_a, n_q)
-    rank, rank_v = (given if given is not None else most for given, most in zip(ranks, full, strict=True))
+    rank, rank_v = (rank if rank is not None else highest for rank, highest in zip(ranks, full, strict=True))
     sizes = n_q, n_c, n_a, rank, rank_v, bool(reduced and n_q > rank_v), bool(augmented), n_nodes
     n_matrices = matrices * n_q**2 if static is None else static.n_matrices(matrices)
     work = empty((*sizes, None if static is None else static.static, n_matrices))
@@ -448,7 +448,7 @@ def prepare_workspace(
 
 
 def _set_constants(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
-    """Fill those arrays of a workspace in the static form that are constant during a run."""
+    """Fill the arrays of a workspace that are constant during a run in the static form."""
     work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
     work.dependent[:] = work.independent[:] = np.arange(system.n_q)
     work.counts[:] = 1.0
