@@ -20,13 +20,13 @@ from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined,
 from twoloop.kernels.data.indices import ATOL, DONE, N_OUTER, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 
-HIGHEST = 12  # largest order; the quadrature with NODES is exact up to order 13
-N_TERMS = HIGHEST + 2  # number of differences of a step, of coefficients g and of coefficients G
+HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES is exact up to order 13
+N_TERMS = HIGHEST + 2  # number of stored differences phi_i, of coefficients g_i and of coefficients G_i
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
 SAFETY = 0.8  # factor on the step size for which the estimated error would equal the tolerance
 GROWTH, SHRINKAGE = 1.2, 0.5  # largest and smallest ratio of successive step sizes
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
-LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes if dependent positions differ from their prediction
+LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes to which `departure` can lead
 RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
 
 # eight Gauss nodes on [0, 1] and their weights: exact for c_i and (1 - s) c_i up to i = 15
@@ -45,22 +45,22 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants at equal steps, lower bounds of the constants in use: after a decrease of h, constants of unequal
-# steps are smaller, and the error would be underestimated if the force jumps
+# error constants at equal steps, which are lower bounds of those that are used: after a decrease of h, the constants of
+# unequal steps are smaller, and would underestimate the error if the force jumps
 EQUAL_STEPS = _error_constants()
 
-# indices in `options`. THETA: largest last correction of a projection that has converged, see `project`
+# indices in `options`. THETA: a projection has converged when its last correction is at most THETA, see `project`
 THETA, N_OPTIONS = range(2)
-# indices of the scalars in `memory`. The scalars are followed by rows of N_TERMS + 2 coefficients, two tables of
-# differences, see _table, and two scratch rows
+# indices of the scalars in `memory`. After the scalars, `memory` contains N_ROWS rows of coefficients, see _row, two
+# tables of differences, see _table, and two scratch rows, see _scratch
 (
     CURRENT,  # index, 0 or 1, of the table of differences at the last accepted step
-    ORDER,
+    ORDER,  # order of the next attempt
     DEPTH,  # number of accelerations in the history, at most N_TERMS
-    AGE,  # number of steps accepted since the order changed or a step was rejected
+    AGE,  # number of accepted steps since the last change of the order or the last rejected step
     STARTING,  # 1: the order rises with every step
     FAILED,  # number of successive rejected attempts
-    NEXT_ORDER,
+    NEXT_ORDER,  # order chosen at the end of an attempt for the next one
     N_SCALARS,
 ) = range(8)
 # indices of the rows of coefficients: psi(n), psi(n+1), beta, g, G, and c_i at NODES
@@ -86,7 +86,7 @@ def _row(memory, which):
 
 @inlined
 def _table(memory, n, which):
-    """Return a view (N_TERMS + 1, n padded) of table `which`: phi_i is the sum of row i - 1 and the last row, d."""
+    """Return a view (N_TERMS + 1, n padded) of table number `which`: phi_i is row i - 1 plus the last row, d."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
     return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))
@@ -94,7 +94,10 @@ def _table(memory, n, which):
 
 @inlined
 def _scratch(memory, n):
-    """Return views of two rows (n padded), for velocities and positions: mean accelerations, then 1 / tolerances."""
+    """Return two scratch rows (n padded), one for velocities and one for positions, of numbers in `memory`.
+
+    The rows first contain mean accelerations over the step, and later the weights ERROR_FACTOR / tolerance.
+    """
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -144,7 +147,7 @@ def _compute_coefficients(memory, h, k):
     for i in range(N_TERMS):
         new_psi[i + 1] = psi[i] + h
     beta[0] = 1.0
-    for i in range(k):  # all quotients before their products, so that the divisions can overlap
+    for i in range(k):  # first all quotients, then all products, so that the divisions can overlap
         beta[i + 1] = new_psi[i] / psi[i] if psi[i] > 0.0 else 0.0
     for i in range(k):
         beta[i + 1] *= beta[i]
@@ -166,12 +169,12 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
-    """Store the predicted state in q1 and v1, and in `new` the differences that follow if the prediction is exact."""
+    """Store the predicted state in q1 and v1, and in table `new` the differences that follow if it is exact."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # this row is phi_{k+2} less d, because phi_{k+2} = d - beta_{k+1} phi_{k+1}
+        # row k + 1 of the table is phi_{k+2} - d, and phi_{k+2} = d - beta_{k+1} phi_{k+1}
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
@@ -224,14 +227,15 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
 def _error(g, G, h, order, largest_v, largest_q):
     """Return the estimated error of a step at `order`, in units of the tolerances.
 
-    `largest_v` and `largest_q` are the largest difference divided by the tolerances of velocities and of positions.
+    `largest_v` and `largest_q` are the largest component of phi_{order+1}, divided by the tolerances of velocities and
+    of positions.
     """
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 
 
 @merged
 def _choose_order(memory, h, k, table, d, n):
-    """Store NEXT_ORDER; return the error in units of the tolerances, and the ratio of the next step size to h.
+    """Store NEXT_ORDER; return the error, in units of the tolerances, and the ratio of the next step size to h.
 
     The rules are those of Shampine and Gordon's STEP. The order decreases if the error at lower orders is not larger.
     It increases after k + 1 steps at order k if the error at order k + 1 is smaller; while STARTING is 1, at each step.
@@ -290,7 +294,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     old, new = _table(memory, n, memory[CURRENT]), _table(memory, n, 1.0 - memory[CURRENT])
     _compute_coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
-    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # order of the next attempt if an evaluation in this attempt fails
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # the order of the next attempt if an evaluation fails in this attempt
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

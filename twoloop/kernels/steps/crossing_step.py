@@ -41,24 +41,24 @@ from twoloop.kernels.linalg.dense import copy
 
 # indices of the scalars in `options`, followed by A, A A and Legendre coefficients (S, S each), b, b A and c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
-S = 20  # number of nodes
-# change of the accelerations by a sweep, in units of the tolerances, up to which the iteration has converged
+S = 20  # number of Gauss nodes, which are the stages
+# the iteration has converged when a sweep changes accelerations by at most CONVERGED_CHANGE tolerances
 CONVERGED_CHANGE = 0.01
-# a change up to STALL_CHANGE, in units of the tolerances, also counts as converged if it is at least
-# STALL_RATIO times the change by the sweep before
+# the iteration has also converged if a sweep changes accelerations by at most STALL_CHANGE tolerances, and by at least
+# STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
 MAX_SWEEPS, FEW_SWEEPS = 40, 12  # largest number of sweeps, and number of sweeps after which more nodes are left out
-DISTANCE_FACTOR = 2.0  # factor, after FEW_SWEEPS sweeps, on the pivot below which nodes are left out
-MAX_LEFT_OUT = 9  # largest number of nodes that may be left out
-# indices of the scalars at the end of `memory`: largest_pivot, earliest and the time of `base`, see `begin`; beginning,
-# duration and end, s, of the polynomial of the last converged attempt (END = -inf: no polynomial)
+DISTANCE_FACTOR = 2.0  # factor on the pivot below which nodes are left out, if FEW_SWEEPS sweeps do not converge
+MAX_LEFT_OUT = 9  # number of left-out nodes above which the step fails
+# indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of `begin`. BEGIN,
+# DURATION, END: times (s) of the polynomial of the last converged attempt (END = -inf: no polynomial)
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
 # smallest and largest fraction of the polynomial that is accepted as a step
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
-# longest time between evaluations if all nodes are evaluated, relative to the polynomial
+# longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
 UNSEEN = 0.0767
-BACK = 0.4  # fraction of the polynomial that lies before the beginning of the step
-ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error, and factor on the estimate
+BACK = 0.4  # part of the polynomial before the beginning of the step, relative to its duration
+ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error in the step size, and factor on the error estimate
 MOVED_WEIGHT = 0.5  # factor on the largest change of a stage by its projection, which counts as an error of the step
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning
@@ -143,10 +143,10 @@ def _weight(tolerances, m, n, h, state):
 
 @compiled
 def _error(tolerances, h, state, legendre, a, n_kept):
-    """Return the error of a step, in units of the tolerances, from the decay of the Legendre coefficients of a.
+    """Return the error of a step, in units of the tolerances, estimated from the last Legendre coefficients.
 
-    The estimate is that of collocation_code.py. `n_kept`: number of nodes that are not left out; coefficients of
-    degrees from `n_kept` on are rounding errors.
+    The coefficients are those of the accelerations a (S, n). The estimate is that of collocation_code.py. `n_kept`:
+    number of nodes that are not left out; coefficients of degrees from `n_kept` on are rounding errors.
     """
     n, largest = a.shape[1], 0.0
     for m in range(n):
@@ -171,9 +171,10 @@ def _error(tolerances, h, state, legendre, a, n_kept):
 
 @merged
 def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
-    """Set q_end and v_end to the state at the time c h after the beginning of the polynomial, where it is (q, v).
+    """Set q_end and v_end to the state at the time c h after the beginning of the polynomial.
 
-    A and AA (S) are the weights of the accelerations in their integral and double integral.
+    (q, v) is the state at the beginning. A and AA (S) are the weights of the accelerations a (S, n) in their integral
+    and double integral.
     """
     _weighted_sum(A, a, v_end)
     _weighted_sum(AA, a, q_end)
@@ -184,7 +185,7 @@ def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
 
 @compiled
 def _interpolate(j, c, left_out, a):
-    """Set a[j] to the value at node j of the polynomial through the accelerations at nodes that are not left out."""
+    """Set a[j] to the value at node c[j] of the polynomial through the accelerations a at nodes with left_out = 0."""
     a[j, :] = 0.0
     for k in range(S):
         if left_out[k] == 0.0:
@@ -198,7 +199,7 @@ def _interpolate(j, c, left_out, a):
 
 @compiled
 def _widest_gap(c, c0, left_out):
-    """Return the length of the longest part of [c0, 1] without an evaluated node; the polynomial covers [0, 1]."""
+    """Return the longest part of [c0, 1] between nodes c with left_out = 0, as a fraction of the polynomial."""
     widest, before = 0.0, c0
     for k in range(S):
         if left_out[k] == 0.0 and c[k] > c0:
@@ -221,7 +222,7 @@ def _choose_partition_at_end(f, w, t, q, pivot, near):
 
 @compiled
 def _weights_to_start(b, c, c0, weights_v, weights_q):
-    """Store weights (S) of the accelerations in their integral (weights_v) and double integral (weights_q) to c0."""
+    """Store weights (S) of accelerations in weights_v and weights_q, for their integral and double integral to c0."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):
@@ -236,7 +237,7 @@ def _weights_to_start(b, c, c0, weights_v, weights_q):
 
 @merged
 def _set_base(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
-    """Set q_0 and v_0 to the state at the beginning of the polynomial, so that its state at c0 is (q, v)."""
+    """Set q_0 and v_0 to the state at the beginning of the polynomial whose state at its fraction c0 is (q, v)."""
     _weighted_sum(weights_v, a, v_0)
     _weighted_sum(weights_q, a, q_0)
     for m in range(q.size):
@@ -246,7 +247,7 @@ def _set_base(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 @compiled
 def _extrapolate(j, c, last, a):
-    """Set a[j] to the value at node j of the polynomial through the accelerations at nodes `last` (-1: no node)."""
+    """Set a[j] to the value at node c[j] of the polynomial through the accelerations at nodes `last` (-1: no node)."""
     a[j, :] = 0.0
     for k in last:
         if k >= 0:
@@ -260,7 +261,7 @@ def _extrapolate(j, c, last, a):
 
 @compiled
 def _evaluate(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acceleration):
-    """Set q, v and `acceleration` to the values of the polynomial at `time`, s, after its beginning."""
+    """Set q, v and `acceleration` (n each) to the values of the polynomial `time` seconds after its beginning."""
     fraction = time / duration
     _weights_to_start(b, c, fraction, weights_v, weights_q)
     _weighted_sum(weights_v, a, v)
@@ -280,9 +281,9 @@ def _evaluate(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acc
 
 @merged
 def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
-    """Store the state [q, v, a] of `stage` in `new_state`, as the end of a step; return the attempt.
+    """Store the state [q, v, a] of `stage`, projected onto the constraints, in `new_state`; return the attempt.
 
-    The state is first projected onto the constraints, unless its smallest pivot is below `near`.
+    The state is not projected if its smallest pivot is below `near`, or if its projection fails and `near` is positive.
     """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
@@ -318,7 +319,7 @@ def state_at(memory, options, t):
     fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
     weights = np.array(
         [_lagrange(c, x) for x in (*(fraction * c), fraction)]
-    )  # at Gauss nodes of the part before t, and at t
+    )  # values at the Gauss nodes of the interval from the beginning to t, then at t
     weights_v = fraction * b @ weights[:-1]
     weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
     q, v = q_0 + duration * (fraction * v_0 + duration * (weights_q @ a)), v_0 + duration * (weights_v @ a)
@@ -334,7 +335,7 @@ def _lagrange(c, x):
 
 @kernel(ATTEMPT)
 def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: take a piece of the polynomial in `memory`, or if there is no polynomial, compute it."""
+    """Attempt a step: take a piece of the polynomial in `memory`, or compute a polynomial if none covers the step."""
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     A, AA, legendre = options[N_SCALARS : N_SCALARS + 3 * S * S].reshape((3, S, S))
@@ -362,7 +363,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if estimated:
             duration = h + max(0.0, min(h * BACK / (1.0 - BACK), t - earliest))
     begin, c0 = t + h - duration, (duration - h) / duration
-    c_base = 0.0 if time_of_base <= t else c0  # time of the state `base`, relative to the polynomial
+    c_base = 0.0 if time_of_base <= t else c0  # time of the state `base`, as a fraction of the polynomial
     _weights_to_start(b, c, c_base, weights_v, weights_q)
     n_back = 0  # number of nodes before the state `base`
     while n_back < S and c[n_back] < c_base:
@@ -377,7 +378,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     last_0, last_1, last_2 = -1, -1, -1  # the last evaluated nodes, from which the first sweep extrapolates; -1: none
     for sweep in range(MAX_SWEEPS):
         change, moved = 0.0, 0.0
-        chooses_nodes = sweep in (0, 2, FEW_SWEEPS)  # whether to choose anew which nodes are left out
+        chooses_nodes = sweep in (0, 2, FEW_SWEEPS)  # whether this sweep decides anew which nodes are left out
         if estimated and chooses_nodes and sweep == FEW_SWEEPS:
             near = min(DISTANCE_FACTOR * near, NEAR_MOST)
         for i in range(S):
@@ -401,7 +402,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
                 left_out[j] = 0.0
-                if code == DONE:  # in a run that begins near the position, earlier pivots may all be small
+                if code == DONE:  # in a run that begins near a singular position, earlier pivots may all be small
                     largest_pivot = max(largest_pivot, w.notes[PIVOT])
                 if estimated and (code != DONE or w.notes[PIVOT] < near * largest_pivot):
                     left_out[j], code = 1.0, DONE
@@ -445,7 +446,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             converged = True
             break
         _set_base(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
-        # most rejected steps fail this test of their end, which is accurate enough after two sweeps
+        # test the end of the step early: it is accurate enough after two sweeps, and most failing steps fail here
         if sweep == 1 and estimated:
             _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
             code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
@@ -464,7 +465,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    if estimated:  # the steps that follow are pieces of the polynomial
+    if estimated:  # the next steps are pieces of this polynomial
         stored[BEGIN], stored[DURATION], stored[END] = begin, duration, t + h
         return Attempt(DONE, REPEAT, REPEAT)
     copy(q1, q_stage)

@@ -11,9 +11,9 @@ provides tangents, the derivatives are computed in every iteration: stiff direct
 turn much in a step, the iteration with older derivatives does not converge. Methods whose stages are solved together,
 as in newton_step.py, use one set of derivatives for all stages.
 
-From tangents, the dense matrix T^T (M - z^2 K - z D) T of an iteration is factored directly. newton_systems.py first
-multiplies the derivatives by the inverse of T^T M T, to use them in several systems. The direct way takes half the work
-if a matrix is used in one iteration only.
+If the system provides tangents K and D, the dense matrix T^T (M - z^2 K - z D) T of an iteration is factored directly.
+newton_systems.py first multiplies the derivatives by the inverse of T^T M T, to use them in several systems. Direct
+factorization takes half the work if each matrix is used in one iteration only.
 
 Under step-size control, TR-BDF2 continues from the embedded formula of order 3; the difference of the two formulas is
 filtered three times, which keeps the method L-stable. Then the errors of many short steps add up to the tolerance, not
@@ -73,13 +73,13 @@ from twoloop.kernels.steps.velocity_errors import (
     velocity_error,
 )
 
-# largest |A_ij - A_ji| of a matrix A that counts as symmetric, relative to its largest diagonal entry
+# a matrix A counts as symmetric if |A_ij - A_ji| is at most this fraction of its largest diagonal entry
 MAX_ASYMMETRY = 1e-12
 
 
 @compiled
 def _is_symmetric(A):
-    """Return whether A is symmetric but for rounding errors."""
+    """Return whether the matrix A is symmetric up to rounding errors, see MAX_ASYMMETRY."""
     largest, asymmetry = 0.0, 0.0
     for i in range(A.shape[0]):
         largest = max(largest, abs(A[i, i]))
@@ -90,7 +90,7 @@ def _is_symmetric(A):
 
 @compiled
 def _fill_matrix(w, memory, n, m, z, H):
-    """Store T^T (M - z^2 K - z D) T in H (m^2), where m is the number of independent coordinates."""
+    """Store T^T (M - z^2 K - z D) T in H (m^2 entries, row by row); m is the number of independent coordinates."""
     N, Kr, Dr = matrix_storage(w, n, at.SYSTEMS), matrix_storage(w, n, at.BY_Q), matrix_storage(w, n, at.BY_V)
     z2 = z * z
     if memory[at.DAMPED] == 1.0:
@@ -103,7 +103,7 @@ def _fill_matrix(w, memory, n, m, z, H):
 
 @compiled
 def factor_matrix(w, memory, z):
-    """Factor T^T (M - z^2 K - z D) T, where z is gamma times a step size, with the latest tangents; return a code."""
+    """Factor T^T (M - z^2 K - z D) T, with z = gamma h and the tangents K and D computed last; return a code."""
     n, m = w.Q.size, w.independent.size
     numbers = matrix_storage(w, n, at.FILTER)
     H = as_matrix(numbers, m)
@@ -114,15 +114,15 @@ def factor_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.SYMMETRIC] = 1.0
             return DONE
-        _fill_matrix(w, memory, n, m, z, numbers)  # the matrix is indefinite, for example if a beam is compressed
+        _fill_matrix(w, memory, n, m, z, numbers)  # L D L^T fails if the matrix is indefinite, as in a compressed beam
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
 
 @compiled
 def factor_iteration(f, w, memory, t, q, v, z):
-    """Compute the tangents at (t, q, v), the state evaluated last, and call `factor_matrix`; return a code.
+    """Compute the tangents K and D at (t, q, v) and factor T^T (M - z^2 K - z D) T; return a code.
 
-    w.lam must be the multipliers at this state.
+    The last evaluation must have been at (t, q, v), and w.lam must be the multipliers there.
     """
     n = q.size
     m = w.independent.size
@@ -148,7 +148,7 @@ def factor_iteration(f, w, memory, t, q, v, z):
 
 @compiled
 def _solve_iteration(w, memory, x):
-    """Replace the right-hand side x (n_dof) by the solution of the system that `factor_matrix` has factored."""
+    """Replace the right-hand side x (n_dof) by the solution of the system whose matrix `factor_matrix` has factored."""
     m = x.size
     H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
     if memory[at.SYMMETRIC] == 1.0:
@@ -159,7 +159,10 @@ def _solve_iteration(w, memory, x):
 
 @compiled
 def solve_iteration(w, memory, residual, a):
-    """Solve for the correction of the independent accelerations; store it in `residual` (n_q); add it to a (n_q)."""
+    """Replace `residual` (n_q) by the Newton correction of the accelerations a (n_q), and add the correction to a.
+
+    Only the entries of independent coordinates are read and changed.
+    """
     n = w.Q.size
     m = w.independent.size
     N, x = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
@@ -191,17 +194,17 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
 
 
 MAX_ITERATIONS = 8  # number of Newton iterations after which a stage has failed
-GROWTH = 2.0  # largest ratio of successive corrections with which Newton's method goes on
-LINEAR_FACTOR = 0.01  # factor on the tolerance of Newton's method if derivatives by differences make it converge slowly
-MAX_CONTRACTION = 0.1  # largest ratio of successive corrections with which derivatives by differences are reused
-VELOCITY_WEIGHT = 0.1  # weight of the position error that a correction of velocities causes, in the convergence test
+GROWTH = 2.0  # ratio of successive corrections above which Newton's method has diverged
+LINEAR_FACTOR = 0.01  # factor on Newton's tolerance with derivatives by differences, which make convergence linear
+MAX_CONTRACTION = 0.1  # ratio of successive corrections above which derivatives by differences are computed anew
+VELOCITY_WEIGHT = 0.1  # weight, in the convergence test, of the position error that a correction of velocities causes
 
 
 @inlined
 def stages_of(memory, s, n):
-    """Return views of `memory`: velocities (s, n) and accelerations (s, n) of the stages, and accelerations (n).
+    """Return views of `memory`: velocities (s, n) and accelerations (s, n) of the stages, and final accelerations (n).
 
-    The last array contains the accelerations at the last stage of the last accepted step.
+    The final accelerations are those of the last stage of the last accepted step.
     """
     last = memory.size - n
     return (
@@ -213,14 +216,14 @@ def stages_of(memory, s, n):
 
 @merged
 def gamma_of(options):
-    """Return gamma, the diagonal entry of A."""
+    """Return gamma, the diagonal entry of A (s, s) in all rows but the first."""
     s = int(options[DIAGONAL_OFFSET])
     return options[DIAGONAL_OFFSET + s * s]
 
 
 @merged
 def _set_stage_state(z, q_bar, v_bar, a, Q, V):
-    """Store the positions and velocities of a stage with accelerations a (n_q) in Q and V (n_q).
+    """Store V = v_bar + z a and Q = q_bar + z V (n_q each), the state of a stage with accelerations a.
 
     The entries of dependent coordinates are start values for the inner loop.
     """
@@ -248,9 +251,9 @@ def one_stage_of(options):
 
 @compiled
 def _prepare(f, w, options, memory, t, h, Q, V, F):
-    """Update the derivatives and factors for an iteration, unless they can be reused; return a code.
+    """Update the derivatives and factors for a Newton iteration, unless they can be reused; return a code.
 
-    (Q, V) is the state evaluated last, and F are its accelerations.
+    The last evaluation must have been at (t, Q, V), with the accelerations F.
     """
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
@@ -280,7 +283,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     residual = block(memory, 1, n, at.RESIDUAL)
     a = A_stage[0]
-    tangents_given = f.flags[FORCE_BY_Q_GIVEN] == 1
+    has_tangents = f.flags[FORCE_BY_Q_GIVEN] == 1
     last_change = 0.0
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
@@ -315,12 +318,12 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if iteration > 0 and last_change > 0.0:
             contraction = change / last_change
             memory[at.CONTRACTION] = contraction
-        if tangents_given and change <= options[OUTER_TOL]:
+        if has_tangents and change <= options[OUTER_TOL]:
             break
         if iteration > 0:
             if contraction > GROWTH:
                 return OUTER_DIVERGED
-            factor = 1.0 if tangents_given else LINEAR_FACTOR
+            factor = 1.0 if has_tangents else LINEAR_FACTOR
             if contraction < 1.0 and contraction / (1.0 - contraction) * change <= factor * options[OUTER_TOL]:
                 break
             if contraction > MAX_CONTRACTION and memory[at.FRESH] == 0.0:
@@ -334,34 +337,34 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# number of times that the difference of the two formulas is filtered before it is subtracted: with fewer filters, the
-# method is unstable for vibrations, see tests/kernels/test_diagonal.py
+# number of times that the difference of the two formulas is filtered before it is subtracted from the result: with
+# fewer filters, the method is unstable for vibrations, see tests/kernels/test_diagonal.py
 N_FILTERS = 3
 
-# largest value, for a jump of the accelerations, of the sum of `lower` times the stage accelerations, relative to the
-# range of these accelerations; from this value on, `_error_at_jumps` does not reduce its estimate
+# largest ratio of |sum_k jump_weights[k] a_k| to the range of the stage accelerations a_k that a single jump can cause:
+# at a smaller ratio, `_error_at_jumps` reduces its estimate in proportion
 MAX_JUMP_RATIO = 0.174
 
 
 @compiled
 def _filter(f, w, options, memory, h, e_q, e_v):
-    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, with the latest factors.
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, with the factors computed last.
 
-    J is the Jacobian of (v, F). Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
+    J is the Jacobian of (v, F) by (q_i, v_i). Only the first n_dof numbers of e_q and e_v (n_q) are read and changed.
     """
     z = h * gamma_of(options)
-    count = w.independent.size
+    n_dof = w.independent.size
     if has_dense_tangents(f, w):
-        filter_by_iteration(w, memory, z, e_q[:count], e_v[:count])
+        filter_by_iteration(w, memory, z, e_q[:n_dof], e_v[:n_dof])
     else:
         filter_error(f, w, options, memory, one_stage_of(options), h, e_q, e_v)
-    for i in range(count):
+    for i in range(n_dof):
         e_q[i] += z * e_v[i]
 
 
 @compiled
 def _factor_filter(f, w, options, memory, h):
-    """Factor the matrix with which `_filter` filters errors of steps of size h; return a code."""
+    """Factor the matrix that `_filter` needs for errors of steps of size h; return a code."""
     if has_dense_tangents(f, w):
         return factor_matrix(w, memory, h * gamma_of(options))
     return factor_filter(f, w, options, memory, one_stage_of(options), h)
@@ -371,7 +374,7 @@ def _factor_filter(f, w, options, memory, h):
 def _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
     """Store `factor` h sum_k weights[k] V_stage[k] in e_q, and `factor` h sum_k weights[k] A_stage[k] in e_v.
 
-    Only the entries of the independent coordinates are computed, and stored as the first n_dof numbers.
+    The first n_dof numbers of e_q and e_v (n_q) become the entries of the independent coordinates.
     """
     for i in range(w.independent.size):
         j = w.independent[i]
@@ -385,7 +388,7 @@ def _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
 
 @compiled
 def _renew_derivatives(f, w, options, memory, t, h, new_state):
-    """Compute the derivatives at `new_state`, and factor the systems for steps of size h; return a code."""
+    """Compute the derivatives at `new_state` and t, and factor the systems for steps of size h; return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -406,17 +409,17 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
 
 @compiled
 def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
-    """Return the largest component of an error estimate, in units of the tolerances.
+    """Return the largest component of the error estimate of `_weighted_difference`, in units of the tolerances.
 
-    The estimate is that of `_weighted_difference`. It is filtered with the latest factors (Hosea and Shampine 1996), so
-    that stiff components do not count. If outdated derivatives would change the result, they are computed anew. On
-    return, the vectors E_Q and E_V of `memory` contain the estimate, filtered twice.
+    The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If the derivatives are
+    so outdated that the filter is wrong, they are computed anew. On return, the vectors E_Q and E_V of `memory` contain
+    the estimate, filtered twice.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
     unfiltered, filtered_once = vector(memory, 1, n, at.A_NEW), vector(memory, 1, n, at.A_MID)
-    count = w.independent.size
+    n_dof = w.independent.size
     z = h * gamma_of(options)
     _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
     copy(e_v, unfiltered)
@@ -431,7 +434,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
         copy(e_v, unfiltered)
         _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
-    for i in range(count):
+    for i in range(n_dof):
         j = w.independent[i]
         scale = allowed(tolerances, j, q[j], q1[j])
         error = max(error, abs(e_q[i]) / scale)
@@ -450,9 +453,9 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
 
 @compiled
 def _extrapolate(f, w, options, memory, h, q1, v1):
-    """Replace (q1, v1), the end of the step, by the result of the embedded formula.
+    """Replace (q1, v1), the state at the end of the step, by the result of the embedded formula.
 
-    (E_Q, E_V) must be the difference of the two formulas, which `_error` has filtered twice.
+    On entry, E_Q and E_V in `memory` must be the difference of the two formulas, as `_error` has filtered it (twice).
     """
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, N_FILTERS):
@@ -464,9 +467,9 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the position error, in units of the tolerances, that the velocity error E_V causes in slow directions.
+    """Return the effect, in units of the tolerances, of the velocity error E_V in slow directions, see newton_step.py.
 
-    Returns 0 if E_V is too small to matter; see newton_step.py. Overwrites E_Q, E_V and the factors.
+    The result is 0 if all of E_V has an effect of at most 1. E_Q, E_V and the factors are overwritten.
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
@@ -481,28 +484,28 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     h_longer = STEPS_TO_DECAY * h / gamma_of(options)
     if _factor_filter(f, w, options, memory, h_longer) == DONE:
         _filter(f, w, options, memory, h_longer, e_q, e_v)
-        # if the motion is unstable, the system may be nearly singular, and its solution too large
+        # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     memory[at.H_FACTORED] = 0.0
     return error
 
 
 @compiled
-def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower):
+def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, jump_weights):
     """Return a second error estimate, in units of the tolerances, for accelerations that jump within the step.
 
-    A jump in the first half of the step hardly changes the first estimate, which has small weights there. `lower`
-    (s) are weights of another embedded formula. The sum of `lower` times the accelerations of the stages is zero if the
-    accelerations are quadratic in time, small relative to their range if they are smooth, and large if they jump. The
-    second estimate is multiplied by the ratio of this sum to the range, so that its order exceeds that of the first.
+    The first estimate has small weights in the first half of the step, and hardly shows a jump there. `jump_weights`
+    (s) are those of another embedded formula. The sum of jump_weights[k] A_stage[k] is zero if the accelerations are
+    quadratic in time, small relative to their range if they are smooth, and large if they jump. The second estimate
+    contains the ratio of this sum to the range as a factor, so that its order exceeds that of the first.
     """
     n = w.Q.size
     deviation, widest = 0.0, 0.0
     for j in w.independent:
         low, high, total = A_stage[0, j], A_stage[0, j], 0.0
-        for k in range(lower.size):
+        for k in range(jump_weights.size):
             low, high = min(low, A_stage[k, j]), max(high, A_stage[k, j])
-            total += lower[k] * A_stage[k, j]
+            total += jump_weights[k] * A_stage[k, j]
         scale = allowed(tolerances, j, state[n + j], new_state[n + j])
         deviation, widest = max(deviation, abs(total) / scale), max(widest, (high - low) / scale)
     if deviation == 0.0:
@@ -510,7 +513,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
     if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
     factor = min(1.0, deviation / (MAX_JUMP_RATIO * widest))
-    error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower, factor)
+    error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, jump_weights, factor)
     if error <= 1.0:
         error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage))
     return error
@@ -522,7 +525,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[DIAGONAL_OFFSET])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # not F at this state, which contains the stiffness times Newton's residual
+        copy(A_stage[s - 1], a_end)  # not F at the last stage, which contains Newton's residual times the stiffness
         memory[at.FRESH] = 0.0
 
 
@@ -530,10 +533,10 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: solve for the stages one after another; the last stage is the end of the step."""
     s = int(options[DIAGONAL_OFFSET])
-    o = DIAGONAL_OFFSET + 1
-    A = options[o : o + s * s].reshape((s, s))
-    c, weights = options[o + s * s : o + s * s + s], options[o + s * s + s : o + s * s + 2 * s]
-    lower = options[o + s * s + 2 * s : o + s * s + 3 * s]
+    begin = DIAGONAL_OFFSET + 1
+    A = options[begin : begin + s * s].reshape((s, s))
+    c, weights = options[begin + s * s : begin + s * s + s], options[begin + s * s + s : begin + s * s + 2 * s]
+    jump_weights = options[begin + s * s + 2 * s : begin + s * s + 3 * s]
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -568,7 +571,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)
-    for m in w.dependent:  # predicted by the formula; compared below with the positions that the constraints determine
+    for m in w.dependent:  # positions by the formula: `departure` compares them with positions on the constraints
         q1[m] = q_bar[m] + h * A[s - 1, s - 1] * V[m]
     for m in w.independent:
         q1[m] = Q[m]
@@ -582,8 +585,10 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             _extrapolate(f, w, options, memory, h, q1, v1)
         error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage))
         if error <= 1.0 and options[options.size - 1] == 0.0:
-            jumps = _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower)
-            error = max(error, jumps)
+            error_at_jumps = _error_at_jumps(
+                f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, jump_weights
+            )
+            error = max(error, error_at_jumps)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     store_prediction(w, q1)

@@ -15,15 +15,15 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, N_OUTER, N
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, evaluate_state, project
 from twoloop.kernels.linalg.dense import copy
 
-# indices of the scalars in `options`. The scalars are followed by A (s, s), b (s), c (s) and the weights of the two
-# error estimates (s each). FREE: 1 if stages are not projected
+# indices of the scalars in `options`, for arguments of options_array. After the scalars, `options` contains A (s, s),
+# b (s), c (s) and the weights of the two error estimates (s each). FREE: 1 if stages are not projected
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
-# indices of the vectors in `memory`. The vectors are followed by the slopes of the stages. A vector or slope has 2 n_q
+# indices of the vectors in `memory`, after which come the slopes [v, a] of the s stages. A vector or slope has 2 n_q
 # numbers, padded to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
 BLOCK = 8  # number of sums that `_weighted_sum` accumulates in registers
-# factor on the error estimate once the run has come near a singular position, because phase errors grow at each such
-# position; the factor is reduced if the smallest tolerance over the factor would be below LEAST_STRICT
+# STRICT: factor on the error estimate once a run has come near a singular position, because phase errors grow at each
+# singular position. The factor is smaller, but at least 1, where (smallest tolerance) / STRICT is below LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -37,7 +37,7 @@ def options_array(
     free: bool = False,
     theta: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` that the step reads.
+    """Return the array `options` of `explicit_step` for the tableau A (s, s), b (s), c (s).
 
     `fine`, `coarse`: weights (s) of the two error estimates; `free`: stages are not projected; `theta`: see `project`.
     """
@@ -64,7 +64,7 @@ def _width(n):
 
 @inlined
 def tableau_of(options):
-    """Return the number of stages s, and views of `options`: A, b, c, and the weights of the two error estimates."""
+    """Return the number of stages s and views of `options`: A, b, c and the weights (s) of both error estimates."""
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))
@@ -80,14 +80,14 @@ def _vector(memory, n, which):
 
 @inlined
 def _slopes(memory, s, n):
-    """Return a view (s, 2 n padded) of the slopes in `memory`: the velocities and the accelerations of each stage."""
+    """Return a view (s, 2 n padded) of the slopes in `memory`: velocities and accelerations [v, a] of each stage."""
     begin = N_VECTORS * _width(n)
     return memory[begin : begin + s * _width(n)].reshape((s, _width(n)))
 
 
 @compiled
 def _weighted_sum(weights, slopes, total):
-    """Store the sum of weights[k] slopes[k] over k in `total`, BLOCK entries at a time."""
+    """Store the sum of weights[k] slopes[k] over the stages k in `total` (2 n padded), BLOCK entries at a time."""
     for m in range(0, total.size, BLOCK):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for k in range(weights.size):
@@ -112,7 +112,7 @@ def _weighted_sum(weights, slopes, total):
 
 @compiled
 def _advance(y, h, weights, slopes, total, y1):
-    """Set y1 to y + h sum_k weights[k] slopes[k]; `total` is scratch. Adding y last leads to a single rounding."""
+    """Set y1 to y + h sum_k weights[k] slopes[k]; `total` is scratch. As y is added last, y is rounded only once."""
     _weighted_sum(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -120,12 +120,12 @@ def _advance(y, h, weights, slopes, total, y1):
 
 @compiled
 def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
-    """Return the error e^2 / sqrt(e^2 + d^2) of a step, in units of the tolerances.
+    """Return the error e^2 / sqrt(e^2 + d^2) of a step from y to y1, in units of the tolerances.
 
-    e and d are the largest components of the estimates `fine_error` and `coarse_error` (2 n) of positions and
-    velocities, relative to atol + rtol |y|. For each component separately, the error would be e, of low order, where d
-    passes through zero, at the cost of up to 30 % more evaluations. If `strict`, return e^(3/2) / (e^2 + d^2)^(1/4):
-    near a singular position, terms of high order are not small (an error of 47 tolerances was estimated as 1.4).
+    e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
+    velocities), relative to atol + rtol |y|. A formula for each component alone would give e, of low order, where the
+    component's d passes through zero, and cost up to 30 % more evaluations. If `strict`, the error is e^(3/2) / (e^2 +
+    d^2)^(1/4): near a singular position, terms of high order are not small (47 tolerances were estimated as 1.4).
     """
     n = fine_error.size // 2
     rtol = tolerances[RTOL]
@@ -145,7 +145,7 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
 
 @compiled
 def _error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
-    """Return the error of a step from y to y1, in units of the tolerances; overwrite `fine_error`, `coarse_error`."""
+    """Return the error of a step from y to y1, in units of the tolerances; fill `fine_error` and `coarse_error`."""
     _weighted_sum(fine, slopes, fine_error)
     _weighted_sum(coarse, slopes, coarse_error)
     for m in range(y.size):
@@ -156,15 +156,15 @@ def _error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error,
 
 @kernel(ATTEMPT, vectorized=True)
 def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step; if its error is above 1, the accelerations at its end are not computed."""
+    """Attempt a step of size h; if its error is above 1, do not compute the accelerations at its end."""
     s, A, b, c, fine, coarse = tableau_of(options)
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     stage, fine_error, coarse_error = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
     slopes = _slopes(memory, s, n)
-    # near a singular position stages are projected, because it matters on which side of this position a stage is, and
-    # how accurate its velocities are
+    # near a singular position all stages are projected: it matters on which side of the position a stage lies, and how
+    # accurate its velocities are
     is_near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
     free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)

@@ -43,9 +43,9 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
-# ratio of the last two corrections of Newton's method above which the next step computes new derivatives
+# ratio of the last two Newton corrections above which the next step computes new derivatives
 SLOW_CONTRACTION = 0.05
-# largest correction that counts as a rounding error in steps of fixed size, relative to max(1, |value|)
+# largest Newton correction that counts as a rounding error in steps of fixed size, relative to max(1, |value|)
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
@@ -53,8 +53,8 @@ MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     """Solve for the stage accelerations A_stage (s, n) by Newton's method; return a code.
 
-    On entry, A_stage contains predicted accelerations. Stores CONTRACTION, the ratio of the last two corrections, in
-    `memory`.
+    On entry, A_stage contains predicted accelerations. The ratio of the last two corrections is stored in
+    memory[CONTRACTION].
     """
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
@@ -62,9 +62,9 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     Q_stage, V_stage = block(memory, s, n, at.Q_STAGE), block(memory, s, n, at.V_STAGE)
     a_new = vector(memory, s, n, at.A_NEW)
     previous_change = 0.0
-    floor = MAX_ROUNDING_CORRECTION_FIXED
+    max_rounding = MAX_ROUNDING_CORRECTION_FIXED
     if tolerances[ESTIMATE] == 1.0:
-        floor = MAX_ROUNDING_CORRECTION * tolerances[LEAST]
+        max_rounding = MAX_ROUNDING_CORRECTION * tolerances[LEAST]
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for j in range(s):
@@ -111,22 +111,22 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
             contraction = change / previous_change if previous_change > 0.0 else 0.0
             memory[at.CONTRACTION] = contraction
             if contraction >= 0.9:
-                return DONE if change <= floor else OUTER_DIVERGED
+                return DONE if change <= max_rounding else OUTER_DIVERGED
             if contraction / (1.0 - contraction) * change <= options[OUTER_TOL]:
                 return DONE
-            # fail early if the remaining iterations cannot reach the tolerance
+            # fail early if the corrections cannot fall to the tolerance in the remaining iterations
             n_left = MAX_ITERATIONS - 1 - iteration
-            if change * contraction**n_left / (1.0 - contraction) > max(options[OUTER_TOL], floor):
+            if change * contraction**n_left / (1.0 - contraction) > max(options[OUTER_TOL], max_rounding):
                 return OUTER_DIVERGED
         elif change <= 1e-3 * options[OUTER_TOL]:
             return DONE
         previous_change = change
-    return DONE if previous_change <= floor else OUTER_DIVERGED
+    return DONE if previous_change <= max_rounding else OUTER_DIVERGED
 
 
 @compiled
 def _filter(f, w, options, memory, h, e_q, e_v):
-    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma0, where J is the Jacobian of (v, F).
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma0 and the Jacobian J of (v, F) by (q_i, v_i).
 
     Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
     """
@@ -183,11 +183,11 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the position error, in units of the tolerances, that the velocity error E_V causes in slow directions.
+    """Return the effect, in units of the tolerances, of the velocity error E_V in slow directions, see velocity_error.
 
     In `filtered_velocity_error`, errors last as long as their fastest component. Here, a filter keeps the component
-    that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. Returns 0 if E_V is too small
-    to matter. Overwrites E_Q, E_V and the factors of the filter.
+    that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. The result is 0 if all of E_V
+    has an effect of at most 1. E_Q, E_V and the factors of the filter are overwritten.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[newton_options_at(s) + at.GAMMA0]
@@ -200,7 +200,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
         e_q[i] = 0.0
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
-        # if the motion is unstable, the system may be nearly singular, and its solution too large
+        # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
@@ -223,7 +223,7 @@ def settle_newton(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step with Newton's method as the outer loop and an embedded estimate of the error."""
+    """Attempt a step of size h by Newton's method, with an embedded estimate of the error."""
     s, _, _, b, bA, c = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -239,8 +239,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # derivatives at the middle stage: stiff directions turn as the bodies move, and differ least from those of
-            # the other stages there. Between two stages, a force might act that acts at no stage
+            # compute derivatives at the middle stage: stiff directions turn as the bodies move, and those of the middle
+            # stage differ least from those of the others. Between stages, a force might act that acts at no stage
             x = node * h
             for m in range(n):
                 q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
@@ -271,7 +271,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the state extrapolated to the middle stage may be wrong, for example if friction is no longer stiff there:
+        # the state extrapolated to the middle stage may be wrong, for example if friction is not stiff in this state:
         # repeat with derivatives at the beginning of the step
         if memory[at.FRESH] == 1.0:
             node = 0.0

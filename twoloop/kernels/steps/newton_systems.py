@@ -20,12 +20,13 @@ There are three kinds of storage:
 - dense: J_q and J_v (n_dof, n_dof), from the tangents K and D if the system provides them, otherwise by differences of
   the right-hand side;
 - banded, if the system has a bandwidth b: K, D and the border, at a cost proportional to n_q. Without tangents, K and D
-  are computed by differences in 2 b + 1 groups of columns that share no row (Curtis, Powell and Reid 1974, doi
+  are computed by differences, in 2 b + 1 groups of columns without common rows (Curtis, Powell and Reid 1974, doi
   10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
 - sparse, for large systems: all coordinates are treated as independent, and the bordered matrix, with the right-hand
   side [M r; G r], has a fixed sparsity pattern. K and D are computed by differences in groups of columns. Each time,
-  the change of the residual that they predict is compared with the effect of displacing all coordinates at once. A
-  deviation shows that entries are missing, which were zero when the pattern was recorded: other storage is then needed.
+  all coordinates are displaced at once, too, and the change of the residual is compared with the change that K and D
+  predict. A deviation shows that entries are missing, which were zero when the pattern was recorded: other storage is
+  then needed.
 """
 
 import numpy as np
@@ -93,14 +94,14 @@ from twoloop.kernels.steps.stages import (
 )
 
 MAX_ITERATIONS = 15  # number of Newton iterations after which a step has failed
-# relative difference up to which step sizes count as equal: they are differences of times, with rounding errors
+# relative difference of step sizes that count as equal: as differences of times, they have rounding errors
 EQUAL_STEP_TOLERANCE = 1e-9
-# largest correction, over the smallest tolerance, that counts as a rounding error once corrections do not decrease
+# largest Newton correction, relative to the smallest tolerance, that counts as a rounding error if it does not decrease
 MAX_ROUNDING_CORRECTION = 0.1
 
 RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to max(1, |value|)
-# if all coordinates are displaced at once, the displacement of coordinate i is multiplied by 1 + UNEQUAL (i mod
-# N_UNEQUAL), because the effects of equal displacements might cancel
+# if all coordinates are displaced at once, the displacement of coordinate i gets the factor 1 + UNEQUAL (i mod
+# N_UNEQUAL), because the effects of equal displacements might cancel each other
 UNEQUAL, N_UNEQUAL = 0.37, 7
 
 # --- tangents K and D, of which only the band |i - j| <= b is computed and read
@@ -108,7 +109,7 @@ UNEQUAL, N_UNEQUAL = 0.37, 7
 
 @inlined
 def displace_unequally(value, index):
-    """Return a coordinate or velocity, `value`, displaced by an amount that depends on its `index`, see UNEQUAL."""
+    """Return a coordinate or velocity `value` plus a displacement that depends on its `index`, see UNEQUAL."""
     return value + RELATIVE_DISPLACEMENT * max(1.0, abs(value)) * (1.0 + UNEQUAL * (index % N_UNEQUAL))
 
 
@@ -131,8 +132,8 @@ def _check_band_finite(A, b):
 
 
 @compiled
-def _jacobian_differs(f, w, t, q):
-    """Store C_q at q in w.Gx; return whether it differs from w.G."""
+def _has_jacobian_changed(f, w, t, q):
+    """Store C_q at (t, q) in w.Gx; return whether w.Gx then differs from w.G."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -144,21 +145,21 @@ def _jacobian_differs(f, w, t, q):
 
 @compiled
 def _subtract_reaction_differences(f, w, t, q, moved, b, K):
-    """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K with |i - j| <= b.
+    """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K (n_q, n_q) with |i - j| <= b.
 
-    w.G must be C_q at q. Coordinates j, j + 2 b + 1, ... are displaced at once. `moved` (n_q) is scratch.
+    w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... are displaced at once. `moved` (n_q) is scratch.
     """
     n = q.size
     for j in range(n):
         moved[j] = displace_unequally(q[j], j)
-    if not _jacobian_differs(f, w, t, moved):
+    if not _has_jacobian_changed(f, w, t, moved):
         return
     width = min(n, 2 * b + 1)
     for group in range(width):
         copy(q, moved)
         for j in range(group, n, width):
             moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(q[j]))
-        if not _jacobian_differs(f, w, t, moved):
+        if not _has_jacobian_changed(f, w, t, moved):
             continue
         for j in range(group, n, width):
             displacement = moved[j] - q[j]
@@ -169,9 +170,9 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
 
 @compiled
 def tangent_by_q(f, w, t, q, v, b, moved, K, R):
-    """Store in K (n_q, n_q) its entries with |i - j| <= b at (t, q, v), the state evaluated last; return a code.
+    """Store the entries with |i - j| <= b of d(Q - C_q^T lam)/dq at (t, q, v) in K (n_q, n_q); return a code.
 
-    `moved` (n_q) and R (n_q, n_q) are scratch.
+    The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
     """
     _clear_band(K, b)
     f.force_by_q(t, q, v, f.p, K)
@@ -188,7 +189,7 @@ def tangent_by_q(f, w, t, q, v, b, moved, K, R):
 
 @compiled
 def tangent_by_v(f, t, q, v, b, D):
-    """Store in D (n_q, n_q) its entries with |i - j| <= b, if the system provides them; return a code."""
+    """Store the entries with |i - j| <= b of dQ/dv in D (n_q, n_q), if the system provides them; return a code."""
     if f.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
     _clear_band(D, b)
@@ -224,11 +225,11 @@ def reduce_to_independents(w, A, AT, B):
 
 @compiled
 def _dense_from_tangents(f, w, memory, s, t, q, v):
-    """Store J_q and J_v, computed from the tangents of the system at the state evaluated last; return a code."""
+    """Store J_q and J_v, computed from K and D at (t, q, v), the last evaluated state, in w.matrices; return a code."""
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    # K (then D), T^T M T and A T overwrite the factors, which are no longer needed
+    # K (later D), T^T M T and the products A T overwrite factors of earlier matrices, which are no longer needed
     K, R = as_matrix(matrix_storage(w, n, FILTER), n), as_matrix(matrix_storage(w, n, SYSTEMS), n)
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
@@ -254,7 +255,7 @@ def _dense_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v at (t, q, v), the state evaluated last, whose accelerations are a; return a code."""
+    """Store J_q and J_v in w.matrices; return a code. (t, q, v, a): last evaluated state and its accelerations."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
         return _dense_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
@@ -275,7 +276,7 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
         for row in range(m):
             i = w.independent[row]
             Jq[row, column] = (a_new[i] - a[i]) / displacement
-    # displace all velocities at once: if no acceleration changes, J_v is zero
+    # displace all velocities at once: if this changes no acceleration, J_v is zero
     copy(q, q_moved)
     for column in range(m):
         j = w.independent[column]
@@ -306,7 +307,7 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense(w, memory, s, which, z, matrix):
-    """Store the factors of I - z^2 J_q - z J_v in `matrix`; return a code. `which`: argument k of `pivots_of`."""
+    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, the pivots in pivots_of(..., `which`); return a code."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
     damped = memory[DAMPED] == 1.0
@@ -339,16 +340,16 @@ def _filter_dense(w, options, memory, s, h, e_q, e_v):
 
 @inlined
 def _band(numbers, n, b):
-    """Return a view (n, 2 b + 1) of `numbers`, the storage of K or D: [i, b + j - i] is the entry (i, j)."""
+    """Return a view (n, 2 b + 1) of `numbers`, which store K or D: its element [i, b + j - i] is the entry (i, j)."""
     return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
 
 
 @inlined
 def _border(w, n, r, b):
-    """Return views of three arrays that are stored after K, and belong to the state at which K was computed.
+    """Return views of three arrays, stored after K, for the state at which K was computed.
 
-    They are the r independent rows of C_q (r, n), a copy of w.D (n - r + 1, r), and the r dependent coordinates to
-    which the columns of w.D belong.
+    The arrays are the independent rows of C_q (r, n), a copy of w.D (n - r + 1, r), and the indices (r) of the
+    dependent coordinates to which the columns of w.D belong.
     """
     numbers = matrix_storage(w, n, BY_Q)
     start = n * (2 * b + 1)
@@ -360,8 +361,8 @@ def _border(w, n, r, b):
 
 
 @compiled
-def _banded_residual(f, w, t, q, v):
-    """Store Q - C_q^T lam at (t, q, v) in w.Q, with lam = w.lam. Overwrites w.Gx with C_q."""
+def _update_banded_residual(f, w, t, q, v):
+    """Store Q - C_q^T w.lam at (t, q, v) in w.Q, and C_q in w.Gx."""
     w.counters[N_EVALUATIONS] += 1
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
@@ -373,8 +374,8 @@ def _banded_residual(f, w, t, q, v):
 
 
 @compiled
-def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
-    """Store K, or D if `by_v`, in `band` (n_q, 2 b + 1), computed by differences; return DONE, or NOT_FINITE.
+def _fill_band_by_differences(f, w, t, q, v, by_v, base, moved, b, band):
+    """Store K, or D if `by_v`, in `band` (n_q, 2 b + 1), computed by differences; return DONE or NOT_FINITE.
 
     Columns j, j + 2 b + 1, ... are computed at once. `base` (n_q) is the residual at (q, v); `moved` (n_q) is scratch.
     """
@@ -385,9 +386,9 @@ def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
         for j in range(group, n, 2 * b + 1):
             moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
         if by_v:
-            _banded_residual(f, w, t, q, moved)
+            _update_banded_residual(f, w, t, q, moved)
         else:
-            _banded_residual(f, w, t, moved, v)
+            _update_banded_residual(f, w, t, moved, v)
         for j in range(group, n, 2 * b + 1):
             displacement = moved[j] - base_point[j]
             for i in range(max(0, j - b), min(n, j + b + 1)):
@@ -408,7 +409,7 @@ def _copy_band(A, b, band):
 
 @compiled
 def _band_from_tangents(f, w, memory, s, t, q, v, b):
-    """Store K and D as bands, from the tangents of the system at the state evaluated last; return a code."""
+    """Store the tangents K and D at (t, q, v), the last evaluated state, as bands in w.matrices; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, FILTER).reshape((n, n)), matrix_storage(w, n, SYSTEMS).reshape((n, n))
     code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
@@ -424,7 +425,7 @@ def _band_from_tangents(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _banded_derivatives(f, w, memory, s, t, q, v):
-    """Store K and D as bands, and the border, at (t, q, v), the state evaluated last; return a code."""
+    """Store K and D, as bands, and the border at (t, q, v), the last evaluated state, in w.matrices; return a code."""
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
@@ -439,29 +440,29 @@ def _banded_derivatives(f, w, memory, s, t, q, v):
     if f.flags[FORCE_BY_Q_GIVEN] == 1:
         return _band_from_tangents(f, w, memory, s, t, q, v, b)
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
-    _banded_residual(f, w, t, q, v)
+    _update_banded_residual(f, w, t, q, v)
     copy(w.Q, base)
-    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(matrix_storage(w, n, BY_Q), n, b))
+    code = _fill_band_by_differences(f, w, t, q, v, False, base, moved, b, _band(matrix_storage(w, n, BY_Q), n, b))
     if code != DONE:
         return code
-    # displace all velocities at once: if the residual does not change, D is zero
+    # displace all velocities at once: if this does not change the residual, D is zero
     for j in range(n):
         moved[j] = displace_unequally(v[j], j)
-    _banded_residual(f, w, t, q, moved)
+    _update_banded_residual(f, w, t, q, moved)
     memory[DAMPED] = 0.0
     for i in range(n):
         if w.Q[i] != base[i]:
             memory[DAMPED] = 1.0
     if memory[DAMPED] == 0.0:
         return DONE
-    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(matrix_storage(w, n, BY_V), n, b))
+    return _fill_band_by_differences(f, w, t, q, v, True, base, moved, b, _band(matrix_storage(w, n, BY_V), n, b))
 
 
 @compiled
 def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
-    """Store the factors of M - z^2 K - z D with its border in `numbers`; return a code.
+    """Store the factors of M - z^2 K - z D with the border C_q in `numbers`; return a code.
 
-    `which` is the argument k of `pivots_of`; `factorize` and `substitute` are LAPACK routines, real or complex.
+    The pivots are stored in pivots_of(..., `which`); `factorize` and `substitute` are LAPACK routines, real or complex.
     """
     n = w.Q.size
     K, D = _band(matrix_storage(w, n, BY_Q), n, b), _band(matrix_storage(w, n, BY_V), n, b)
@@ -479,7 +480,7 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
 
 @compiled
 def _multiply_by_T(w, b, x, X):
-    """Store T x in X (n_q), where only the first n_dof numbers of x (n_q) are read."""
+    """Store the product T x in X (n_q); x is the first n_dof numbers of the array x (n_q)."""
     n_dof = w.independent.size
     _, D, columns = _border(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -506,7 +507,7 @@ def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
 def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
     """Replace x by the solution y of (I - z^2 J_q - z J_v) y = x, with the factors of the bordered matrix.
 
-    The vectors x and y are the first n_dof numbers of the array x (n_q); its other numbers and X (n_q) are scratch.
+    x and y are the first n_dof numbers of the array x (n_q); the other numbers of this array and X (n_q) are scratch.
     """
     _multiply_by_T(w, b, x, X)
     x[:] = 0.0
@@ -516,9 +517,9 @@ def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
 
 @compiled
 def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
-    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0.
+    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
 
-    These vectors are the first n_dof numbers of the arrays e_q and e_v (n_q).
+    e_q and e_v are the first n_dof numbers of arrays (n_q); the other numbers of e_v are scratch.
     """
     n = w.Q.size
     b = f.flags[BANDWIDTH]
@@ -537,8 +538,8 @@ def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# largest difference between the predicted and the actual change of a residual, relative to the sum of the absolute
-# terms of the prediction: a larger difference shows that the sparsity pattern lacks entries
+# difference between the predicted and the actual change of a residual, relative to the sum of the absolute terms of the
+# prediction, above which the sparsity pattern lacks entries
 MAX_DEVIATION = 0.2
 NOISE = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_vectors returns first
@@ -554,19 +555,19 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_state(f, w):
-    """Return views of w.matrices: entries of M, G, K and D; w.counts and factors by which rows of G stiffen M."""
+    """Return views of w.matrices: entries of M, G, K and D, a copy of w.counts, stiffnesses (n_c) of redundant rows."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
-    a = n_mass + n_jacobian
-    b = a + mass_of(f.newton_program)[0].size - n_mass
-    c = b + b - a
+    begin_K = n_mass + n_jacobian
+    begin_D = begin_K + mass_of(f.newton_program)[0].size - n_mass
+    begin_counts = begin_D + begin_D - begin_K
     numbers = w.matrices
     return (
         numbers[:n_mass],
-        numbers[n_mass:a],
-        numbers[a:b],
-        numbers[b:c],
-        numbers[c : c + n_rows],
-        numbers[c + n_rows : c + 2 * n_rows],
+        numbers[n_mass:begin_K],
+        numbers[begin_K:begin_D],
+        numbers[begin_D:begin_counts],
+        numbers[begin_counts : begin_counts + n_rows],
+        numbers[begin_counts + n_rows : begin_counts + 2 * n_rows],
     )
 
 
@@ -576,20 +577,20 @@ def _sparse_vectors(f, w):
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
     begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices
-    middle = begin + N_SPARSE_VECTORS * n
+    begin_sizes = begin + N_SPARSE_VECTORS * n
     return (
         numbers[begin : begin + n_q],
         numbers[begin + n : begin + n + n_q],
         numbers[begin + 2 * n : begin + 2 * n + n_q],
-        numbers[middle : middle + n],
-        numbers[middle + n : middle + 3 * n].view(np.complex128),
-        numbers[middle + 3 * n : middle + 5 * n].view(np.complex128),
+        numbers[begin_sizes : begin_sizes + n],
+        numbers[begin_sizes + n : begin_sizes + 3 * n].view(np.complex128),
+        numbers[begin_sizes + 3 * n : begin_sizes + 5 * n].view(np.complex128),
     )
 
 
 @inlined
 def _sparse_factors(f, w, k):
-    """Return a real view of the real factors for gamma0 (k = 0), or of the complex factors for eigenvalue k - 1."""
+    """Return a real view of w.matrices: the factors for gamma0 (k = 0), or the complex factors for eigenvalue k - 1."""
     n = f.newton_program[N_PIVOTS]
     n_factors = n + 2 * f.newton_program[N_OFF]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -601,9 +602,9 @@ def _sparse_factors(f, w, k):
 
 @compiled
 def _sparse_residual(f, w, t, q, v, renews_G, out):
-    """Store Q - G^T lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
+    """Store Q - G^T w.lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
 
-    The entries of G are w.jacobian_values; if `renews_G`, they are first evaluated at q.
+    The entries of G are w.jacobian_values; if `renews_G` is true, w.jacobian_values are first evaluated at (t, q).
     """
     w.counters[N_EVALUATIONS] += 1
     out[:] = 0.0
@@ -622,10 +623,11 @@ def _sparse_residual(f, w, t, q, v, renews_G, out):
 
 
 @compiled
-def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
-    """Store K, or D if `by_v`, in `entries`, computed by differences; return DONE, or NOT_FINITE.
+def _fill_entries_by_differences(f, w, t, q, v, by_v, base, moved_residual, moved, entries):
+    """Store the entries of K, or D if `by_v`, computed by differences, in `entries`; return DONE or NOT_FINITE.
 
-    The coordinates of a group of columns are displaced at once. `base`: residual at (q, v). `other`, `moved`: scratch.
+    The coordinates of a group of columns are displaced at once. `base` (n_q) is the residual at (q, v);
+    `moved_residual` and `moved` (n_q) are scratch.
     """
     rows, columns, begins = tangents_of(f.newton_program)
     base_point = v if by_v else q
@@ -636,37 +638,38 @@ def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
             j = columns[k]
             moved[j] = base_point[j] + RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
         if by_v:
-            _sparse_residual(f, w, t, q, moved, False, other)
+            _sparse_residual(f, w, t, q, moved, False, moved_residual)
         else:
-            _sparse_residual(f, w, t, moved, v, True, other)
+            _sparse_residual(f, w, t, moved, v, True, moved_residual)
         for k in range(first, last):
             i, j = rows[k], columns[k]
-            entries[k] = (other[i] - base[i]) / (moved[j] - base_point[j])
+            entries[k] = (moved_residual[i] - base[i]) / (moved[j] - base_point[j])
     return DONE if finite_vector(entries) else NOT_FINITE
 
 
 @compiled
-def _entries_are_complete(f, base, other, base_point, moved, largest, entries, predicted):
-    """Return whether `entries` of K or D predict the residual `other` at `moved` from `base` at `base_point` (q or v).
+def _has_complete_pattern(f, base, moved_residual, base_point, moved, largest, entries, predicted):
+    """Return whether the `entries` of K or D explain the difference between `base` and `moved_residual` (n_q).
 
-    `largest`: largest term of the residual. Overwrites `other` and `predicted`.
+    `base` is the residual at `base_point` (q or v), `moved_residual` that at `moved`; `largest` is the largest term of
+    a residual. `moved_residual` and `predicted` (n_q) are overwritten.
     """
     rows, columns, _ = tangents_of(f.newton_program)
     predicted[:] = 0.0
     for k in range(rows.size):
         i, j = rows[k], columns[k]
         term = entries[k] * (moved[j] - base_point[j])
-        other[i] -= term
+        moved_residual[i] -= term
         predicted[i] += abs(term)
     largest_excess = 0.0
     for i in range(base.size):
-        largest_excess = max(largest_excess, abs(other[i] - base[i]) - MAX_DEVIATION * predicted[i])
+        largest_excess = max(largest_excess, abs(moved_residual[i] - base[i]) - MAX_DEVIATION * predicted[i])
     return largest_excess <= NOISE * largest
 
 
 @compiled
 def _sparse_derivatives(f, w, memory, t, q, v):
-    """Store the entries of K and D at (t, q, v), the state evaluated last; return a code.
+    """Store the entries of K and D at (t, q, v), the last evaluated state, in w.matrices; return a code.
 
     The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
     """
@@ -674,52 +677,54 @@ def _sparse_derivatives(f, w, memory, t, q, v):
         return NEEDS_DENSE
     w.counters[N_JACOBIANS] += 1
     mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
-    base, other, moved, sizes, _, _ = _sparse_vectors(f, w)
+    base, moved_residual, moved, pivot_sizes, _, _ = _sparse_vectors(f, w)
     copy(w.mass_values, mass)
     copy(w.jacobian_values, jacobian)
     copy(w.counts, counts)
     copy(w.solutions[w.solutions.size - counts.size :], stiffness)
     largest = _sparse_residual(f, w, t, q, v, False, base)
-    code = _sparse_differences(f, w, t, q, v, False, base, other, moved, K)
+    code = _fill_entries_by_differences(f, w, t, q, v, False, base, moved_residual, moved, K)
     if code != DONE:
         return code
     for j in range(q.size):
         moved[j] = displace_unequally(q[j], j)
-    _sparse_residual(f, w, t, moved, v, True, other)
-    complete = _entries_are_complete(f, base, other, q, moved, largest, K, sizes[: q.size])
+    _sparse_residual(f, w, t, moved, v, True, moved_residual)
+    is_complete = _has_complete_pattern(f, base, moved_residual, q, moved, largest, K, pivot_sizes[: q.size])
     copy(jacobian, w.jacobian_values)
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
-    _sparse_residual(f, w, t, q, moved, False, other)
+    _sparse_residual(f, w, t, q, moved, False, moved_residual)
     memory[DAMPED] = 0.0
     for i in range(q.size):
-        if other[i] != base[i]:
+        if moved_residual[i] != base[i]:
             memory[DAMPED] = 1.0
     if memory[DAMPED] == 0.0:
         D[:] = 0.0
-        return DONE if complete else NEEDS_DENSE
-    code = _sparse_differences(f, w, t, q, v, True, base, other, moved, D)
+        return DONE if is_complete else NEEDS_DENSE
+    code = _fill_entries_by_differences(f, w, t, q, v, True, base, moved_residual, moved, D)
     if code != DONE:
         return code
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
-    _sparse_residual(f, w, t, q, moved, False, other)
-    complete = _entries_are_complete(f, base, other, v, moved, largest, D, sizes[: q.size]) and complete
-    return DONE if complete else NEEDS_DENSE
+    _sparse_residual(f, w, t, q, moved, False, moved_residual)
+    is_complete = (
+        _has_complete_pattern(f, base, moved_residual, v, moved, largest, D, pivot_sizes[: q.size]) and is_complete
+    )
+    return DONE if is_complete else NEEDS_DENSE
 
 
 @compiled
-def _factor_sparse(f, w, z, values):
-    """Store the factors of the bordered matrix for z, real or complex, in `values`; return a code."""
+def _factor_sparse(f, w, z, factors):
+    """Store the factors of the bordered matrix for z in `factors`, both real or both complex; return a code."""
     mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
-    _, _, _, sizes, _, _ = _sparse_vectors(f, w)
-    load(f.newton_program, mass, jacobian, K, D, z, stiffness, values)
-    return DONE if factor_lu(f.newton_program, counts, values, sizes) else SINGULAR
+    _, _, _, pivot_sizes, _, _ = _sparse_vectors(f, w)
+    load(f.newton_program, mass, jacobian, K, D, z, stiffness, factors)
+    return DONE if factor_lu(f.newton_program, counts, factors, pivot_sizes) else SINGULAR
 
 
 @compiled
 def _sparse_right_side(f, w, r, right):
-    """Store the right-hand side [M r; G r] in `right`, where M includes the stiffness that redundant rows add."""
+    """Store [M r; G r] in `right`, the right-hand side of the bordered system; redundant rows add stiffness to M."""
     mass, jacobian, _, _, counts, stiffness = _sparse_state(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_of(f.newton_program)
@@ -746,12 +751,12 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
     copy(x[: e_v.size], e_v)
 
 
-# --- functions for any storage, which steps call
+# --- functions for all kinds of storage, which the steps call
 
 
 @compiled
 def derivatives_at(f, w, options, memory, s, t, q, v, a):
-    """Store the derivatives at (t, q, v), the state evaluated last, whose accelerations are a; return a code."""
+    """Store J_q and J_v (dense storage) or K and D in w.matrices; return a code. (t, q, v, a): last evaluated state."""
     if f.flags[FORM] == STATIC:
         return _sparse_derivatives(f, w, memory, t, q, v)
     if f.flags[BANDWIDTH] >= 0:
@@ -761,7 +766,7 @@ def derivatives_at(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def factor_filter(f, w, options, memory, s, h):
-    """Factor the real system for z = h gamma0, with which `filter_error` filters errors; return a code."""
+    """Factor the real matrix I - z^2 J_q - z J_v, z = h gamma0, with which `filter_error` filters; return a code."""
     n, z = w.Q.size, h * options[newton_options_at(s) + GAMMA0]
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
@@ -773,7 +778,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def _factor_system(f, w, memory, s, k, z):
-    """Factor the complex system for z, the step size times eigenvalue number k of A; return a code."""
+    """Factor the complex matrix I - z^2 J_q - z J_v; z is the step size times eigenvalue k of A; return a code."""
     n = w.Q.size
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
@@ -785,7 +790,7 @@ def _factor_system(f, w, memory, s, k, z):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor the systems of gamma0 and of every eigenvalue of A for steps of size h; return a code."""
+    """Factor the matrices of gamma0 and of all eigenvalues of A for steps of size h; return a code."""
     offset = newton_options_at(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -800,13 +805,18 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_real(f, w, memory, s, x):
-    """Solve the system of gamma0; replace the first n_dof numbers of x (n_q) by the solution."""
+    """Replace x, the first n_dof numbers of an array (n_q), by (I - z^2 J_q - z J_v)^-1 x, with z = h gamma0."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
-        size = y.size
-        _sparse_right_side(f, w, x, right.view(np.float64)[:size])
-        solve_lu(f.newton_program, _sparse_factors(f, w, 0), right.view(np.float64)[:size], y.view(np.float64)[:size])
+        n_unknowns = y.size
+        _sparse_right_side(f, w, x, right.view(np.float64)[:n_unknowns])
+        solve_lu(
+            f.newton_program,
+            _sparse_factors(f, w, 0),
+            right.view(np.float64)[:n_unknowns],
+            y.view(np.float64)[:n_unknowns],
+        )
         copy(right.view(np.float64)[:n], x)
     elif f.flags[BANDWIDTH] >= 0:
         X, pivots = vector(memory, s, n, Q_MOVED), pivots_of(memory, s, n, 0)
@@ -817,7 +827,7 @@ def _solve_real(f, w, memory, s, x):
 
 @compiled
 def _solve_complex(f, w, options, memory, s, k, x):
-    """Solve the complex system of eigenvalue number k; replace the first n_dof numbers of x (n_q) by the solution."""
+    """Replace x (complex; the first n_dof numbers of an array (n_q)) by the solution of the system of eigenvalue k."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
@@ -833,14 +843,14 @@ def _solve_complex(f, w, options, memory, s, k, x):
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
-    """Solve the system of eigenvalue number k; replace the first n_dof numbers of x (n_q), complex, by the solution."""
+    """Replace x (complex; the first n_dof numbers of an array (n_q)) by the solution of the system of eigenvalue k."""
     if k == 0 and options[newton_options_at(s) + N_REAL] > 0.0:  # a real eigenvalue equals gamma0
-        real = vector(memory, s, w.Q.size, V_MOVED)
+        real_part = vector(memory, s, w.Q.size, V_MOVED)
         for i in range(x.size):
-            real[i] = x[i].real
-        _solve_real(f, w, memory, s, real)
+            real_part[i] = x[i].real
+        _solve_real(f, w, memory, s, real_part)
         for i in range(x.size):
-            x[i] = real[i]
+            x[i] = real_part[i]
     else:
         _solve_complex(f, w, options, memory, s, k, x)
 
@@ -862,9 +872,9 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
 
 @compiled
 def correct(f, w, options, memory, s, residual, A_stage):
-    """Solve for the corrections of the stage accelerations, store them in `residual`, and add them to A_stage.
+    """Replace `residual` (s, n_q) by the Newton corrections of the stage accelerations, and add them to A_stage.
 
-    Only the entries of independent coordinates in `residual` and A_stage, (s, n_q) each, are read and changed.
+    Only the entries of independent coordinates in `residual` and A_stage (s, n_q) are read and changed.
     """
     n = w.Q.size
     m = w.independent.size
@@ -873,24 +883,24 @@ def correct(f, w, options, memory, s, residual, A_stage):
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)
     offset += N_EIGEN_SCALARS + s
-    d = block(memory, s, n, Q_STAGE)  # a scratch array, overwritten before the next evaluation
-    d[:, :] = 0.0
+    corrections = block(memory, s, n, Q_STAGE)  # a scratch array, overwritten before the next evaluation
+    corrections[:, :] = 0.0
     for k in range(n_systems):
-        row = offset + 2
-        column = row + 2 * s
+        begin_row = offset + 2
+        begin_column = begin_row + 2 * s
         offset += 2 + 4 * s
         for i in range(m):
             total = complex(0.0, 0.0)
             for j in range(s):
-                total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
+                total += complex(options[begin_row + j], options[begin_row + s + j]) * residual[j, w.independent[i]]
             x[i] = total
         solve_system(f, w, options, memory, s, k, x)
         multiplicity = 1.0 if k < n_real else 2.0
         for j in range(s):
-            re, im = options[column + j], options[column + s + j]
+            re, im = options[begin_column + j], options[begin_column + s + j]
             for i in range(m):
-                d[j, w.independent[i]] += multiplicity * (re * x[i].real - im * x[i].imag)
+                corrections[j, w.independent[i]] += multiplicity * (re * x[i].real - im * x[i].imag)
     for j in range(s):
         for i in w.independent:
-            residual[j, i] = d[j, i]
-            A_stage[j, i] += d[j, i]
+            residual[j, i] = corrections[j, i]
+            A_stage[j, i] += corrections[j, i]

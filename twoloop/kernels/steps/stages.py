@@ -13,14 +13,15 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-# largest ratio of successive step sizes at which the polynomial of the previous step predicts the stages of a step
+# largest ratio of a step size to the previous one at which the previous step's polynomial predicts the stages
 MAX_STEP_RATIO = 3.0
-# factor on `end_error` in methods that also have Richardson's estimate: they need `end_error` only for jumps between an
-# end of the step and the nearest stage
+# factor on `end_error` in methods that also have Richardson's estimate: these need `end_error` only to detect jumps
+# between an end of the step and the nearest stage
 END_ERROR_WEIGHT = 0.01
 
-# indices of the scalars in `options`. The scalars are followed by A (s, s), A A (s, s), b (s), b A (s), c (s) and two
-# rows (s) for `end_error`. EXTRAPOLATION: 1 / (2^order - 1), or 0 for no extrapolation; POWER: order - 1
+# indices of the scalars in `options`. After the scalars, `options` contains A (s, s), A A (s, s), b (s), b A (s), c (s)
+# and the weights (s) that extrapolate from the nodes to 0 and to 1. EXTRAPOLATION: 1 / (2^order - 1), or 0 for no
+# extrapolation; OUTER_TEST: argument `outer_test` of options_array; POWER: order - 1
 STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
 
 
@@ -34,9 +35,10 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` that `tableau_of` reads.
+    """Return the array `options` of an implicit Runge-Kutta method with the tableau A, b, c.
 
-    `outer_test`: 1 if test (32) of the paper also covers the dependent coordinates; `power`: order - 1.
+    `extrapolation`: see EXTRAPOLATION; `outer_test`: 1 if test (32) of the paper, for the convergence of the outer
+    loop, also covers the dependent coordinates, else 0; `power`: order - 1.
     """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
@@ -45,7 +47,7 @@ def options_array(
 
 
 def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
-    """Return the values (s) at x of the s Lagrange polynomials of distinct nodes (s)."""
+    """Return the values (s) at x of the Lagrange polynomials of distinct `nodes` (s)."""
     factors = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
     np.fill_diagonal(factors, 1.0)
     return np.asarray(factors.prod(axis=1))
@@ -91,13 +93,13 @@ def interpolate(c, theta, A_stage, weights, a):
 
 @compiled
 def end_error(tolerances, options, h, state, new_state, A_stage):
-    """Return an estimate, in units of the tolerances (26), of the error of a step with stage accelerations (s, n).
+    """Return an estimate of the error of a step, in units of the tolerances (26), from the stage accelerations (s, n).
 
     The stage accelerations have a range w of order h. At the ends of the step, the polynomial through the stages
     differs from the accelerations by e, of order h^s. If terms of successive orders decrease by a constant factor f,
     then e = w f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, also between an end and
     the nearest stage, the terms do not decrease: the estimate is h w, and steps shrink until the jump does not matter.
-    The estimate must not be used alone, because e may pass through zero: errors of single steps of pendulums then were
+    Another estimate is needed as well, because e may pass through zero: single steps of pendulums then had errors of
     100 tolerances.
     """
     s, n = A_stage.shape
@@ -124,40 +126,43 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
     return largest
 
 
-# indices of the scalars that newton_options adds to `options`, counted from `newton_options_at`. They are followed by
-# the weights e (s) of the error estimate, and for each eigenvalue of A, its real and imaginary part, its row of T^-1
-# and its column of T (s real, then s imaginary parts each). VELOCITIES: 1 if the error of velocities is tested, too
+# indices of the scalars that newton_options adds to `options`, counted from `newton_options_at`. N_REAL, N_PAIRS:
+# numbers of real eigenvalues and complex pairs of A; GAMMA0: first real eigenvalue, or least absolute value of all;
+# VELOCITIES: 1 if the error of velocities is tested, too. After the scalars, `options` contains the weights e (s) of
+# the error estimate, and for each eigenvalue its real and imaginary part, its row of T^-1 and its column of T, where T
+# contains the eigenvectors of A (s real parts, then s imaginary parts each)
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # indices of the scalars in `memory`
 (
+    # 1: the block TRIAL contains the stage accelerations of the last attempt; in diagonal_step.py: an attempt was made
     HAS_TRIAL,
-    H_TRIAL,
-    HAS_PREVIOUS,
-    H_PREVIOUS,
-    HAS_JACOBIAN,
+    H_TRIAL,  # step size of the last attempt, s
+    HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
+    H_PREVIOUS,  # size of the last accepted step, s
+    HAS_JACOBIAN,  # 1: derivatives are stored that may be used
     FRESH,  # 1: the derivatives were computed for this step; 0: for an earlier step, or at the end of this one
-    PARTITION_NUMBER,
-    H_FACTORED,
+    PARTITION_NUMBER,  # value of GENERATION, see data/indices.py, of the partition of the stored derivatives
+    H_FACTORED,  # step size for which the systems are factored, s; 0: none
     CONTRACTION,  # ratio of the last two corrections of Newton's method
-    DAMPED,  # 0: forces do not depend on v
-    SYMMETRIC,  # 1: the factors of the matrix of diagonal_step.py are L D L^T, 0: L U
-    DURATION,  # s, duration of an error of the velocities, see velocity_errors.py; 0: not known
+    DAMPED,  # 1: forces depend on v; 0: J_v and D are zero
+    SYMMETRIC,  # factors of the matrix in diagonal_step.py: 1: L D L^T, 0: L U
+    DURATION,  # duration of an error of the velocities, see velocity_errors.py, s; 0: unknown
     CHANGED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
 # indices of the blocks (s, n_q) in `memory`, and of the vectors (n_q) after the blocks
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# indices of the parts of w.matrices, of n_q^2 entries each; from SYSTEMS on, two parts for each eigenvalue contain a
-# complex matrix
+# indices of the parts of w.matrices, of n_q^2 entries each: derivatives by q and by v, factors of the real filter
+# matrix, and from SYSTEMS on, for each eigenvalue, the factors of a complex matrix in two parts
 BY_Q, BY_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the entries of `options` for Newton's method, which follow those of `options_array`.
+    """Return the entries that Newton's method needs in `options` after those of `options_array`, see N_REAL.
 
     A must be diagonalizable. `velocities`: whether the error of velocities is tested, too.
     """
@@ -174,7 +179,7 @@ def newton_options(
 
 
 def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
-    """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)).
+    """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)) with stage values Y_j.
 
     The estimate is the difference of an embedded quadrature of order s and the method (Hairer & Wanner II, (IV.8.16)).
     If c_1 = 0, f(Y_1) is f(y_n), and the embedded quadrature omits the last stage.
@@ -197,13 +202,13 @@ def memory_size(n_systems: int, s: int, n_q: int) -> int:
 
 
 def n_matrices(n_systems: int) -> int:
-    """Return the number of parts of n_q^2 entries that w.matrices needs."""
+    """Return the number of parts of w.matrices, n_q^2 entries each, for `n_systems` linear systems; see BY_Q."""
     return SYSTEMS + 2 * n_systems
 
 
-# `options` of a diagonally implicit method begin with those of Newton's method for one stage, A = [[gamma]]; N_REAL and
-# the scalars after it begin at NEWTON_OFFSET. At DIAGONAL_OFFSET begin the number of stages, A, c, b - b^, `lower`, and
-# 1 if steps with an error estimate continue from the embedded formula, otherwise 0
+# `options` of a diagonally implicit method begin with those of Newton's method for one stage, A = [[gamma]], of which
+# NEWTON_OFFSET is the index of N_REAL. From DIAGONAL_OFFSET on, they contain the number of stages, A, c, b - b^, the
+# jump weights, and 1 if steps with an error estimate continue from the embedded formula, otherwise 0
 NEWTON_OFFSET = N_SCALARS + 2 + 5
 DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 
@@ -212,30 +217,30 @@ def diagonal_options(
     A: ArrayLike,
     c: ArrayLike,
     weights: ArrayLike,
-    lower: ArrayLike,
+    jump_weights: ArrayLike,
     inner_tol: float,
     outer_tol: float,
     velocities: bool,
     embedded: bool,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of a diagonally implicit method.
+    """Return the array `options` of a diagonally implicit method with the tableau A (s, s), c (s).
 
-    The first row of A (s, s) is zero, the other diagonal entries are gamma, and the last row is b. `weights` (s): b -
-    b^, where b^ are the weights of the embedded formula. `lower` (s): weights of the error estimate for accelerations
-    that jump. `embedded`: whether steps continue from the embedded formula, which then has the higher order.
+    The first row of A is zero, the other diagonal entries are gamma, and the last row is b. `weights` (s): b - b^,
+    where b^ are the weights of the embedded formula. `jump_weights` (s): weights of the error estimate for
+    accelerations that jump. `embedded`: whether steps continue from the embedded formula, if its order is higher.
     """
-    A, c, weights, lower = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, lower))
+    A, c, weights, jump_weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, jump_weights))
     gamma = A[-1, -1]
     one_stage = options_array([[gamma]], [1.0], [1.0], inner_tol, outer_tol, 0.0)
     newton = np.array([1.0, 0.0, gamma, float(velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
-    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, lower, [float(embedded)]])
+    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, jump_weights, [float(embedded)]])
 
 
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
-    """Allocate `memory` of a diagonally implicit method.
+    """Return a new `memory`, filled with zeros, of a diagonally implicit method with s stages.
 
-    `memory` begins with the memory of Newton's method for one stage, followed by the velocities and the accelerations
-    of the stages (s, n_q each), and the accelerations (n_q) of the last stage of the last accepted step.
+    `memory` begins with the memory of Newton's method for one stage. The velocities and the accelerations of the stages
+    (s, n_q each) follow, then the accelerations (n_q) of the last stage of the last accepted step.
     """
     return np.zeros(memory_size(1, 1, n_q) + (2 * s + 1) * n_q)
 
@@ -248,7 +253,7 @@ def newton_options_at(s):
 
 @merged
 def count_systems(options, s):
-    """Return the number of linear systems: one for each real eigenvalue of A and one for each complex pair."""
+    """Return the number of linear systems of Newton's method: real eigenvalues of A plus pairs of complex ones."""
     offset = newton_options_at(s)
     return int(options[offset + N_REAL] + options[offset + N_PAIRS])
 
@@ -281,7 +286,7 @@ def as_matrix(numbers, m):
 
 @inlined
 def system_storage(w, n, k):
-    """Return a complex view (n^2) of the two parts of w.matrices for the system of eigenvalue number k."""
+    """Return a complex view (n^2) of the two parts of w.matrices that store the system of eigenvalue number k."""
     start = (SYSTEMS + 2 * k) * n * n
     return w.matrices[start : start + 2 * n * n].view(np.complex128)
 
@@ -295,7 +300,7 @@ def _after_vectors(memory, s, n, k):
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view of the pivots (n integers) of the filter (k = 0), or of the system of eigenvalue number k - 1."""
+    """Return the pivot indices (n), a view of `memory`, of the filter (k = 0) or of the system of eigenvalue k - 1."""
     return _after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 
@@ -315,22 +320,22 @@ PLACEHOLDER = Step(stop_to_load, commit_nothing)
 
 
 class LazyStep(NamedTuple):
-    """Name of a step that need not be imported yet: `name` in `module`, such as "steps.newton_step"."""
+    """Name of a Step and of its module in twoloop.kernels, such as "steps.newton_step", which is imported if needed."""
 
     module: str
     name: str
 
 
-LOADED: dict[LazyStep, Step] = {}  # steps imported so far
+LOADED: dict[LazyStep, Step] = {}  # steps whose modules have been imported so far
 
 
 def loaded(step: Any) -> Any:
-    """Return a step; for a LazyStep, import its module if necessary, and return the imported step."""
+    """Return `step`; for a LazyStep, import its module if necessary, and return the Step in it."""
     if isinstance(step, LazyStep) and step not in LOADED:
         LOADED[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
     return without_loading(step)
 
 
 def without_loading(step: Any) -> Any:
-    """Return a step; for a LazyStep, return the imported step, or PLACEHOLDER if it is not imported yet."""
+    """Return `step`; for a LazyStep, return its Step, or PLACEHOLDER if its module is not imported yet."""
     return LOADED.get(step, PLACEHOLDER) if isinstance(step, LazyStep) else step

@@ -1,8 +1,8 @@
 """Estimate the position errors that velocity errors cause, for methods whose steps are longer than vibrations.
 
 A velocity error e changes the positions until e changes its sign or decays. Its duration is sqrt(|e| / |J J e|), where
-J is the Jacobian of (v, F). So the error due to a force that jumps within a step has an effect, and the error of fast
-vibrations has none. There are two exceptions:
+J is the Jacobian of (v, F). So an error due to a force that jumps within a step lasts long and counts, and an error of
+fast vibrations hardly counts. There are two exceptions:
 
 - The duration is that of the fastest component of e. If a stiff damper acts beside a contact, the component in slow
   directions lasts much longer. A filter with the time constant of several steps leaves only this component.
@@ -20,12 +20,12 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# largest factor on the duration of a velocity error that changes as slowly as the motion: such an error is no
-# vibration, and the errors of the next steps have the same sign
+# largest factor on the duration of a velocity error that changes as slowly as the motion: the error is not that of a
+# vibration, and errors of later steps have the same sign and add up
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # longest assumed duration of a velocity error, in units of tolerances[GAP]
-STEPS_TO_DECAY = 10.0  # number of steps after which the fast components of a velocity error have decayed
-FAST_DURATION = 20.0  # duration of a velocity error, in units of z = h gamma, below which the error counts as fast
+LONGEST_GAPS = 10.0  # upper limit of the assumed duration of a velocity error, in units of tolerances[GAP]
+STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
+FAST_DURATION = 20.0  # duration of a velocity error, in units of z = h gamma, below which the error may be a fast one
 OUTDATED_CHANGE = 0.3  # relative change of J above which J counts as outdated
 
 
@@ -33,17 +33,17 @@ OUTDATED_CHANGE = 0.3  # relative change of J above which J counts as outdated
 def filtered_velocity_error(
     w, memory, tolerances, z, unfiltered, filtered_once, filtered_twice, state, new_state, a_end
 ):
-    """Return the error, in units of the tolerances, that a velocity error causes, see `velocity_error`.
+    """Return the largest effect of a velocity error, in units of the tolerances, see `velocity_error`.
 
     `unfiltered` (n_dof) is the velocity error; `filtered_once` and `filtered_twice` (n_dof) are this error after one
-    and two filters (I - z J)^-1. `a_end` are the accelerations at the end of the step: if a contact began within
-    the step, only they show how fast the motion now changes. Stores DURATION, the duration of the error, in `memory`.
+    and two filters (I - z J)^-1. `a_end` (n_q) are the accelerations at the end of the step, which show how fast the
+    motion changes after a contact has begun within the step. Stores the duration of the error in memory[DURATION].
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
-    count = w.independent.size
+    n_dof = w.independent.size
     largest, curvature, largest_v, largest_a = 0.0, 0.0, 0.0, 0.0
-    for i in range(count):
+    for i in range(n_dof):
         largest_v = max(largest_v, abs(v[w.independent[i]]))
         largest_a = max(largest_a, abs(a[w.independent[i]]), abs(a_end[w.independent[i]]))
         largest = max(largest, abs(filtered_twice[i]))
@@ -60,8 +60,8 @@ def filtered_velocity_error(
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
     """Return the largest effect, in units of the tolerances, of a velocity error e_v (n_dof) that lasts `duration` (s).
 
-    The effect on a coordinate is the smaller of two ratios: of the velocity error to the tolerance of the velocity, and
-    of the position error that e_v causes in this time to the tolerance of the position.
+    The effect on a coordinate is the smaller of two ratios: velocity error to velocity tolerance, and position error,
+    |e_v| times `duration`, to position tolerance.
     """
     n = w.Q.size
     error = 0.0
@@ -75,7 +75,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the ratio (s) of the largest velocity in `state` to the largest entry of a (n_q), limited by GAP."""
+    """Return (largest velocity in `state`) / (largest acceleration in a (n_q)), s, at most LONGEST_GAPS times GAP."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
@@ -86,12 +86,12 @@ def motion_time(w, tolerances, state, a):
 
 
 @compiled
-def _derivatives_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
-    """Return whether the error estimate might be wrong because J is outdated.
+def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
+    """Return whether outdated derivatives J might make the error estimate wrong.
 
-    This is possible in two cases. First, the velocity error `unfiltered` would exceed the tolerances if it lasted for
-    `longest`, s. Second, the duration computed with J is short, and Newton's method converges so slowly that J must
-    have changed by more than OUTDATED_CHANGE.
+    There are two cases. First, the effect of the velocity error `unfiltered` (n_dof) would exceed the tolerances if it
+    lasted for `longest` (s). Second, the duration computed with J is short, and Newton's method converges so slowly
+    that J must have changed by more than OUTDATED_CHANGE.
     """
     duration = memory[at.DURATION]
     if (
@@ -104,15 +104,15 @@ def _derivatives_matter(w, memory, tolerances, z, unfiltered, longest, state, ne
 
 @compiled
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
-    """Return whether J agrees with the equations at the end of the step, at time t, or whether J does not matter.
+    """Return whether J agrees with the equations at the end of a step, at time t; also True if J does not matter.
 
-    (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `unfiltered`, so that (e_v - unfiltered) / z is the
-    part of J (e_q, e_v) for velocities. This product is compared with the difference of accelerations between the end
-    of the step and a state displaced by (e_q, e_v).
+    (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `unfiltered` (n_dof each). So (e_v - unfiltered) / z
+    is the velocity part of J (e_q, e_v). This product is compared with the difference of the accelerations between the
+    end of the step and a state displaced from it by a multiple of (e_q, e_v).
     """
     n = w.Q.size
     longest = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
-    if not _derivatives_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
+    if not _derivatives_may_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
         return True
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     Q, V = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
@@ -121,13 +121,13 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_
     copy(v1, V)
     if evaluate(f, w, t, Q, V, options[INNER_TOL], a_base) != DONE:
         return False
-    largest, size = 0.0, 1.0
+    largest_error, speed = 0.0, 1.0
     for i in range(w.independent.size):
-        largest = max(largest, abs(e_v[i]))
-        size = max(size, abs(V[w.independent[i]]))
-    if largest == 0.0:
+        largest_error = max(largest_error, abs(e_v[i]))
+        speed = max(speed, abs(V[w.independent[i]]))
+    if largest_error == 0.0:
         return True
-    factor = max(1.0, RELATIVE_DISPLACEMENT * size / largest)
+    factor = max(1.0, RELATIVE_DISPLACEMENT * speed / largest_error)
     copy(q1, Q)
     copy(v1, V)
     for i in range(w.independent.size):
