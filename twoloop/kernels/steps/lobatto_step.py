@@ -60,18 +60,20 @@ from twoloop.kernels.evaluation.inner_loop import check_redundant, project, rene
 from twoloop.kernels.evaluation.partition import MIN_CORRECTION
 from twoloop.kernels.linalg.dense import copy
 
-# indices in `options`. FREE: step size, in units of tolerances[LOOK], above which the nodes are too far apart to detect
-# short forces, and the defect is evaluated between nodes
+# indices in `options`. THETA: largest last correction of a projection; N_ITERATED: number of coordinates whose
+# accelerations are iterated; N_ROWS: number of constraints; FREE: step size, in units of tolerances[LOOK], above which
+# nodes are too far apart to detect short forces, and the defect is evaluated between nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
-START_CONTRACTION = 0.12  # contraction rho for which another first step size is guessed, if a guess is not accepted
+# contraction rho at which a first step should converge: from a rejected guess of its size, the next guess is computed
+START_CONTRACTION = 0.12
 MAX_STARTS = 4  # largest number of guesses of the first step size
 DIVERGED_FACTOR = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
-SAFETY = 0.75  # factor on the step size that the error allows
+SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
 MAX_LIMITED = 24.0  # value of the field LIMITED at which another method takes over, because the motion is stiff
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations hardly vary within a step
-N_PARTS = 4  # number of equal parts of a step, between which the pivots of C_q are compared with those at its beginning
-MIN_PIVOT_RATIO = 0.4  # smallest ratio of these pivots; below it, a singular position is near
+N_PARTS = 4  # number of equal parts of a step, at whose inner ends the pivots of C_q are computed
+MIN_PIVOT_RATIO = 0.4  # ratio of such a pivot to that at the step's beginning below which a singular position is near
 # smallest tolerance with which this method goes on after a singular position: with smaller ones, five more runs of the
 # benchmark A02 were wrong, so another method takes over
 TIGHT_TOLERANCE = 1e-8
@@ -82,25 +84,25 @@ CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evalua
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
-LEAST_TREND = 0.4  # lower bound of the trend, the ratio of the step sizes that the errors of successive steps allow
-MAX_EXTRAPOLATION = 3.0  # largest ratio of the step size that the error allows to the actual step size
+LEAST_TREND = 0.4  # lower bound of the trend: the ratio of successive values of the step size that the error allows
+MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
 _places = merged(places)
 
 
 def memory_size(n, n_iterated, n_rows):
-    """Return the length of `memory`, including LANES numbers for the alignment by `_aligned`."""
+    """Return the length of `memory` for n coordinates, with LANES more numbers for the alignment by `_aligned`."""
     return places(n, n_iterated, n_rows)[-1] + LANES
 
 
 @inlined
 def _aligned(memory):
-    """Return a view of `memory` that begins at the first address that is a multiple of the size of LANES numbers."""
+    """Return a view of `memory` that begins at its first address divisible by the size of LANES numbers."""
     return memory[(-(memory.ctypes.data >> 3)) & (LANES - 1) :]
 
 
 @merged
 def _predict_from_rejected(f, data, state):
-    """Make the polynomial of a step whose error was too large predict the shorter step that replaces this step."""
+    """Update `data` so that the polynomial of a step rejected for its error predicts the shorter repeated step."""
     f.retry_nodes(data, state)
     if data[field.KEPT_DEGREE] == 0.0:
         data[field.KEPT_DEGREE] = max(data[field.DEGREE], 3.0)
@@ -111,22 +113,23 @@ def _predict_from_rejected(f, data, state):
 def _collocate(f, w, options, data, tolerances, t, h, state):
     """Solve for the stages of a step of size h; return a code, the error, and the ratio of the next step size to h.
 
-    The code is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py. The error is in tolerances.
+    The stages are stored in `data`. The code is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py.
+    The error is in units of the tolerances.
     """
-    first, estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
+    is_first, estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[LOOK] / CHECKED_GAP
     if estimated and h > h_max * (1.0 + SLACK):
         return REFUSED, h / h_max, h_max / h
     data[field.T], data[field.H], data[field.DEFECT] = t, h, -1.0
     data[field.MAY_GUESS] = 0.0
-    if first:
+    if is_first:
         data[field.H_BEFORE], data[field.DEGREE], data[field.RHO] = h, 0.0, START_CONTRACTION
         data[field.MAY_GUESS] = 1.0 if estimated and data[field.STARTS] < MAX_STARTS else 0.0
     result = int(f.attempt_nodes(data, state, tolerances, f.own_numbers))
-    m = int(data[field.SWEEPS])
-    w.counters[N_OUTER] += m
-    w.counters[N_EVALUATIONS] += LANES * m
-    w.counters[N_FACTORIZATIONS] += LANES * m
+    n_sweeps = int(data[field.SWEEPS])
+    w.counters[N_OUTER] += n_sweeps
+    w.counters[N_EVALUATIONS] += LANES * n_sweeps
+    w.counters[N_FACTORIZATIONS] += LANES * n_sweeps
     if result == GUESSED:
         data[field.STARTS] += 1.0
         return result, 2.0, min(max(START_CONTRACTION / data[field.RHO], 0.05), 30.0)
@@ -140,7 +143,7 @@ def _collocate(f, w, options, data, tolerances, t, h, state):
         _predict_from_rejected(f, data, state)
         return REFUSED, error, min(max(0.9 * data[field.FACTOR_OF_ERROR], 0.3), 0.9)
     max_factor = GROWTH_EARLY if data[field.N_STEPS] < N_EARLY else GROWTH
-    if max_factor > GROWTH and m == 1:
+    if max_factor > GROWTH and n_sweeps == 1:
         max_factor = GROWTH_ONE_SWEEP
     if h > options[FREE] * tolerances[LOOK] * (1.0 + SLACK):
         w.counters[N_EVALUATIONS] += LANES
@@ -155,14 +158,14 @@ def _collocate(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.TARGETED]
-    # accelerations hardly vary, but the step took at least its target number of sweeps less one: motion may be stiff
-    limited = data[field.CURVED] < MIN_CURVED and extra_sweeps >= -1.0
-    data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if limited else -1.0))
+    # the motion may be stiff if accelerations hardly vary, but a step takes the target number of sweeps, or one less
+    is_limited = data[field.CURVED] < MIN_CURVED and extra_sweeps >= -1.0
+    data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
     factor = data[field.FACTOR]
-    # extrapolate the step size that the error allows: its trend mostly changes little from step to step
+    # extrapolate the step size that the error allows by its trend, which mostly changes little from step to step
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVED] >= MIN_CURVED:
-        trend = 1.0 if first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
+        trend = 1.0 if is_first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
         factor = min(factor, SAFETY * trend * data[field.FACTOR_OF_ERROR])
     data[field.ALLOWED_H] = h_allowed
     if extra_sweeps > 1.0:
@@ -172,7 +175,7 @@ def _collocate(f, w, options, data, tolerances, t, h, state):
 
 @merged
 def _accept_polynomial(data):
-    """Make the polynomial of an accepted step predict the next step."""
+    """Update `data` so that the polynomial of an accepted step predicts the next step."""
     if data[field.KEPT_DEGREE] > 0.0:
         data[field.NEXT_DEGREE], data[field.KEPT_DEGREE] = data[field.KEPT_DEGREE], 0.0
     data[field.CURRENT] = 1.0 - data[field.CURRENT]
@@ -183,18 +186,18 @@ def _accept_polynomial(data):
 
 @merged
 def _is_unsuited(w, data, tolerances):
-    """Return whether another method has to take over, near a singular position or because stiffness limits steps."""
-    stiff = data[field.LIMITED] >= MAX_LIMITED or data[field.FAILURES] >= MAX_FAILURES
-    near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
-    return stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and near)
+    """Return whether another method has to take over: near a singular position, or if stiffness limits the steps."""
+    is_stiff = data[field.LIMITED] >= MAX_LIMITED or data[field.FAILURES] >= MAX_FAILURES
+    is_near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
+    return is_stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and is_near)
 
 
 @compiled
-def _comes_near_singular(f, w, t, h, state, new_state):
-    """Return whether C_q is much closer to a loss of rank within a step than at the beginning of the step.
+def _is_singular_within(f, w, t, h, state, new_state):
+    """Return whether the smallest pivot of C_q within a step is below MIN_PIVOT_RATIO times that at the beginning.
 
-    If it is, another method has to cross the singular position, near which stages that violate the constraints have
-    wrong accelerations. Positions within the step are those of the cubic through the states at both ends.
+    Another method then has to cross the singular position, near which stages that violate the constraints have wrong
+    accelerations. Positions within the step are those of the cubic through the states at both ends.
     """
     n, pivot = w.Q.size, w.notes[PIVOT]
     for k in range(1, N_PARTS):
@@ -210,7 +213,7 @@ def _comes_near_singular(f, w, t, h, state, new_state):
 
 @kernel(SETTLE)
 def settle_lobatto(f, w, options, memory, tolerances, accepted):
-    """Make the polynomial of an accepted attempt predict the next step, or discard a rejected attempt."""
+    """Update `memory` so that the polynomial of an accepted attempt predicts the next step; discard a rejected one."""
     data = _aligned(memory)
     if accepted and data[field.TRIED] == 1.0:
         _accept_polynomial(data)
@@ -219,7 +222,7 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt one step, whose end is projected onto the constraints."""
+    """Attempt one step of size h, and project its end onto the constraints."""
     data, n = _aligned(memory), w.Q.size
     data[field.TRIED] = 0.0
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, data, tolerances):
@@ -238,18 +241,18 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if code == DONE:
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
     if code == DONE and error <= 1.0 and w.notes[NEARLY_SINGULAR] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        w.notes[NEAR_NOW] = 2.0  # pivots are checked after the step, too
-        if _comes_near_singular(f, w, t, h, state, new_state):
+        w.notes[NEAR_NOW] = 2.0  # 2: `check_partition` renews the partition, and checks its pivots, after the step
+        if _is_singular_within(f, w, t, h, state, new_state):
             code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)
 
 
 @merged
 def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
-    """Copy the first n_ends rows of `out_state` to one lane each of `data`, and project them onto the constraints.
+    """Project the states in the first n_ends rows of `out_state` onto the constraints, each in one lane of `data`.
 
-    The accelerations and multipliers of the projected states are computed, too. FINE becomes 1 in lanes whose
-    projection converges, otherwise 0.
+    The lanes get the projected states, their accelerations and multipliers, and 1 in the field FINE if the projection
+    converges, otherwise 0.
     """
     ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
@@ -264,10 +267,10 @@ def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
         f.project_ends(data, f.own_numbers)
         w.counters[N_INNER] += n_ends
         w.counters[N_FACTORIZATIONS] += n_ends
-        moved = 0.0
+        largest_move = 0.0
         for k in range(n_ends):
-            moved = max(moved, data[field.MOVED + k])
-        if moved <= tolerance:
+            largest_move = max(largest_move, data[field.MOVED + k])
+        if largest_move <= tolerance:
             break
     for k in range(n_ends):
         if not data[field.MOVED + k] <= tolerance:
@@ -276,11 +279,11 @@ def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
 
 @merged
 def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, state):
-    """Copy the projection in lane k to `row` and `state`; return False instead if it is invalid.
+    """Copy the projected state in lane k of `data` to `row` and `state`; return False if the state is invalid.
 
-    It is invalid if it failed, if it changes positions in `row` by more than the tolerances, or if redundant rows do
-    not hold. If constraints depend on time (`driven`), the change of velocities is checked, too: a large one may be due
-    to a discontinuity of the drive between the nodes, see discontinuities.py.
+    The state is invalid if its projection has failed or has changed positions in `row` by more than the tolerances, or
+    if it violates redundant rows. If constraints depend on time (`driven`), the change of velocities is checked, too:
+    a large one may be due to a discontinuity of the drive between the nodes, see discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if data[field.FINE + k] == 0.0:
@@ -306,25 +309,29 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 
 @merged
-def _may_continue(w, data, tolerances, control, clock, h):
-    """Return whether a step of size h may be taken before the integrator has checked the step before."""
+def _can_take_next_step(w, data, tolerances, control, clock, h):
+    """Return whether a step of size h may follow the last step before the integrator has checked the last step."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED * h_long or _is_unsuited(w, data, tolerances):
         return False
-    near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
-    return not (near and h < SHORT_STEP * h_long)
+    is_near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
+    return not (is_near and h < SHORT_STEP * h_long)
 
 
 @merged
 def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Take at most n_most steps, and store their unprojected ends in out_t and out_state; return their number."""
+    """Take at most n_most steps from `state`, up to the time `goal`; return their number.
+
+    The times, unprojected states and sizes of the steps are stored in out_t, out_state and out_steps; `state` becomes
+    the last state.
+    """
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         h_wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
-        if not _may_continue(w, data, tolerances, control, clock, h_wanted):
+        if not _can_take_next_step(w, data, tolerances, control, clock, h_wanted):
             break
-        h, reaches = off_grid(control, t, h_wanted, goal - t, False)
-        if reaches:
+        h, reaches_goal = off_grid(control, t, h_wanted, goal - t, False)
+        if reaches_goal:
             h = goal - t
         result, _, factor = _collocate(f, w, options, data, tolerances, t, h, state)
         if result == NOT_COMPUTED:
@@ -335,7 +342,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
             continue
         f.end_nodes(data, state, state)
         _accept_polynomial(data)
-        t = goal if reaches else t + h
+        t = goal if reaches_goal else t + h
         out_t[n_ends], out_steps[n_ends, at.H] = t, h
         data[field.DEFECTS + n_ends] = data[field.DEFECT]
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
@@ -351,8 +358,8 @@ def lobatto_steps(
 ):
     """Take at most LANES steps in a row, and project their ends together; return the number of accepted steps.
 
-    A group of steps ends when the number of accepted steps of the run is a multiple of LANES. So the groups and the
-    results do not depend on the times at which the integrator pauses.
+    A group of steps ends when the run's number of accepted steps is a multiple of LANES, so that the results do not
+    depend on the times at which the integrator pauses.
     """
     data, n = _aligned(memory), w.Q.size
     if out_t.size < LANES or w.notes[NEARLY_SINGULAR] == 1.0:

@@ -224,7 +224,7 @@ def reduce_to_independents(w, A, AT, B):
 
 
 @compiled
-def _dense_from_tangents(f, w, memory, s, t, q, v):
+def _fill_dense_from_tangents(f, w, memory, s, t, q, v):
     """Store J_q and J_v, computed from K and D at (t, q, v), the last evaluated state, in w.matrices; return a code."""
     n = q.size
     m = w.independent.size
@@ -254,10 +254,10 @@ def _dense_from_tangents(f, w, memory, s, t, q, v):
 
 
 @compiled
-def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
+def _fill_dense_derivatives(f, w, options, memory, s, t, q, v, a):
     """Store J_q and J_v in w.matrices; return a code. (t, q, v, a): last evaluated state and its accelerations."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
-        return _dense_from_tangents(f, w, memory, s, t, q, v)
+        return _fill_dense_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
@@ -408,7 +408,7 @@ def _copy_band(A, b, band):
 
 
 @compiled
-def _band_from_tangents(f, w, memory, s, t, q, v, b):
+def _fill_band_from_tangents(f, w, memory, s, t, q, v, b):
     """Store the tangents K and D at (t, q, v), the last evaluated state, as bands in w.matrices; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, FILTER).reshape((n, n)), matrix_storage(w, n, SYSTEMS).reshape((n, n))
@@ -424,7 +424,7 @@ def _band_from_tangents(f, w, memory, s, t, q, v, b):
 
 
 @compiled
-def _banded_derivatives(f, w, memory, s, t, q, v):
+def _fill_banded_derivatives(f, w, memory, s, t, q, v):
     """Store K and D, as bands, and the border at (t, q, v), the last evaluated state, in w.matrices; return a code."""
     n = q.size
     b = f.flags[BANDWIDTH]
@@ -438,7 +438,7 @@ def _banded_derivatives(f, w, memory, s, t, q, v):
     copy_matrix(w.D, D)
     copy(columns_of(w.index), columns)
     if f.flags[FORCE_BY_Q_GIVEN] == 1:
-        return _band_from_tangents(f, w, memory, s, t, q, v, b)
+        return _fill_band_from_tangents(f, w, memory, s, t, q, v, b)
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
     _update_banded_residual(f, w, t, q, v)
     copy(w.Q, base)
@@ -601,7 +601,7 @@ def _sparse_factors(f, w, k):
 
 
 @compiled
-def _sparse_residual(f, w, t, q, v, renews_G, out):
+def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
     """Store Q - G^T w.lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
 
     The entries of G are w.jacobian_values; if `renews_G` is true, w.jacobian_values are first evaluated at (t, q).
@@ -638,9 +638,9 @@ def _fill_entries_by_differences(f, w, t, q, v, by_v, base, moved_residual, move
             j = columns[k]
             moved[j] = base_point[j] + RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
         if by_v:
-            _sparse_residual(f, w, t, q, moved, False, moved_residual)
+            _fill_sparse_residual(f, w, t, q, moved, False, moved_residual)
         else:
-            _sparse_residual(f, w, t, moved, v, True, moved_residual)
+            _fill_sparse_residual(f, w, t, moved, v, True, moved_residual)
         for k in range(first, last):
             i, j = rows[k], columns[k]
             entries[k] = (moved_residual[i] - base[i]) / (moved[j] - base_point[j])
@@ -668,7 +668,7 @@ def _has_complete_pattern(f, base, moved_residual, base_point, moved, largest, e
 
 
 @compiled
-def _sparse_derivatives(f, w, memory, t, q, v):
+def _fill_sparse_derivatives(f, w, memory, t, q, v):
     """Store the entries of K and D at (t, q, v), the last evaluated state, in w.matrices; return a code.
 
     The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
@@ -682,18 +682,18 @@ def _sparse_derivatives(f, w, memory, t, q, v):
     copy(w.jacobian_values, jacobian)
     copy(w.counts, counts)
     copy(w.solutions[w.solutions.size - counts.size :], stiffness)
-    largest = _sparse_residual(f, w, t, q, v, False, base)
+    largest = _fill_sparse_residual(f, w, t, q, v, False, base)
     code = _fill_entries_by_differences(f, w, t, q, v, False, base, moved_residual, moved, K)
     if code != DONE:
         return code
     for j in range(q.size):
         moved[j] = displace_unequally(q[j], j)
-    _sparse_residual(f, w, t, moved, v, True, moved_residual)
+    _fill_sparse_residual(f, w, t, moved, v, True, moved_residual)
     is_complete = _has_complete_pattern(f, base, moved_residual, q, moved, largest, K, pivot_sizes[: q.size])
     copy(jacobian, w.jacobian_values)
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
-    _sparse_residual(f, w, t, q, moved, False, moved_residual)
+    _fill_sparse_residual(f, w, t, q, moved, False, moved_residual)
     memory[DAMPED] = 0.0
     for i in range(q.size):
         if moved_residual[i] != base[i]:
@@ -706,7 +706,7 @@ def _sparse_derivatives(f, w, memory, t, q, v):
         return code
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
-    _sparse_residual(f, w, t, q, moved, False, moved_residual)
+    _fill_sparse_residual(f, w, t, q, moved, False, moved_residual)
     is_complete = (
         _has_complete_pattern(f, base, moved_residual, v, moved, largest, D, pivot_sizes[: q.size]) and is_complete
     )
@@ -723,7 +723,7 @@ def _factor_sparse(f, w, z, factors):
 
 
 @compiled
-def _sparse_right_side(f, w, r, right):
+def _fill_sparse_right_side(f, w, r, right):
     """Store [M r; G r] in `right`, the right-hand side of the bordered system; redundant rows add stiffness to M."""
     mass, jacobian, _, _, counts, stiffness = _sparse_state(f, w)
     right[:] = 0.0
@@ -743,7 +743,7 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
     _, _, _, _, right, y = _sparse_vectors(f, w)
     z, n = h * options[newton_options_at(s) + GAMMA0], y.size
     x = right.view(np.float64)[:n]
-    _sparse_right_side(f, w, e_v, x)
+    _fill_sparse_right_side(f, w, e_v, x)
     rows, columns, _ = tangents_of(f.newton_program)
     for k in range(rows.size):
         x[rows[k]] += z * K[k] * e_q[columns[k]]
@@ -758,10 +758,10 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
 def derivatives_at(f, w, options, memory, s, t, q, v, a):
     """Store J_q and J_v (dense storage) or K and D in w.matrices; return a code. (t, q, v, a): last evaluated state."""
     if f.flags[FORM] == STATIC:
-        return _sparse_derivatives(f, w, memory, t, q, v)
+        return _fill_sparse_derivatives(f, w, memory, t, q, v)
     if f.flags[BANDWIDTH] >= 0:
-        return _banded_derivatives(f, w, memory, s, t, q, v)
-    return _dense_derivatives(f, w, options, memory, s, t, q, v, a)
+        return _fill_banded_derivatives(f, w, memory, s, t, q, v)
+    return _fill_dense_derivatives(f, w, options, memory, s, t, q, v, a)
 
 
 @compiled
@@ -810,7 +810,7 @@ def _solve_real(f, w, memory, s, x):
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
         n_unknowns = y.size
-        _sparse_right_side(f, w, x, right.view(np.float64)[:n_unknowns])
+        _fill_sparse_right_side(f, w, x, right.view(np.float64)[:n_unknowns])
         solve_lu(
             f.newton_program,
             _sparse_factors(f, w, 0),
@@ -831,7 +831,7 @@ def _solve_complex(f, w, options, memory, s, k, x):
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
-        _sparse_right_side(f, w, x, right)
+        _fill_sparse_right_side(f, w, x, right)
         solve_lu(f.newton_program, _sparse_factors(f, w, 1 + k).view(np.complex128), right, y)
         copy(right[:n], x)
     elif f.flags[BANDWIDTH] >= 0:

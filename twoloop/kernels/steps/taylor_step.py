@@ -55,40 +55,43 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_AS_GIVEN, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_both
 
-# indices of the scalars in `options`. The scalars are followed by the offsets of the program's arrays, and by these
-# arrays, with integers as bit patterns. ORDER: order of the series of q; KEEP: 1 if consecutive steps evaluate the
-# series about the first state, to interpolate within a step
+# indices of the scalars in `options`. ORDER: order of the series of q; THETA: largest last correction of a projection;
+# N_NODES: number of quantities of the program; EARLY_WIDTH, LATE_WIDTH: numbers of early and late operations, padded;
+# KEEP: 1 if consecutive steps evaluate the series about the first state, to interpolate within a step. After the
+# scalars, `options` contains the offsets of the program's arrays, then these arrays, with integers as bit patterns
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
-# indices of the arrays of a table of operations, and of a list of sums, see `Sums` in twoloop.generate.series
+# indices of the arrays of a table of operations, and of a list of sums, see `Table`, `Sums` in twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
 SUM_INDICES = N_SUMS  # index, after the arrays of a list of sums, of the array of indices at which sums are stored
+# indices, among the program's arrays, of the first arrays of the two tables and of the two lists of sums
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
 
-# indices of the scalars in `memory`, followed by two series of q (ORDER + 1, n_q each), and the arrays of `arrays_of`
+# indices of the scalars in `memory`. After the scalars, `memory` contains two series of q (ORDER + 1, n_q each) and the
+# arrays of `arrays_of`
 (
-    KNOWN,  # 1: the current series has been computed
+    HAS_SERIES,  # 1: the current series has been computed
     CURRENT,  # index, 0 or 1, of the current series: the one about the beginning of the step
     UNIT,  # unit of time of the current series, s
-    NEXT_UNIT,
-    LENGTH,  # step size that the current series allows, in units of UNIT
-    NEXT_LENGTH,
+    NEXT_UNIT,  # unit of time of the series about the end of the last attempt, s
+    ALLOWED_SIZE,  # step size that the current series allows, in units of UNIT
+    NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
     TRIED,  # 1: the last attempt computed the other series, which becomes the current one if the attempt is accepted
-    PASSED,  # with KEEP = 1: time since the state about which the series is, s
-    TARGET,  # index of the series that `expand` computes
-    # step size, relative to LENGTH, that the distance of the last step's end from the constraints allowed; 0: unknown
-    SHORTER,
-    ATTEMPTS,  # number of attempts, from which the times at which the defect is evaluated follow
-    SUSPECTED,  # 1: a step was rejected because of its defect at the time SUSPECT, s, which the run has not passed yet
-    SUSPECT,
+    PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
+    TARGET,  # index, 0 or 1, of the series that `expand` computes
+    # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_DISTANCE; 0: not known yet
+    DISTANCE_FACTOR,
+    ATTEMPTS,  # number of attempts, which determines the times within a step at which the defect is evaluated
+    SUSPECTED,  # 1: a step was rejected because of its defect at the time SUSPECT, which the run has not passed yet
+    SUSPECT,  # time at which the defect was too large, s
     N_MEMORY_SCALARS,
 ) = range(14)
 
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
-    """Return the length of `memory`."""
+    """Return the length of `memory`; `early` and `late`: EARLY_WIDTH and LATE_WIDTH."""
     rows = order + 2
     scratch = rows * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
     return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch + n_q
@@ -96,7 +99,7 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 @inlined
 def series_accelerations(memory, n):
-    """Return a view of the last n numbers of `memory`, which contain accelerations computed from the series."""
+    """Return the last n numbers of `memory`, a view that stores accelerations computed from the series."""
     return memory[memory.size - n :]
 
 
@@ -113,14 +116,14 @@ def _numbers(options, which):
 
 @inlined
 def series_of(memory, order, n, which):
-    """Return a flat view of series `which`, 0 or 1, of q; a view of two dimensions would cost a function call."""
+    """Return a flat view of the series `which` (0 or 1) of q, row by row: a matrix would cost a function call."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
 
 @merged
 def sum_of_products(X, Y, K, total):
-    """Store the sum of X[j, m] Y[K - j, m] over 0 < j < K in total[m], for eight m at once."""
+    """Store the sum of X[j, m] Y[K - j, m] over 0 < j < K in total[m], for eight indices m at a time."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for j in range(1, K):
@@ -144,8 +147,8 @@ def sum_of_products(X, Y, K, total):
 
 
 @merged
-def _gather(options, sums, groups, g, more, values, out):
-    """Store the arguments, sums of `values`, of the operations of group g in `out`, without their constants."""
+def _fill_arguments(options, sums, groups, g, more, values, out):
+    """Store the arguments of the operations of group g, sums of `values` without their constants, in `out`."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
@@ -156,8 +159,8 @@ def _gather(options, sums, groups, g, more, values, out):
 
 
 @merged
-def _sum(options, sums, scale, values, out):
-    """Store `scale` times each sum of a list, without its constant, in `out` at its index in SUM_INDICES."""
+def _store_sums(options, sums, scale, values, out):
+    """Store `scale` times each sum of `values` in the list `sums`, without its constant, in `out` at SUM_INDICES."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     indices = _integers(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -170,7 +173,7 @@ def _sum(options, sums, scale, values, out):
 
 @compiled
 def begin_operations(options, table, values, z, x, y):
-    """Store the Taylor coefficients of order 0 of the results z and the arguments x and y of a table of operations.
+    """Store the Taylor coefficients of order 0 of the results z and arguments x and y of a table of operations.
 
     Pending products, whose second factor depends on the accelerations, are set to zero.
     """
@@ -178,8 +181,8 @@ def begin_operations(options, table, values, z, x, y):
     constant, constant_2 = _numbers(options, table + FIRST + CONSTANT), _numbers(options, table + SECOND + CONSTANT)
     for g in range(0, groups.size, N_GROUP):
         kind = groups[g]
-        _gather(options, table + FIRST, groups, g, MORE_FIRST, values, x)
-        _gather(options, table + SECOND, groups, g, MORE_SECOND, values, y)
+        _fill_arguments(options, table + FIRST, groups, g, MORE_FIRST, values, x)
+        _fill_arguments(options, table + SECOND, groups, g, MORE_SECOND, values, y)
         for o in range(groups[g + BEGIN], groups[g + END]):
             x[o] += constant[o]
             y[o] += constant_2[o]
@@ -208,15 +211,16 @@ def begin_operations(options, table, values, z, x, y):
 
 @merged
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
-    """Store the Taylor coefficients of order K > 0 of the results z and arguments of a table of operations.
+    """Store the Taylor coefficients of order K > 0 of the results z and arguments x and y of a table of operations.
 
-    The second factor of a pending product is not yet known to order K: the term with this coefficient is left out.
+    x0 and y0 are the coefficients of order 0; `total` is the result of `sum_of_products` for order K. Coefficient K of
+    a pending product's second factor is not yet known: the term with this coefficient is left out.
     """
     groups = _integers(options, table + GROUPS)
     inverse = 1.0 / K
     for g in range(0, groups.size, N_GROUP):
         kind, first, last = groups[g], groups[g + BEGIN], groups[g + END]
-        _gather(options, table + FIRST, groups, g, MORE_FIRST, values, x)
+        _fill_arguments(options, table + FIRST, groups, g, MORE_FIRST, values, x)
         if kind == op.PENDING:
             for o in range(first, last):
                 z[o] = total[o] + x[o] * y0[o]
@@ -230,7 +234,7 @@ def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
                 z[o], z[p] = sine, cosine
                 y[o], y[p] = cosine, -sine
         elif kind == op.PRODUCT:
-            _gather(options, table + SECOND, groups, g, MORE_SECOND, values, y)
+            _fill_arguments(options, table + SECOND, groups, g, MORE_SECOND, values, y)
             for o in range(first, last):
                 z[o] = total[o] + x0[o] * y[o] + x[o] * y0[o]
         elif kind == op.RECIPROCAL:
@@ -244,22 +248,26 @@ def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
                 x[o] *= K
                 z[o] = y[o] = (total[o] + x[o] * y0[o]) * inverse
         else:
-            _gather(options, table + SECOND, groups, g, MORE_SECOND, values, y)
+            _fill_arguments(options, table + SECOND, groups, g, MORE_SECOND, values, y)
             for o in range(first, last):
                 z[o] = (x[o] - total[o] * inverse) / y0[o]
                 x[o] = K * z[o]
 
 
 @merged
-def _complete(options, table, values, y):
-    """Store the second factors of pending products in y, from `values` that include the accelerations."""
+def _fill_second_factors(options, table, values, y):
+    """Store the second factors of pending products in y; they are sums of `values`, which include accelerations."""
     groups = _integers(options, table + GROUPS)
-    _gather(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
+    _fill_arguments(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
 
 
 @inlined
 def arrays_of(options, memory, n, n_rows):
-    """Return views of `memory`: coefficients N of quantities, X1 to Y2 of arguments, sums of products, r and c."""
+    """Return views of `memory`: coefficients of all quantities and of arguments, sums of products, r and c.
+
+    N has one row for each order, as have (X1, Y1) and (X2, Y2), the arguments of early and late operations; r (n) and
+    c (n_rows) are right-hand sides.
+    """
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
     depth = order + 2
@@ -283,7 +291,7 @@ def arrays_of(options, memory, n, n_rows):
 
 @merged
 def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
-    """Set the coefficients of t and q to order 1, of v and of early operations to order 0; set r and c to zero."""
+    """Store the coefficients of t and q up to order 1, of v and early operations of order 0; set r and c to zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -296,7 +304,7 @@ def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
 
 @merged
 def integrate_coefficients(K, unit, N, series, a):
-    """Store the coefficients of order K of v and K + 1 of q, computed from those of order K - 1 of accelerations, a."""
+    """Store coefficients of order K of v, K + 1 of q, in N and `series`, computed from order K - 1 of a (n)."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
     for j in range(n):
@@ -318,7 +326,10 @@ def end_series(w, order, series):
 
 @compiled
 def expand(f, w, options, memory, t, state, unit):
-    """Store series TARGET about `state` at t, in units of `unit`, s; return a code. w has the factors at this state."""
+    """Store series TARGET about `state` at t in `memory`; return a code. `unit`: unit of time, s.
+
+    w must contain the factors of the matrices at this state.
+    """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
     series = series_of(memory, order, n, memory[TARGET])
@@ -334,13 +345,13 @@ def expand(f, w, options, memory, t, state, unit):
             N[K, 0] = 0.0
         sum_of_products(X1, Y1, K, total1)
         _next_coefficients(options, EARLY, K, N[K], N[K, first:], X1[K], Y1[K], X1[0], Y1[0], total1)
-        _sum(options, ROWS, -K / unit, N[K], c)
+        _store_sums(options, ROWS, -K / unit, N[K], c)
         if k == 0:
             begin_operations(options, LATE, N[0], N[0, second:], X2[0], Y2[0])
         else:
             sum_of_products(X2, Y2, k, total2)
             _next_coefficients(options, LATE, k, N[k], N[k, second:], X2[k], Y2[k], X2[0], Y2[0], total2)
-        _sum(options, BALANCE, 1.0, N[k], r)
+        _store_sums(options, BALANCE, 1.0, N[k], r)
         if k == 0:
             for o in range(indices.size):
                 r[indices[o]] += constant[o]
@@ -352,20 +363,20 @@ def expand(f, w, options, memory, t, state, unit):
         else:
             solve_both(f, w, r, c, a, lam)
         integrate_coefficients(K, unit, N, series, a)
-        _complete(options, EARLY, N[K], Y1[K])
-        _complete(options, LATE, N[k], Y2[k])
+        _fill_second_factors(options, EARLY, N[K], Y1[K])
+        _fill_second_factors(options, LATE, N[k], Y2[k])
     return end_series(w, order, series)
 
 
-# distance of the end of a step from the constraints, before its projection, for which step sizes are chosen, relative
-# to the largest distance that `departure` allows
+# distance from the constraints, relative to the largest distance that `departure` allows, at which a step should end
+# before its projection: step sizes are chosen for this distance
 TARGET_DISTANCE = 0.3
 # a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
 # times the defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
-NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to its size, that is too short for a force to change
-GOLDEN = 0.6180339887498949  # fractional parts of its multiples are evenly distributed between 0 and 1
-MAX_DEFECT = 1e300  # replaces an infinite defect, in a step within which a function has no value
+NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
+GOLDEN = 0.6180339887498949  # golden section: fractional parts of its multiples are evenly distributed from 0 to 1
+MAX_DEFECT = 1e300  # replaces an infinite defect, which is returned if a function has no finite value within the step
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
 GROWTH = 5.0  # largest ratio of successive step sizes: the unit of the coefficients is the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of it do not overflow
@@ -374,7 +385,7 @@ TOO_SHORT = 2.0  # error that is returned to reject a first step, because the se
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, which):
-    """Store series `which`, about `state` at t, the state projected last; return a code."""
+    """Store the series `which` about `state` at t, the state projected last, in `memory`; return a code."""
     n = w.Q.size
     memory[TARGET] = which
     if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # generated code leaves no factors in w
@@ -387,7 +398,7 @@ def _compute_series(f, w, options, memory, t, state, unit, which):
 
 @merged
 def _allowed_step(tolerances, series, unit, order, n):
-    """Return the step size, in units of `unit`, at which the last two terms of the series equal the tolerances."""
+    """Return the step size, in units of `unit` (s), at which neither of the last two terms exceeds the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -441,7 +452,10 @@ def _evaluate(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the ratio of the defect at t + s h to the allowed defect, or infinity if it cannot be evaluated."""
+    """Return the defect at t + s h relative to the allowed defect, or infinity if the equations have no value there.
+
+    q, v and a (n each) are scratch.
+    """
     series_a = series_accelerations(memory, q.size)
     _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
@@ -451,7 +465,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
 
 @compiled
 def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-    """Return whether `defect` is a rounding error: it is as large near the beginning, where the series is exact."""
+    """Return whether `defect` is a rounding error, as large as that near the step's beginning, see NOISE_RATIO."""
     if defect > MAX_NOISE:
         return False
     noise = 0.0
@@ -462,7 +476,7 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 @compiled
 def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the first defect within the step that is too large, or 0; store the largest allowed defect in w.notes.
+    """Return the first defect within the step above the allowed one, or 0; update the largest one in w.notes[DEFECT].
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
@@ -492,47 +506,47 @@ def _shrink_factor(defect, order):
 
 @kernel(SETTLE)
 def settle_taylor(f, w, options, memory, tolerances, accepted):
-    """Make the series about the end of an accepted step the current one, with which the next step is taken."""
+    """Make the series about the end of an accepted step the current one, from which the next step is computed."""
     if accepted and memory[TRIED] == 1.0:
         memory[CURRENT] = 1.0 - memory[CURRENT]
-        memory[UNIT], memory[LENGTH] = memory[NEXT_UNIT], memory[NEXT_LENGTH]
+        memory[UNIT], memory[ALLOWED_SIZE] = memory[NEXT_UNIT], memory[NEXT_ALLOWED_SIZE]
     memory[TRIED] = 0.0
 
 
 @kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the series about its beginning; the series about its end limits the size of the next step."""
+    """Attempt a step of size h by the series about its beginning; the series about its end limits the next size."""
     n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     w.counters[N_OUTER] += 1
-    if memory[KNOWN] == 0.0:
+    if memory[HAS_SERIES] == 0.0:
         copy(state, new_state)
         code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
         if code == DONE:
             code = _compute_series(f, w, options, memory, t, new_state, h, memory[CURRENT])
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        memory[KNOWN], memory[UNIT] = 1.0, h
+        memory[HAS_SERIES], memory[UNIT] = 1.0, h
         if estimated:
-            memory[LENGTH] = _allowed_step(tolerances, series_of(memory, order, n, memory[CURRENT]), h, order, n)
-            if memory[LENGTH] > GROWTH:
-                return Attempt(DONE, TOO_SHORT, min(memory[LENGTH], MAX_FIRST_FACTOR))
+            memory[ALLOWED_SIZE] = _allowed_step(tolerances, series_of(memory, order, n, memory[CURRENT]), h, order, n)
+            if memory[ALLOWED_SIZE] > GROWTH:
+                return Attempt(DONE, TOO_SHORT, min(memory[ALLOWED_SIZE], MAX_FIRST_FACTOR))
     series, unit = series_of(memory, order, n, memory[CURRENT]), memory[UNIT]
     x = (memory[PASSED] + h) / unit
-    error, checked, series_a = 0.0, False, series_accelerations(memory, n)
+    error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if estimated:
-        error = x / memory[LENGTH]  # an upper limit: the estimated error is a power of this ratio
+        error = x / memory[ALLOWED_SIZE]  # an upper limit: the estimated error is a power of this ratio
         if error > 1.0 + SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
-        singular = w.notes[NEARLY_SINGULAR] != 0.0  # True from the first singular position on
-        checked = w.notes[NEAR_NOW] == 0.0  # near a singular position, accelerations off the constraints are useless
-        w.notes[NEAR_NOW] = 0.0 if checked else 2.0
+        was_near_singular = w.notes[NEARLY_SINGULAR] != 0.0  # true from the first singular position of the run on
+        checks_defect = w.notes[NEAR_NOW] == 0.0  # not near singular positions, where accelerations of stages are wrong
+        w.notes[NEAR_NOW] = 0.0 if checks_defect else 2.0
         ratio_to_gap = gap_ratio(tolerances, h)
-        if ratio_to_gap > 0.0 and singular:
+        if ratio_to_gap > 0.0 and was_near_singular:
             return Attempt(DONE, ratio_to_gap, 1.0 / ratio_to_gap)
-        if checked:
+        if checks_defect:
             memory[ATTEMPTS] += 1.0
             if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
                 memory[SUSPECTED] = 0.0
@@ -549,13 +563,13 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[PASSED] += h
         return Attempt(DONE, 0.0, 0.0)
     distance = departure(w, tolerances, h, q, v, q1)
-    memory[SHORTER], allowed = 1.0, np.inf
-    if distance > 0.0:  # a step shorter than LENGTH, due to GROWTH or to a force ahead, counts as at least 1 / GROWTH
-        allowed = (TARGET_DISTANCE / distance) ** (1.0 / order)
-        memory[SHORTER] = min(1.0, max(x / memory[LENGTH], 1.0 / GROWTH) * allowed)
+    memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
+    if distance > 0.0:  # if GROWTH or a force ahead shortened the step, x / ALLOWED_SIZE counts as at least 1 / GROWTH
+        allowed_factor = (TARGET_DISTANCE / distance) ** (1.0 / order)
+        memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / GROWTH) * allowed_factor)
     if distance > 1.0:
-        return Attempt(DONE, distance, allowed)
-    if checked:
+        return Attempt(DONE, distance, allowed_factor)
+    if checks_defect:
         defect = defect_ratio(tolerances, h, order, series_a, a1, q1, v1)
         if defect > 1.0:
             noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
@@ -567,16 +581,16 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 return Attempt(code, np.inf, 0.0)
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
     series = series_of(memory, order, n, 1.0 - memory[CURRENT])
-    unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
+    unit = min(memory[ALLOWED_SIZE] * unit, GROWTH * h) if estimated else h
     code = _compute_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[CURRENT])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
     factor = 0.0
     if estimated:
-        memory[NEXT_LENGTH] = _allowed_step(tolerances, series, unit, order, n)
-        shorter = memory[SHORTER] if memory[SHORTER] > 0.0 else 1.0
-        factor = min(shorter * memory[NEXT_LENGTH] * unit / h, GROWTH)
+        memory[NEXT_ALLOWED_SIZE] = _allowed_step(tolerances, series, unit, order, n)
+        distance_factor = memory[DISTANCE_FACTOR] if memory[DISTANCE_FACTOR] > 0.0 else 1.0
+        factor = min(distance_factor * memory[NEXT_ALLOWED_SIZE] * unit / h, GROWTH)
     return Attempt(DONE, max(error, distance), factor)
 
 
