@@ -43,13 +43,13 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-TARGET_ERROR = 0.3  # ratio of the error of predicted positions to its limit for which steps are shortened if above 1
+TARGET_ERROR = 0.3  # value of OFF for which the next step size is chosen after a step with OFF above 1 was rejected
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
-MAX_REJECTIONS = 10  # largest number of successive rejections; after more, a lane fails
+MAX_REJECTIONS = 10  # largest number of successive rejected steps; after more, the run leaves its lane
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
 # a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
-CONTRACTION = 0.5  # ratio of two successive corrections above which a projection fails
+CONTRACTION = 0.5  # ratio of a correction to the previous one, above which a projection fails
 IN_PARALLEL = 3  # number of coordinates in one loop of Horner schemes: each needs 3 of the 16 vector registers
 
 
@@ -77,7 +77,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Store and return UNIT, the unit of time of the series, s, which changes in new runs and accepted steps."""
+        """Store and return UNIT, the unit of time of the series, s; a new one in new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
         span = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
@@ -85,8 +85,8 @@ class LaneSteps:
             emit.multiply(emit.load(work, lanes.LENGTH), unit),
             emit.multiply(emit.constant(MAX_FACTOR), emit.load(work, lanes.H)),
         )
-        first = emit.multiply(emit.constant(FIRST_UNIT), span)
-        unit = select(fresh, first, select(accepted, next_unit, unit))
+        first_unit = emit.multiply(emit.constant(FIRST_UNIT), span)
+        unit = select(fresh, first_unit, select(accepted, next_unit, unit))
         emit.store(unit, work, lanes.UNIT)
         for field, value in ((lanes.LONGEST, math.inf), (lanes.SHIFT, 0.0)):
             emit.store(select(fresh, emit.constant(value), emit.load(work, field)), work, field)
@@ -96,7 +96,7 @@ class LaneSteps:
         """Store the step sizes H and X, computed from the last two terms of the series, and update RUNNING and FINE."""
         builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
-        one, sizes = emit.constant(1.0), []
+        one, norms = emit.constant(1.0), []
         scales = []
         for j in range(n):
             q, v = (emit.function("fabs", emit.load(at.series, i)) for i in (j, n + j))
@@ -110,26 +110,26 @@ class LaneSteps:
             row, largest = emit.pointer(at.series, builder.mul(power, integer(n))), emit.constant(0.0)
             for j, scale in enumerate(scales):
                 largest = emit.larger(emit.multiply(emit.function("fabs", emit.load(row, j)), scale), largest)
-            sizes.append(largest)
-        logarithms = [
+            norms.append(largest)
+        log_roots = [
             emit.divide(emit.logarithm(value), emit.number(power))
-            for value, power in zip(sizes, (order, builder.sub(order, integer(1))), strict=True)
+            for value, power in zip(norms, (order, builder.sub(order, integer(1))), strict=True)
         ]
-        length = emit.exponential(emit.negative(emit.larger(*logarithms)))
-        emit.store(length, work, lanes.LENGTH)
+        h_in_units = emit.exponential(emit.negative(emit.larger(*log_roots)))
+        emit.store(h_in_units, work, lanes.LENGTH)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
         time_left, zero = emit.subtract(t1, t), emit.constant(0.0)
-        h = emit.smallest_of(emit.multiply(length, unit), emit.load(work, lanes.LONGEST))
+        h = emit.smallest_of(emit.multiply(h_in_units, unit), emit.load(work, lanes.LONGEST))
         h = builder.select(builder.compare("fcmp oge", h, time_left), time_left, h)
         largest = emit.larger(emit.function("fabs", t), emit.function("fabs", t1))
-        may_step = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
+        continues = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
         for field in (lanes.RUNNING, lanes.FINE):
-            may_step = builder.both(may_step, is_set(emit, work, field))
-        h = builder.select(may_step, h, zero)
+            continues = builder.both(continues, is_set(emit, work, field))
+        h = builder.select(continues, h, zero)
         emit.store(h, work, lanes.H)
         emit.store(emit.divide(h, unit), work, lanes.X)
         for field in (lanes.RUNNING, lanes.FINE):
-            store_mask(emit, work, field, may_step)
+            store_mask(emit, work, field, continues)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Evaluate the series at X units of time; store NEW, `series_a`, and the positions once more as `predicted`."""
@@ -143,11 +143,11 @@ class LaneSteps:
         builder, n, order = emit.builder, self.n, at.order
         unit, zero = emit.load(at.work, lanes.UNIT), emit.constant(0.0)
         per_unit = emit.divide(emit.constant(1.0), unit)
-        twice = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
-        last = emit.pointer(at.series, builder.mul(order, integer(n)))
+        acceleration_unit = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
+        last_row = emit.pointer(at.series, builder.mul(order, integer(n)))
         for begin in range(0, n, IN_PARALLEL):
             group = range(begin, min(begin + IN_PARALLEL, n))
-            initial = [each for j in group for each in (emit.load(last, j), zero, zero)]
+            initial = [each for j in group for each in (emit.load(last_row, j), zero, zero)]
             with emit.loop(integer(0), order, initial) as (m, carried, new):
                 power = builder.sub(builder.sub(order, integer(1)), m)
                 row = emit.pointer(at.series, builder.mul(power, integer(n)))
@@ -160,7 +160,7 @@ class LaneSteps:
                 positions.append(q)
                 emit.store(q, at.new, j)
                 emit.store(emit.multiply(v, per_unit), at.new, n + j)
-                emit.store(emit.multiply(a, twice), at.series_a, j)
+                emit.store(emit.multiply(a, acceleration_unit), at.series_a, j)
         return positions
 
     def defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
@@ -170,14 +170,14 @@ class LaneSteps:
         emit.store(self.defect_of(emit, control, at, a), work, lanes.DEFECT)
 
     def defect_of(self, emit: LaneEmitter, control: Value, at: Places, a: list[Value]) -> Value:
-        """Return the defect at NEW, see control/step_size.py, relative to the tolerances.
+        """Return the defect of the series at NEW, relative to the tolerances, see control/step_size.py.
 
-        It is the difference between the accelerations of the series and `a`, those by the equations of motion.
+        The defect is the difference between the accelerations of the series and `a`, those by the equations of motion.
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
-        steps, h = emit.number(at.order), emit.load(at.work, lanes.H)
-        # per_share is infinite if h is 0: then positions set no limit
-        share, per_share = emit.divide(h, steps), emit.divide(steps, h)
+        order, h = emit.number(at.order), emit.load(at.work, lanes.H)
+        # per_duration is infinite if h is 0: then positions set no limit
+        duration, per_duration = emit.divide(h, order), emit.divide(order, h)
         largest = worst = emit.constant(0.0)
         for each in a:
             largest = emit.larger(emit.function("fabs", each), largest)
@@ -188,29 +188,29 @@ class LaneSteps:
                 emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(at.new, place))))
                 for place in (j, n + j)
             )
-            allowed = emit.smallest_of(of_v, emit.multiply(of_q, per_share))
+            allowed = emit.smallest_of(of_v, emit.multiply(of_q, per_duration))
             worst = emit.largest_of(emit.divide(emit.subtract(defect, noise), allowed), worst)
-        return emit.multiply(share, worst)
+        return emit.multiply(duration, worst)
 
     def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store OFF, the difference of predicted and projected positions over its limit, see control/step_size.py."""
+        """Store OFF, the ratio of |predicted - projected positions| to its limit, see control/step_size.py."""
         n, at, (rtol, atol) = self.n, self.places(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
-        def size(base: Value, place: int) -> Value:
-            return emit.function("fabs", emit.load(base, place))
+        def magnitude(base: Value, index: int) -> Value:
+            return emit.function("fabs", emit.load(base, index))
 
-        def difference(one: Value, other: Value, place: int) -> Value:
-            return emit.function("fabs", emit.subtract(emit.load(one, place), emit.load(other, place)))
+        def difference(first: Value, second: Value, index: int) -> Value:
+            return emit.function("fabs", emit.subtract(emit.load(first, index), emit.load(second, index)))
 
         motion = error = emit.constant(0.0)
         for j in range(n):
-            distance = emit.larger(emit.multiply(h, size(at.state, n + j)), difference(at.new, at.state, j))
+            distance = emit.larger(emit.multiply(h, magnitude(at.state, n + j)), difference(at.new, at.state, j))
             motion = emit.larger(distance, motion)
         turned, least = self.turned(emit, at), emit.multiply(emit.constant(SHARE_THROUGH_ZERO), motion)
         motion = emit.multiply(emit.constant(SHARE_OF_MOTION), motion)
         for j in range(n):
-            scale = emit.add(atol[j], emit.multiply(rtol, emit.larger(size(at.new, j), size(at.state, j))))
+            scale = emit.add(atol[j], emit.multiply(rtol, emit.larger(magnitude(at.new, j), magnitude(at.state, j))))
             allowed = emit.add(motion, emit.multiply(emit.constant(FLOOR), scale))
             allowed = emit.smaller(scale, allowed)
             if turned is not None:
@@ -228,10 +228,10 @@ class LaneSteps:
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, emit.divide(one, emit.number(order))
         off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
-        fine = is_set(emit, work, lanes.FINE)
+        is_valid = is_set(emit, work, lanes.FINE)
         for value in (off, *defects):
-            size = emit.function("fabs", value)
-            fine = builder.both(fine, builder.compare("fcmp olt", size, emit.constant(math.inf)))
+            magnitude = emit.function("fabs", value)
+            is_valid = builder.both(is_valid, builder.compare("fcmp olt", magnitude, emit.constant(math.inf)))
         defect, shortest = emit.larger(*defects), emit.constant(MIN_FACTOR)
 
         def root(x: Value) -> Value:
@@ -242,17 +242,17 @@ class LaneSteps:
         by_defect = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
         by_defect = emit.smaller(factor, emit.larger(shortest, by_defect))
         factor = select(builder.compare("fcmp ogt", defect, one), by_defect, factor)
-        factor = select(fine, factor, shortest)
+        factor = select(is_valid, factor, shortest)
         running, refused = is_set(emit, work, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
         accepted = builder.both(running, builder.compare("fcmp oge", factor, one))
         store_mask(emit, work, lanes.ACCEPTED, accepted)
         n_refused = emit.load(work, lanes.REFUSED)
         n_refused = select(builder.both(running, refused), emit.add(n_refused, one), n_refused)
         # fail if a value is not finite: shorter steps could pass over the point where the equations are undefined
-        n_refused = select(fine, n_refused, emit.constant(math.inf))
+        n_refused = select(is_valid, n_refused, emit.constant(math.inf))
         emit.store(n_refused, work, lanes.REFUSED)
-        longest = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(MAX_FACTOR)))
-        emit.store(select(running, longest, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
+        h_longest = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(MAX_FACTOR)))
+        emit.store(select(running, h_longest, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
         within_limit = builder.compare("fcmp ole", n_refused, emit.constant(float(MAX_REJECTIONS)))
         store_mask(emit, work, lanes.RUNNING, builder.both(running, within_limit))
 
@@ -273,20 +273,20 @@ class LaneSteps:
         *fixed, series = lanes.places(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
         emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
-        begin = emit.pointer(work, series)
-        following = emit.builder.add(order, integer(1))
-        scratch = emit.pointer(begin, emit.builder.mul(following, integer(self.n)))
+        series_memory = emit.pointer(work, series)
+        n_coefficients = emit.builder.add(order, integer(1))
+        scratch = emit.pointer(series_memory, emit.builder.mul(n_coefficients, integer(self.n)))
         state, new, predicted, series_a, a, lam = (emit.pointer(work, place) for place in fixed)
-        return Places(order, work, state, new, predicted, series_a, a, lam, begin, scratch)
+        return Places(order, work, state, new, predicted, series_a, a, lam, series_memory, scratch)
 
 
 def _triples(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
     return zip(values[::3], values[1::3], values[2::3], strict=True)
 
 
-def broadcast_entry(emit: LaneEmitter, control: Value, place: int) -> Value:
-    """Return one entry of the array `control`, broadcast to all lanes."""
-    return emit.splat(emit.builder.load(emit.builder.gep(control, integer(place))))
+def broadcast_entry(emit: LaneEmitter, control: Value, index: int) -> Value:
+    """Return entry `index` of the array `control`, broadcast to all lanes."""
+    return emit.splat(emit.builder.load(emit.builder.gep(control, integer(index))))
 
 
 def is_set(emit: LaneEmitter, work: Value, field: int) -> Value:
@@ -308,45 +308,45 @@ Rows = list[dict[int, Value]]  # the nonzero entries of each row, by column
 
 
 def changed_orientation(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
-    """Return a mask of the lanes in which a step may have passed a singular position: det G1 G0^T is not positive.
+    """Return a mask of the lanes where det G1 G0^T <= 0, whose steps may have passed a singular position.
 
     G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula
     the determinant is the inner product of the vectors of their maximal minors, which is positive if the two vectors
     are similar. A step through a position at which the rows become dependent may lead to another assembly: then all
-    minors pass through zero and change their signs. Lanes with a pivot of zero are set in the mask, too.
+    minors pass through zero and change their signs. A lane with a zero pivot is in the mask, too.
     """
     matrix: list[dict[int, Value]] = [{} for _ in before]
     for i, row in enumerate(after):
-        for k, other in enumerate(before):
+        for k, row_before in enumerate(before):
             total: Value | None = None
-            for j in sorted(row.keys() & other.keys()):
-                term = emit.multiply(row[j], other[j])
+            for j in sorted(row.keys() & row_before.keys()):
+                term = emit.multiply(row[j], row_before[j])
                 total = term if total is None else emit.add(total, term)
             if total is not None:
                 matrix[i][k] = total
     one, zero, select, compare = emit.constant(1.0), emit.constant(0.0), emit.builder.select, emit.builder.compare
-    left, sign = set(range(len(matrix))), one
-    while left:
+    remaining, sign = set(range(len(matrix))), one
+    while remaining:
         # minimum degree, counted in rows alone, because rows and columns have the same pattern
-        i = min(left, key=lambda each: (len(matrix[each]), each))
-        left.remove(i)
+        i = min(remaining, key=lambda each: (len(matrix[each]), each))
+        remaining.remove(i)
         pivot = matrix[i].pop(i)
-        below = select(compare("fcmp olt", pivot, zero), emit.negative(sign), zero)
-        sign = select(compare("fcmp ogt", pivot, zero), sign, below)
+        sign_unless_positive = select(compare("fcmp olt", pivot, zero), emit.negative(sign), zero)
+        sign = select(compare("fcmp ogt", pivot, zero), sign, sign_unless_positive)
         inverse = emit.divide(one, pivot)
-        for k in sorted(left):
+        for k in sorted(remaining):
             if i in matrix[k]:
                 multiple = emit.multiply(matrix[k].pop(i), inverse)
                 for j, value in matrix[i].items():
                     change = emit.multiply(multiple, value)
-                    old = matrix[k].get(j)
-                    matrix[k][j] = emit.negative(change) if old is None else emit.subtract(old, change)
+                    entry = matrix[k].get(j)
+                    matrix[k][j] = emit.negative(change) if entry is None else emit.subtract(entry, change)
     return compare("fcmp ule", sign, zero)
 
 
 Array = NDArray[np.float64]
 
-WEIGHT_ROUNDING = 1e-13  # smaller weights count as zero: in products such as A A they are rounding errors
+WEIGHT_ROUNDING = 1e-13  # weights of at most this size count as zero: in products such as A A they are rounding errors
 
 
 # A, b, c of an explicit Runge-Kutta method whose first stage is the state itself, and weights of two error estimates
@@ -365,7 +365,7 @@ class LaneStages:
 
     @property
     def structure(self) -> list[bytes]:
-        """Return the tableau as a list of bytes: the only data on which the code depends, besides n."""
+        """Return the tableau as a list of bytes; besides n, the code depends on nothing else."""
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], at: Places) -> None:
@@ -384,8 +384,8 @@ class LaneStages:
         with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
             coordinate = _Coordinate(self, emit, at, j, len(b))
             new_state = coordinate.move(b, b @ A, x)
-            pointer = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
-            atol = emit.splat(emit.builder.load(pointer))
+            atol_pointer = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
+            atol = emit.splat(emit.builder.load(atol_pointer))
             error_weights = [
                 coordinate.error_weight(atol, rtol, *each) for each in zip(coordinate.before, new_state, strict=True)
             ]
@@ -403,7 +403,7 @@ class LaneStages:
         error = emit.divide(e, emit.function("sqrt", emit.add(emit.constant(1.0), emit.multiply(ratio, ratio))))
         select, compare = emit.builder.select, emit.builder.compare
         error = select(compare("fcmp ogt", e, zero), error, zero)
-        # maxima ignore NaN, the sum does not
+        # the maxima e and d ignore NaN; `total` is NaN if a value is not finite
         error = select(compare("fcmp oeq", total, zero), error, emit.constant(math.inf))
         emit.store(error, work, lanes.ERROR)
 
@@ -422,7 +422,7 @@ class _Coordinate:
             emit.store(self._loaded[count - 1], *self._slopes[count - 1])
 
     def sum(self, weights: Array) -> Value:
-        """Return the weighted sum of the accelerations at the stages."""
+        """Return the sum of the accelerations at the stages, multiplied by `weights`, one for each stage."""
         total: Value | None = None
         for k, weight in enumerate(weights.tolist()):
             if abs(weight) > WEIGHT_ROUNDING:
@@ -433,13 +433,13 @@ class _Coordinate:
         return self.emit.constant(0.0) if total is None else total
 
     def error_weight(self, atol: Value, rtol: Value, before: Value, after: Value) -> Value:
-        """Return the reciprocal of the allowed error of a position or velocity with these values at the step's ends."""
+        """Return the reciprocal of the allowed error of a position or velocity that goes from `before` to `after`."""
         emit = self.emit
-        size = emit.larger(emit.function("fabs", before), emit.function("fabs", after))
-        return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, size)))
+        magnitude = emit.larger(emit.function("fabs", before), emit.function("fabs", after))
+        return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, magnitude)))
 
     def move(self, weights: Array, twice: Array, x: Value) -> tuple[Value, Value]:
-        """Store q and v at a stage in NEW, and return them; `weights`, `twice`: weights of accelerations in v, in q."""
+        """Store q and v at a stage in NEW; return both. `weights`, `twice`: weights of accelerations in v and in q."""
         emit, (q, v) = self.emit, self.before
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
         q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(twice)))))
@@ -451,7 +451,7 @@ class _Coordinate:
 
 GOLDEN = 0.6180339887498949  # golden section: its multiples modulo 1 are spread evenly on [0, 1]
 MOST_PARTS = 1000.0  # largest number of parts into which a step is divided; the defect is checked between the parts
-MOST_OPERATIONS = 1500  # largest number of operations of a series: as many take some seconds to compile
+MOST_OPERATIONS = 1500  # largest number of operations of a series: this many take some seconds to compile
 
 
 class LaneCode(LaneSteps):
@@ -499,14 +499,14 @@ class LaneCode(LaneSteps):
         self._rows_at = Program(equations.graph, {"G": [rows[k, j] for k, j in self._entries]})
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
-        parts = [
+        programs = [
             *equations.accelerations,
             equations.position_projection,
             equations.basic_projection,
             equations.redundant_rows,
         ]
-        parts += [self.solution.kept] if series else []
-        counts = [len(each.quantities()) for each in parts]
+        programs += [self.solution.kept] if series else []
+        counts = [len(each.quantities()) for each in programs]
         counts += [len(self.solution.solved.quantities())] if series else []
         self.n_quantities = sum(counts)
 
@@ -515,18 +515,18 @@ class LaneCode(LaneSteps):
         """Return the names of the functions to generate."""
         if self.recurrences is not None:
             return *lanes.TASKS, *lanes.TASKS_OF_SERIES
-        explicit = () if self.explicit is None else lanes.TASKS_OF_EXPLICIT
-        return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit
+        explicit_tasks = () if self.explicit is None else lanes.TASKS_OF_EXPLICIT
+        return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit_tasks
 
     def series_size(self, order: int) -> int:
-        """Return the number of vectors in memory for a series of an order, and for its intermediate results."""
+        """Return the number of vectors in memory for the coefficients of a series up to `order`, and for scratch."""
         assert self.recurrences is not None
         return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
         description: list[Any] = [] if self.explicit is None else [*self.explicit.structure]
-        parts = [
+        programs = [
             *equations.accelerations,
             equations.position_projection,
             equations.basic_projection,
@@ -534,10 +534,10 @@ class LaneCode(LaneSteps):
         ]
         if self.recurrences is not None:
             description += list(self.recurrences.structure)
-            parts.append(self.solution.kept)
+            programs.append(self.solution.kept)
         else:
-            parts.append(self._rows_at)  # its coefficients must get indices even if the code is read from the disk
-        for outputs in parts:
+            programs.append(self._rows_at)  # its coefficients must get indices, also if the code is read from the disk
+        for outputs in programs:
             description += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
             description += list(numbers.structure(self.solution.solved))
@@ -561,35 +561,35 @@ class LaneCode(LaneSteps):
         self.recurrences.begin(emit, inputs, scratch)
         with emit.loop(integer(1), order, []) as (k, _, _):
             self.recurrences.order(emit, k, unit, out, scratch)
-        last, total = emit.pointer(out, builder.mul(order, integer(n))), emit.constant(0.0)
+        last_row, total = emit.pointer(out, builder.mul(order, integer(n))), emit.constant(0.0)
         for j in range(n):
-            total = emit.add(total, emit.multiply(emit.constant(0.0), emit.load(last, j)))
+            total = emit.add(total, emit.multiply(emit.constant(0.0), emit.load(last_row, j)))
         holds = builder.both(holds, builder.compare("fcmp oeq", total, emit.constant(0.0)))
         store_mask(emit, work, lanes.FINE, holds)
 
     def check_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store WORST, the largest defect at equidistant times within the step, at most GAP apart.
 
-        AHEAD becomes each of the times, and finally the end of the step. SHIFT is a multiple of the golden section
-        modulo 1; it moves the times as far as GAP allows, so that they differ from step to step.
+        AHEAD becomes each of these times, and finally the end of the step. SHIFT is a multiple of the golden section
+        modulo 1, which moves the times as far as GAP allows, so that they differ from step to step.
         """
         builder, at = emit.builder, self.places(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
         zero, one, two = (emit.constant(x) for x in (0.0, 1.0, 2.0))
-        parts = emit.function("ceil", emit.divide(h, gap))
-        parts = emit.larger(emit.smaller(parts, emit.constant(MOST_PARTS)), one)
-        part = emit.divide(h, parts)
+        n_in_lane = emit.function("ceil", emit.divide(h, gap))
+        n_in_lane = emit.larger(emit.smaller(n_in_lane, emit.constant(MOST_PARTS)), one)
+        part_size = emit.divide(h, n_in_lane)
         shift = emit.add(emit.load(work, lanes.SHIFT), emit.constant(GOLDEN))
         shift = emit.subtract(shift, builder.select(builder.compare("fcmp oge", shift, one), one, zero))
         emit.store(shift, work, lanes.SHIFT)
         offset = emit.multiply(
-            emit.subtract(emit.multiply(two, shift), one), emit.larger(emit.subtract(gap, part), zero)
+            emit.subtract(emit.multiply(two, shift), one), emit.larger(emit.subtract(gap, part_size), zero)
         )
-        n_parts = builder.convert("fptosi", emit.largest_lane(parts), INTEGER)
-        with emit.loop(integer(1), n_parts, [zero]) as (place, (worst,), new):
-            number = emit.number(place)
-            is_inside = builder.compare("fcmp olt", number, parts)
-            x = builder.select(is_inside, emit.add(emit.multiply(number, part), offset), zero)
+        n_parts = builder.convert("fptosi", emit.largest_lane(n_in_lane), INTEGER)
+        with emit.loop(integer(1), n_parts, [zero]) as (index, (worst,), new):
+            part = emit.number(index)
+            is_inside = builder.compare("fcmp olt", part, n_in_lane)
+            x = builder.select(is_inside, emit.add(emit.multiply(part, part_size), offset), zero)
             emit.store(emit.add(emit.load(work, lanes.T), x), work, lanes.AHEAD)
             self.positions(emit, at, emit.divide(x, emit.load(work, lanes.UNIT)))
             holds, a = self._accelerations(emit, work, at)
@@ -597,11 +597,11 @@ class LaneCode(LaneSteps):
             new.append(emit.largest_of(builder.select(is_inside, defect, zero), worst))
         emit.store(new[0], work, lanes.WORST)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
-        last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
-        emit.store(builder.select(last, t1, emit.add(t, h)), work, lanes.AHEAD)
+        is_last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
+        emit.store(builder.select(is_last, t1, emit.add(t, h)), work, lanes.AHEAD)
 
     def approach(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct the positions NEW once in the lanes in which FINE is set; store FINE and LEFT_TO_MOVE."""
+        """Correct the positions NEW once in lanes with FINE = 1; store in FINE and LEFT_TO_MOVE where this succeeds."""
         active, _ = self._project(
             emit, self.equations.position_projection, lanes.FINE, self.places(emit, order, control, work)
         )
@@ -610,9 +610,9 @@ class LaneCode(LaneSteps):
         emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
 
     def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct positions, project velocities in lanes with LEFT_TO_MOVE; store a, lam, FINE and LEFT_TO_MOVE."""
+        """Project NEW once in lanes with LEFT_TO_MOVE = 1; store a, lam, FINE (converged) and LEFT_TO_MOVE."""
         builder, at = emit.builder, self.places(emit, order, control, work)
-        fine, left = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
+        fine, moves = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
         active, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, at)
         largest = emit.constant(0.0)
         for j in range(self.n):
@@ -625,11 +625,11 @@ class LaneCode(LaneSteps):
         continues = builder.both(continues, builder.compare("fcmp ogt", moved, tolerance))
         emit.store(emit.larger(moved, tolerance), work, lanes.MOVED_BEFORE)
         store_mask(emit, work, lanes.LEFT_TO_MOVE, continues)
-        unchanged = builder.operation("xor", fine, builder.both(fine, left))
-        store_mask(emit, work, lanes.FINE, builder.operation("or", unchanged, converged))
+        has_finished = builder.operation("xor", fine, builder.both(fine, moves))
+        store_mask(emit, work, lanes.FINE, builder.operation("or", has_finished, converged))
 
-    def _project(self, emit: LaneEmitter, outputs: Program, which: int, at: Places) -> tuple[Value, Value]:
-        """Correct NEW by a projection program, in the lanes in which the field `which` is set.
+    def _project(self, emit: LaneEmitter, outputs: Program, field: int, at: Places) -> tuple[Value, Value]:
+        """Correct NEW by a projection program, in the lanes in which the field `field` is 1.
 
         Return a mask of the lanes whose correction is valid, and the largest change of a position in each lane.
         """
@@ -637,7 +637,7 @@ class LaneCode(LaneSteps):
         inputs = self._new_state(emit, work, at)
         lowering, arrays = lower(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
-        active = emit.builder.both(is_set(emit, work, which), lowering.holds(outputs, arrays[0]))
+        active = emit.builder.both(is_set(emit, work, field), lowering.holds(outputs, arrays[0]))
         largest = emit.constant(0.0)
         for value in values["moved"]:
             largest = emit.larger(emit.function("fabs", value), largest)
@@ -670,7 +670,7 @@ class LaneCode(LaneSteps):
         return [(lanes.T, at.state), (lanes.AHEAD, at.new)]
 
     def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
-        """Return the nonzero entries of each row of G, by columns, at the time field `time` and the state at `base`."""
+        """Return the nonzero entries of each row of G, by column; `time`: field of t; `base`: pointer to the state."""
         inputs = [emit.load(at.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
         _, (entries,) = lower(emit, self._rows_at, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
@@ -742,12 +742,12 @@ class LaneConstraints(LaneSteps):
 
 
 BUILD_SECONDS = 3e-4  # estimated time to compile the operation of one quantity, s
-ELIMINATION = (elimination, null_space, compile_equations)
+ELIMINATION = (elimination, null_space, compile_equations)  # modules that write the code of accelerations
 # modules that write the code: cached code is invalid after a change of one of them
 WRITERS = (series, *ELIMINATION, program, lane_series, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)
-KIND = "lanes"  # kind of the cached files
+KIND = "lanes"  # first part of the names of cached files
 
 
 class GeneratedLanes(Generic[Code]):

@@ -29,11 +29,11 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.kernels.lanes.layout import LANES
 
-# coefficients of polynomials, lowest power first, for log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at
-# Chebyshev points. Their errors, 2e-06 and 1e-07, are small enough for step sizes.
+# polynomials for log2 on [1, 2] and 2^x on [-1/2, 1/2]: coefficients, lowest power first, by least squares at Chebyshev
+# points. The errors of the polynomials, 2e-06 and 1e-07, are small enough for step sizes
 LOG2 = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
 EXP2 = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
-LARGEST_POWER, SMALLEST = 1000.0, 1e-300  # largest |x| in 2^x, and smallest argument of log2, against overflow
+LARGEST_POWER, SMALLEST = 1000.0, 1e-300  # largest |x| in 2^x, and smallest argument of log2: others would overflow
 
 
 class LaneEmitter(Emitter):
@@ -47,7 +47,7 @@ class LaneEmitter(Emitter):
         self.double, self.whole_number, self.bit = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
 
     def like(self, builder: Builder) -> "LaneEmitter":
-        """Return an emitter with the same number of lanes for another function."""
+        """Return an emitter with the same number of lanes that writes to another function, that of `builder`."""
         return LaneEmitter(builder, self.lanes)
 
     def splat(self, value: Value) -> Value:
@@ -58,45 +58,45 @@ class LaneEmitter(Emitter):
         return self.builder.first_everywhere(vector)
 
     def far(self, value: float) -> Value:
-        """Return a vector with one number in all lanes that is loaded where it is used, see `Builder.far`."""
+        """Return a vector with one number in all lanes, loaded just before its use, see `Builder.far`."""
         return self.splat(super().far(value))
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal, or a Coefficient loaded from memory: a vector if it varies, else one value in all lanes."""
+        """Return a literal or loaded Coefficient: with a value for each lane if it varies, else one for all lanes."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
-        place = self.builder.gep(self.constants, integer(number.place))
-        return self.splat(self.builder.load(place, constant=True))
+        pointer = self.builder.gep(self.constants, integer(number.place))
+        return self.splat(self.builder.load(pointer, constant=True))
 
     def number(self, whole: Value) -> Value:
-        """Return a vector of doubles with an integer in all lanes."""
+        """Return a vector with the integer `whole`, converted to double, in all lanes."""
         return self.splat(super().number(whole))
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
         """Return the pointer `base` advanced by the sum of `places`, counted in vectors."""
         for place in places:
-            scaled = (
+            offset = (
                 integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
             )
-            base = self.builder.gep(base, scaled)
+            base = self.builder.gep(base, offset)
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Return the vector at an index, loaded from memory."""
+        """Return vector `place` of the array at `base`, loaded from memory."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*")
         return self.builder.load(pointer, constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Store a vector at an index."""
+        """Store a vector as vector `place` of the array at `base`."""
         self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*"))
 
     def function(self, name: str, x: Value) -> Value:
         """Return f(x) in each lane, by one LLVM intrinsic for all lanes, or by a function of libm lane by lane."""
         if name in INTRINSICS:
             return super().function(name, x)
-        result, one = undefined(self.double), Emitter(self.builder)
+        result, scalar = undefined(self.double), Emitter(self.builder)
         for lane in range(self.lanes):
-            result = self.builder.insert(result, one.function(name, self.builder.extract(x, lane)), lane)
+            result = self.builder.insert(result, scalar.function(name, self.builder.extract(x, lane)), lane)
         return result
 
     def largest_lane(self, x: Value) -> Value:
@@ -112,10 +112,10 @@ class LaneEmitter(Emitter):
         builder = self.builder
         bits = builder.convert("bitcast", self.larger(x, self.constant(SMALLEST)), self.whole_number)
         exponent = builder.sub(builder.operation("lshr", bits, self.whole(52)), self.whole(1023))
-        rest = builder.operation("or", builder.both(bits, self.whole((1 << 52) - 1)), self.whole(1023 << 52))
+        mantissa = builder.operation("or", builder.both(bits, self.whole((1 << 52) - 1)), self.whole(1023 << 52))
         return self.add(
             builder.convert("sitofp", exponent, self.double),
-            self.polynomial(LOG2, builder.convert("bitcast", rest, self.double)),
+            self.polynomial(LOG2, builder.convert("bitcast", mantissa, self.double)),
         )
 
     def exponential(self, x: Value) -> Value:
@@ -131,11 +131,11 @@ class LaneEmitter(Emitter):
         )
 
     def smallest_of(self, a: Value, b: Value) -> Value:
-        """Return the smaller of two numbers, or `a` if one of them is NaN; so the result is NaN if `a` is."""
+        """Return the smaller of a and b, or a if one of the two is NaN: if a is NaN, the result is NaN."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def largest_of(self, a: Value, b: Value) -> Value:
-        """Return the larger of two numbers, or `a` if one of them is NaN; so the result is NaN if `a` is."""
+        """Return the larger of a and b, or a if one of the two is NaN: if a is NaN, the result is NaN."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
 
@@ -145,17 +145,17 @@ def vector_index(emit: LaneEmitter, k: Value) -> Value:
 
 
 def load_lanes(emit: LaneEmitter, base: Value, place: int = 0) -> Value:
-    """Return the vector of STAGES numbers at `place`, an index that counts numbers."""
+    """Return the vector of STAGES numbers that begins at `base`[place], where `place` counts numbers."""
     return Emitter(emit.builder).load_vector(base, place, STAGES)
 
 
 def store_lanes(emit: LaneEmitter, value: Value, base: Value, place: int = 0) -> None:
-    """Store a vector of STAGES numbers at `place`, an index that counts numbers."""
+    """Store a vector of STAGES numbers that begins at `base`[place], where `place` counts numbers."""
     Emitter(emit.builder).store_vector(value, base, place)
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """Return the sum of the lanes of a, and that of b; the two sums share their instructions."""
+    """Return the sum of the elements of a, and that of b; both are computed by the same instructions."""
     builder, half = emit.builder, STAGES // 2
     lower, upper = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
     total = emit.add(builder.shuffle(a, b, lower), builder.shuffle(a, b, upper))
@@ -165,14 +165,14 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return a vector whose elements are those of `vectors` in one lane (for a single vector, this element)."""
-    builder, places = emit.builder, [lane, STAGES + lane]
+    """Return the elements number `lane` of all `vectors` as one vector; of a single vector, return this element."""
+    builder, lanes = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
     while len(vectors) > 1:
         pairs = zip(vectors[::2], vectors[1::2], strict=True)
-        vectors = [builder.shuffle(*pair, places) for pair in pairs]
-        places = list(range(2 * len(places)))
+        vectors = [builder.shuffle(*pair, lanes) for pair in pairs]
+        lanes = list(range(2 * len(lanes)))
     return vectors[0]
 
 
@@ -180,7 +180,7 @@ def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
 def loop_over(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Return a context for a loop over `coordinates`: it yields k, a coordinate, and the lists of `Emitter.loop`."""
+    """Return a context for a loop over `coordinates`: it yields k, coordinates[k], and the lists of `Emitter.loop`."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
@@ -188,8 +188,8 @@ def loop_over(
         yield k, i, values, new
 
 
-ZEROS = -1  # index of the row of factors that is zero: it is stored before the row of order 0
-# largest number of sums in one loop: the totals of more sums would not fit into 32 (or 16) registers
+ZEROS = -1  # order of a row of factors that are all zero, which is stored before the row of order 0
+# largest number of sums in one loop, so that the totals fit into the registers: 32 of eight doubles, or 16 of four
 SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
@@ -197,13 +197,13 @@ class Operation(NamedTuple):
     """Operation in the program of a series; sine and cosine of an angle are one operation with two results."""
 
     kind: int
-    results: tuple[int, ...]  # quantities
+    results: tuple[int, ...]  # indices of the quantities that are the results
     first: tuple[Terms, float]  # terms and constant of the first argument
     second: tuple[Terms, float]  # terms and constant of the second argument
 
 
 class LaneSeries:
-    """Generator of the code for the recurrences of a program.
+    """Generator of the code for the recurrences of a SeriesProgram.
 
     `scratch` contains, in this order, as vectors: the factors of the linear equations; their right-hand side r; the
     reciprocal divisors in recurrences of roots, logarithms and arctangents; sums that are carried over to the next
@@ -214,12 +214,12 @@ class LaneSeries:
         self.solution, self.numbers, self.n, self.n_rows = solution, numbers, n, n_rows
         self.slots: dict[Any, int] = {}
         self._divisors: dict[int, int] = {}
-        first = 1 + 3 * n + n_rows
-        self.early = self._operations(program.early, first)
-        self.late = self._operations(program.late, first + len(program.early.first.column))
+        first_result = 1 + 3 * n + n_rows
+        self.early = self._operations(program.early, first_result)
+        self.late = self._operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._rows(program.rows, program.row_places)
         self.balance = self._rows(program.balance, program.balance_places)
-        # factors of the carried sum, by product; empty at first, because `_shared_sums` calls `_factors`
+        # by product whose sum is carried over: the factors of this sum; empty while `_shared_sums` calls `_factors`
         self._carried: dict[int, tuple[int, int]] = {}
         self._carried |= self._shared_sums()
         self.sums_ahead = sorted(set(self._carried.values()))
@@ -240,7 +240,7 @@ class LaneSeries:
 
     @property
     def structure(self) -> list[Any]:
-        """Return the data on which the code depends."""
+        """Return the data on which the code depends, for a digest."""
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.slots]
 
     def _forms(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
@@ -267,7 +267,7 @@ class LaneSeries:
         return operations
 
     def _slot(self, *key: Any) -> int:
-        """Return the index in a row of a factor: of terms and a constant, multiplied by the order if after "scaled"."""
+        """Return the index in a row of a factor: (terms, constant), or times the order: ("scaled", terms, constant)."""
         return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
@@ -275,7 +275,8 @@ class LaneSeries:
 
         The keys are the quantities that are such products; the values are pairs of factors, see `_factors`. (cos x) x'
         is the derivative of sin x. So a sum in the recurrence of sin x for order k + 1, divided by the unit of time, is
-        the part of coefficient k of the product that is known before order k is solved. For (sin x) x': that of cos x.
+        the part of coefficient k of the product that is known before order k is solved. The same holds for (sin x) x'
+        and cos x.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -285,11 +286,11 @@ class LaneSeries:
                 for result, pair in zip(reversed(operation.results), self._factors(operation), strict=True):
                     pairs[((result, 1.0),), rate] = pair
         products = [each for each in self.early if each.kind == PENDING and not each.first[1] and not each.second[1]]
-        known = {each.results[0]: pairs.get((each.first[0], each.second[0])) for each in products}
-        return {result: pair for result, pair in known.items() if pair is not None}
+        pair_of = {each.results[0]: pairs.get((each.first[0], each.second[0])) for each in products}
+        return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return the indices in a row of the factors X and Y whose products the recurrence of each result sums up."""
+        """Return, for each result, the indices in a row of the factors X and Y of the products in its recurrence."""
         kind, results, first, second = operation
         if results[0] in self._carried:
             return []
@@ -297,91 +298,91 @@ class LaneSeries:
             return [(self._slot(*first), self._slot(*second))]
         if kind in (LOGARITHM, ARCTANGENT):
             return [(self._slot("scaled", ((results[0], 1.0),), 0.0), self._slot(*second))]
-        own = [self._slot(((result, 1.0),), 0.0) for result in results]
+        result_slots = [self._slot(((result, 1.0),), 0.0) for result in results]
         if kind == RECIPROCAL:
-            return [(self._slot(*first), own[0])]
+            return [(self._slot(*first), result_slots[0])]
         if kind == SQUARE_ROOT:
-            return [(own[0], own[0])]
+            return [(result_slots[0], result_slots[0])]
         x = self._slot("scaled", *first)
-        return [(x, own[1]), (x, own[0])] if kind == SINE else [(x, own[0])]
+        return [(x, result_slots[1]), (x, result_slots[0])] if kind == SINE else [(x, result_slots[0])]
 
     def begin(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Write code for order 0 at `inputs`, [t, q, v]; the factors of the linear equations are stored already."""
+        """Write code for order 0 at `inputs`, [t, q, v]; `scratch` already has the factors of the linear equations."""
         for place in (*range(self.r, self.divisors), *range(self.carried, self.table)):
             emit.store(emit.constant(0.0), scratch, place)
         row = _Row(self, emit, emit.pointer(scratch, self.table))
-        known = Quantities(emit, lambda i: inputs[i])
-        self._begin(emit, known, self.early, row, scratch)
-        self._begin(emit, known, self.late, row, scratch)
+        quantities = Quantities(emit, lambda i: inputs[i])
+        self._begin(emit, quantities, self.early, row, scratch)
+        self._begin(emit, quantities, self.late, row, scratch)
         for place, form in self.balance:
-            emit.store(known.sum(*form), scratch, self.r + place)
+            emit.store(quantities.sum(*form), scratch, self.r + place)
 
     def order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write code for order k > 0: it stores velocities of order k, and positions of order k + 1 in `out`."""
+        """Write code for order k > 0: it stores the coefficients k + 1 of q in `out`, and the factors in `scratch`."""
         builder, n = emit.builder, self.n
-        following = builder.add(k, integer(1))
+        next_order = builder.add(k, integer(1))
         q = emit.pointer(out, builder.mul(k, integer(n)))
         order, zero = emit.number(k), emit.constant(0.0)
-        none_below = builder.compare("icmp eq", k, integer(1))
-        time = builder.select(none_below, unit, zero)
-        known = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time)
+        is_first = builder.compare("icmp eq", k, integer(1))
+        time_coefficient = builder.select(is_first, unit, zero)
+        quantities = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time_coefficient)
         row = _Row(self, emit, self._row(emit, scratch, k))
-        inverse = emit.divide(emit.constant(1.0), order)
-        first = self._row(emit, scratch, builder.select(none_below, integer(ZEROS), integer(1)))
+        per_order = emit.divide(emit.constant(1.0), order)
+        first_row = self._row(emit, scratch, builder.select(is_first, integer(ZEROS), integer(1)))
         row_before = _Row(self, emit, self._row(emit, scratch, builder.sub(k, integer(1))))
         sums = self._sums(emit, scratch, k)
-        edges = _Edges(sums, first, self._row(emit, scratch, integer(1)), row_before)
-        self._operate(emit, known, self.early, row, scratch, edges, order, inverse)
+        edges = _Edges(sums, first_row, self._row(emit, scratch, integer(1)), row_before)
+        self._operate(emit, quantities, self.early, row, scratch, edges, order, per_order)
         next_sums = {pair: edges.next_sum(pair, row) for pair in self.sums_ahead}
         for place, pair in enumerate(self.sums_ahead):
             emit.store(next_sums[pair], scratch, self.carried + place)
         per_unit = emit.divide(emit.constant(1.0), unit)
         for result, pair in self._carried.items():
-            known.define(result, emit.multiply(per_unit, next_sums[pair]))
-        scale = emit.negative(emit.divide(order, unit))
+            quantities.define(result, emit.multiply(per_unit, next_sums[pair]))
+        minus_rate = emit.negative(emit.divide(order, unit))
         c = [zero] * self.n_rows
         for place, (terms, _) in self.rows:
-            c[place] = emit.multiply(scale, known.sum(terms))
+            c[place] = emit.multiply(minus_rate, quantities.sum(terms))
         r = [emit.load(scratch, self.r + i) for i in range(n)]
         kept = [emit.load(scratch, i) for i in range(self.solution.n_stored)]
         solution = self.solution
         _, (a, lam) = lower(emit, solution.solved, [*r, *c, *kept], self.numbers)
-        per_v, per_q = emit.multiply(unit, inverse), emit.divide(unit, emit.number(following))
+        per_v, per_q = emit.multiply(unit, per_order), emit.divide(unit, emit.number(next_order))
         before = Quantities(emit, lambda i: zero)  # a and lam of order k - 1
         for j in range(n):
             v = emit.multiply(per_v, a[j])
-            known.define(1 + n + j, v)
-            emit.store(emit.multiply(per_q, v), emit.pointer(out, builder.mul(following, integer(n))), j)
+            quantities.define(1 + n + j, v)
+            emit.store(emit.multiply(per_q, v), emit.pointer(out, builder.mul(next_order, integer(n))), j)
             before.define(1 + 2 * n + j, a[j])
         for i in range(self.n_rows):
             before.define(1 + 3 * n + i, lam[i])
-        for operations, values, into in ((self.early, known, row), (self.late, before, row_before)):
+        for operations, values, into in ((self.early, quantities, row), (self.late, before, row_before)):
             for operation in operations:
                 if operation.kind == PENDING and operation.results[0] not in self._carried:
                     into.store(operation.second, values.sum(operation.second[0]))
-        self._operate(emit, known, self.late, row, scratch, edges, order, inverse)
+        self._operate(emit, quantities, self.late, row, scratch, edges, order, per_order)
         for place, (terms, _) in self.balance:
-            emit.store(known.sum(terms), scratch, self.r + place)
+            emit.store(quantities.sum(terms), scratch, self.r + place)
 
     def _row(self, emit: LaneEmitter, scratch: Value, order: Value) -> Value:
         return emit.pointer(scratch, self.table, emit.builder.mul(order, integer(self.width)))
 
     def _begin(
-        self, emit: LaneEmitter, known: Quantities, operations: list[Operation], row: "_Row", scratch: Value
+        self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for the results of operations, of order 0; store the factors in a row as far as they are known."""
+        """Write code for the results of operations at order 0; store their factors in `row`, except unknown ones."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
-            x = known.sum(*first)
+            x = quantities.sum(*first)
             row.store(first, x, "if used")
             divisor = None
             if kind == PENDING:
                 if operations is self.early and results[0] not in self._carried:
-                    row.store(second, known.sum(*second))
+                    row.store(second, quantities.sum(*second))
                 values = [zero]
             elif kind == PRODUCT:
-                z = known.sum(*second)
+                z = quantities.sum(*second)
                 row.store(second, z)
                 values = [emit.multiply(x, z)]
             elif kind == SINE:
@@ -391,7 +392,7 @@ class LaneSeries:
             else:
                 values = [emit.function(FUNCTIONS[kind], x)]
                 if kind in (LOGARITHM, ARCTANGENT):
-                    divisor = known.sum(*second)
+                    divisor = quantities.sum(*second)
                     row.store(second, divisor)
                 elif kind == SQUARE_ROOT:
                     divisor = emit.add(values[0], values[0])
@@ -401,41 +402,42 @@ class LaneSeries:
             if divisor is not None:
                 emit.store(emit.divide(one, divisor), scratch, self.divisors + self._divisors[results[0]])
             for result, value in zip(results, values, strict=True):
-                known.define(result, value)
+                quantities.define(result, value)
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Return sums over 1 < j < k: X[j] Y[k - j] by (factors, False), and X[j] Y[k + 1 - j] by (factors, True).
+        """Return sums over 1 < j < k for pairs of factors (X, Y): the values of a dict with keys (pair, bool).
 
-        `_Edges` adds the first and last terms when they are known. So one loop computes several sums, does not wait for
-        the previous order, and loads each row once.
+        The sum is that of X[j] Y[k - j] for the key (pair, False), and of X[j] Y[k + 1 - j] for (pair, True). `_Edges`
+        adds the first and last terms when they are known. So one loop computes several sums, does not wait for the
+        previous order, and loads each row once.
         """
         builder = emit.builder
-        wanted = [(pair, True) for pair in self.sums_ahead]
+        keys = [(pair, True) for pair in self.sums_ahead]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
-        wanted += [(pair, False) for pair in pairs - set(self.sums_ahead)]
-        wanted.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours often share a factor
+        keys += [(pair, False) for pair in pairs - set(self.sums_ahead)]
+        keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours often share a factor
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
-        following = builder.add(k, integer(1))
-        for begin in range(0, len(wanted), SUMS_IN_LOOP):
-            some = wanted[begin : begin + SUMS_IN_LOOP]
-            with emit.loop(integer(2), k, [emit.constant(0.0)] * len(some)) as (j, totals, new):
-                up, down = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(following, j))
+        next_order = builder.add(k, integer(1))
+        for begin in range(0, len(keys), SUMS_IN_LOOP):
+            group = keys[begin : begin + SUMS_IN_LOOP]
+            with emit.loop(integer(2), k, [emit.constant(0.0)] * len(group)) as (j, totals, new):
+                up, down = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(next_order, j))
                 below = self._row(emit, scratch, builder.sub(j, integer(1)))
                 loaded: dict[tuple[Value, int], Value] = {}
-                for ((x, y), for_next_order), total in zip(some, totals, strict=True):
+                for ((x, y), for_next_order), total in zip(group, totals, strict=True):
                     places = ((up, x), (down, y)) if for_next_order else ((down, x), (below, y))
                     for base, place in places:
                         if (base, place) not in loaded:
                             loaded[base, place] = emit.load(base, place)
                     new.append(emit.add(total, emit.multiply(*(loaded[each] for each in places))))
-            sums |= dict(zip(some, new, strict=True))
+            sums |= dict(zip(group, new, strict=True))
         return sums
 
     def _operate(
         self,
         emit: LaneEmitter,
-        known: Quantities,
+        quantities: Quantities,
         operations: list[Operation],
         row: "_Row",
         scratch: Value,
@@ -443,7 +445,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write code for the results of operations at order k > 0; for pending products, for the part known so far."""
+        """Write code for the results of operations at order k > 0, without terms whose factor of order k is unknown."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:
@@ -451,24 +453,24 @@ class LaneSeries:
                 sums[pair] = emit.load(scratch, self.carried + self.sums_ahead.index(pair))
             else:
                 sums[pair] = edges.now(pair)
-        begin = emit.pointer(scratch, self.table)
+        row_0 = emit.pointer(scratch, self.table)
         for operation in operations:
             kind, results, (first, _), (second, _) = operation
             if results[0] in self._carried:
                 continue
             totals = [sums[pair] for pair in self._factors(operation)]
-            at = [(emit.load(begin, x), emit.load(begin, y)) for x, y in self._factors(operation)]
-            u = known.sum(first)
+            start = [(emit.load(row_0, x), emit.load(row_0, y)) for x, y in self._factors(operation)]
+            u = quantities.sum(first)
             row.store(operation.first, u, "if used")
             if kind == PENDING:
-                values = [emit.add(totals[0], emit.multiply(u, at[0][1]))]
+                values = [emit.add(totals[0], emit.multiply(u, start[0][1]))]
             elif kind == PRODUCT:
-                z = known.sum(second)
+                z = quantities.sum(second)
                 row.store(operation.second, z)
-                values = [emit.add(emit.add(totals[0], emit.multiply(u, at[0][1])), emit.multiply(at[0][0], z))]
+                values = [emit.add(emit.add(totals[0], emit.multiply(u, start[0][1])), emit.multiply(start[0][0], z))]
             elif kind == RECIPROCAL:
-                total = emit.add(totals[0], emit.multiply(u, at[0][1]))
-                values = [emit.negative(emit.multiply(total, at[0][1]))]
+                total = emit.add(totals[0], emit.multiply(u, start[0][1]))
+                values = [emit.negative(emit.multiply(total, start[0][1]))]
             elif kind == SQUARE_ROOT:
                 divisor = emit.load(scratch, self.divisors + self._divisors[results[0]])
                 values = [emit.multiply(emit.subtract(u, totals[0]), divisor)]
@@ -476,37 +478,37 @@ class LaneSeries:
                 divisor = emit.load(scratch, self.divisors + self._divisors[results[0]])
                 values = [emit.multiply(emit.subtract(u, emit.multiply(totals[0], inverse)), divisor)]
                 row.store(("scaled", ((results[0], 1.0),), 0.0), emit.multiply(order, values[0]))
-                row.store(operation.second, known.sum(second))
+                row.store(operation.second, quantities.sum(second))
             else:
                 x = emit.multiply(order, u)
                 row.store(("scaled", *operation.first), x)
                 values = [
                     emit.multiply(emit.add(total, emit.multiply(x, y)), inverse)
-                    for total, (_, y) in zip(totals, at, strict=True)
+                    for total, (_, y) in zip(totals, start, strict=True)
                 ]
                 if kind == SINE:
                     values[1] = emit.negative(values[1])
             for result, value in zip(results, values, strict=True):
-                known.define(result, value)
+                quantities.define(result, value)
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
 
 class _Row:
-    """Row of the factors of one order in memory; values that were stored by this object are not loaded again."""
+    """Row of the factors of one order in memory; values that this object stored are not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store the value of a factor at its index; if `when` is "if used", skip factors without an index."""
+        """Store the value of the factor `key` at its index; if `when` is "if used", skip a factor without an index."""
         place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
         if place is not None and place not in self._stored:
             self._stored[place] = value
             self.emit.store(value, self.base, place)
 
     def load(self, place: int) -> Value:
-        """Return the factor at an index."""
+        """Return the value of the factor with index `place`."""
         return self._stored[place] if place in self._stored else self.emit.load(self.base, place)
 
 

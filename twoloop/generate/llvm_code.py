@@ -41,7 +41,7 @@ from twoloop.kernels.evaluation.operations import (
 FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # fast-math flags of floating-point instructions, as in kernels
 MIN_TERMS_SPLIT = 4  # number of terms from which on a sum is computed as the sum of two halves
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
-# LLVM intrinsics by names of functions; functions without an intrinsic are called in libm
+# names of LLVM intrinsics by names of functions; a function without an intrinsic is called in libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
 
 
@@ -59,7 +59,7 @@ class Emitter:
         self.numbers: Any = None
 
     def like(self, builder: Builder) -> "Emitter":
-        """Return an emitter of the same kind for another function."""
+        """Return an emitter of the same class that writes to another function, that of `builder`."""
         return type(self)(builder)
 
     def constant(self, value: float) -> Value:
@@ -67,15 +67,15 @@ class Emitter:
         return constant(self.double, value)
 
     def far(self, value: float) -> Value:
-        """Return a number that is loaded from memory where it is used, see `Builder.far`."""
+        """Return a number that is loaded from memory just before its use, see `Builder.far`."""
         return self.builder.far(value)
 
     def whole(self, value: int) -> Value:
-        """Return a literal of 64 bits, an integer (or, in lanes, a vector of equal integers)."""
+        """Return a literal integer of 64 bits; in lanes, a vector of equal integers."""
         return constant(self.whole_number, value)
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal, or the value of a Coefficient, loaded from an array that does not change during a call."""
+        """Return a literal, or a Coefficient loaded from the array `numbers`, which does not change during a call."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
         return self.load(self.numbers, number.place, constant=True)
@@ -105,7 +105,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Return the value of a polynomial, constant first, at x; pairs of terms can be computed in parallel."""
+        """Return the value at x of a polynomial; `coefficients`: constant first. Pairs of terms run in parallel."""
         square, terms = self.builder.operation("fmul", x, x), [self.far(each) for each in coefficients]
         pairs = [self.fused(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -127,17 +127,17 @@ class Emitter:
         return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
 
     def times(self, factor: float, a: Value) -> Value:
-        """Return the product of a literal, or of a Coefficient loaded from memory, and a."""
+        """Return `factor` times a; `factor` is a literal, or a Coefficient loaded from memory."""
         if factor in (1.0, -1.0):
             return a if factor == 1.0 else self.negative(a)
         return self.multiply(self.coefficient(factor), a)
 
     def number(self, whole: Value) -> Value:
-        """Convert an integer to a double."""
+        """Return the integer `whole` converted to a double."""
         return self.builder.convert("sitofp", whole, DOUBLE)
 
     def function(self, name: str, x: Value) -> Value:
-        """Return f(x), by the LLVM intrinsic of this name if there is one, else by libm."""
+        """Return f(x) of the function `name`, computed by its LLVM intrinsic if there is one, else by libm."""
         intrinsic = INTRINSICS.get(name)
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
@@ -148,15 +148,15 @@ class Emitter:
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Return the number at an index, loaded from memory; `constant`: the number does not change during a call."""
+        """Return base[place], loaded from memory; `constant`: this number does not change during a call."""
         return self.builder.load(self.pointer(base, place), constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Store a number at an index."""
+        """Store a number in base[place]."""
         self.builder.store(value, self.pointer(base, place))
 
     def load_vector(self, base: Value, place: int, width: int) -> Value:
-        """Return the vector at an index, whose address must be aligned to the size of the vector.
+        """Return the vector that begins at base[place]; this address must be aligned to the size of the vector.
 
         The load is slow just after the elements were stored one by one: the processor waits until all are stored.
         """
@@ -164,12 +164,12 @@ class Emitter:
         return self.builder.load(pointer, 8 * width)
 
     def store_vector(self, value: Value, base: Value, place: int) -> None:
-        """Store a vector at an index, whose address must be aligned to the size of the vector."""
+        """Store a vector that begins at base[place]; this address must be aligned to the size of the vector."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{value.type}*")
         self.builder.store(value, pointer, 8 * width_of(value.type))
 
     def vector(self, values: Sequence[Value]) -> Value:
-        """Return a vector with the given numbers as elements."""
+        """Return the vector whose elements are `values`."""
         vector = undefined(vector_of(DOUBLE, len(values)))
         for place, value in enumerate(values):
             vector = self.builder.insert(vector, value, place)
@@ -177,15 +177,15 @@ class Emitter:
 
     @contextmanager
     def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Any], list[Any]]]:
-        """Write a loop over integers from `first` to `end` - 1.
+        """Return a context that writes a loop over integers from `first` to `end` - 1.
 
         The context yields the integer, the values carried from the previous iteration (`initial` in the first one), and
-        a list to which their new values are appended. After the loop that list has the final values.
+        a list to which the new values are appended. After the loop this list has the final values.
         """
         builder = self.builder
-        enters = builder.compare("icmp slt", first, end)
+        is_entered = builder.compare("icmp slt", first, end)
         before, body, after = builder.block, builder.append_block(), builder.append_block()
-        builder.branch(enters, body, after)
+        builder.branch(is_entered, body, after)
         builder.position_at_end(body)
         index = builder.phi(INTEGER)
         index.add_incoming(first, before)
@@ -193,9 +193,9 @@ class Emitter:
         new: list[Any] = []
         yield index, carried, new
         next_index = builder.add(index, integer(1))
-        enters, last = builder.compare("icmp slt", next_index, end), builder.block
+        is_entered, last = builder.compare("icmp slt", next_index, end), builder.block
         index.add_incoming(next_index, last)
-        builder.branch(enters, body, after)
+        builder.branch(is_entered, body, after)
         builder.position_at_end(after)
         for k, value in enumerate(initial):
             result = builder.phi(value.type)
@@ -206,10 +206,10 @@ class Emitter:
 
 
 class Quantities:
-    """Values of numbered quantities and of linear combinations of quantities; each is loaded or computed only once.
+    """Values of numbered quantities and of their linear combinations; each value is loaded or computed only once.
 
-    Each part of a divided function loads the quantities that it needs again: otherwise the compiler would spill them to
-    the stack. So the memory from which quantities are loaded must not change.
+    Each part of a divided function loads its quantities again: otherwise the compiler would spill them to the stack. So
+    the memory from which quantities are loaded must not change.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value of a quantity: the defined one, else one loaded in the current part of the function."""
+        """Return the value of a quantity: as defined, or else as loaded in the current part of the function."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._loaded_in_part()
@@ -252,7 +252,7 @@ class Quantities:
         """Return `constant` plus the sum of coefficient * quantity over the terms."""
         key = terms, constant
         if self._emit.builder.module.divided and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # multiplying again takes no longer than loading a stored product
+            ((quantity, coefficient),) = terms  # another multiplication takes no longer than loading the product
             return self._emit.times(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
@@ -279,15 +279,15 @@ def write(
     emit: Callable[..., Any],
     emitter: Callable[..., Emitter] = Emitter,
 ) -> None:
-    """Add a function to a module: `emit` writes its body, `kind` has the types of its result and arguments."""
+    """Add the function `name` to a module; `emit` writes its body, `kind` has the types of its result and arguments."""
     builder = module.function(name, *kind)
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
-# sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... from S. Moshier's Cephes library,
-# sin.c; angles are reduced by multiples of pi/2, which is stored as the sum of two numbers
 LARGEST_ANGLE = 1e6  # largest accepted angle, rad: for larger angles, HALF_PI as a sum of two numbers is not accurate
-HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
+HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # pi/2 as a sum: angles are reduced by multiples of pi/2
+# coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from S. Moshier's Cephes
+# library, sin.c
 SINES = (
     -1.66666666666666307295e-1,
     8.33333333332211858878e-3,
@@ -328,10 +328,11 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     return results[0], results[1]
 
 
+# names of functions by kinds of operations
 FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
 
-Place = tuple[Value, int]  # an array, and an index in it
-NOWHERE: Mapping[int, Place] = {}
+Place = tuple[Value, int]  # memory location: pointer to an array, and an index in this array
+NOWHERE: Mapping[int, Place] = {}  # no memory locations
 
 
 class Lowering(Algebra[Value]):
@@ -342,7 +343,7 @@ class Lowering(Algebra[Value]):
     emit : Emitter
     numbers : Coefficients
     places : dict, optional
-        Memory locations (array and index) of quantities that are stored already.
+        Memory locations of quantities that are stored already.
     """
 
     def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Place] = NOWHERE):
@@ -359,10 +360,10 @@ class Lowering(Algebra[Value]):
         """Define the value of a quantity."""
         self._quantities.define(quantity, value)
 
-    def define_inputs(self, graph: Graph, given: Sequence[Value]) -> None:
-        """Define the inputs of a graph by arguments of the function: numbers, or arrays to be loaded from."""
+    def define_inputs(self, graph: Graph, arguments: Sequence[Value]) -> None:
+        """Define the inputs of a graph by the arguments of the function: numbers, or pointers to arrays of inputs."""
         first = 0
-        for argument, size in zip(given, graph.sizes, strict=True):
+        for argument, size in zip(arguments, graph.sizes, strict=True):
             if argument.type == self.emit.double:
                 self.define(first, argument)
             else:
@@ -395,7 +396,7 @@ class Lowering(Algebra[Value]):
         return self._pairs[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], places: Mapping[int, Place] = NOWHERE) -> None:
-        """Compute quantities in the given order; store each quantity that has a location in `places`."""
+        """Write code that computes quantities in this order, and stores those that have a location in `places`."""
         if not places:
             return super().run(graph, quantities)
         for i in quantities:
@@ -407,7 +408,7 @@ class Lowering(Algebra[Value]):
         return None
 
     def outputs(self, program: Program) -> list[list[Value]]:
-        """Return the arrays of a program as values, after writing code for them and for the quantities of conditions.
+        """Write code that computes the arrays of a program, and the quantities in its conditions; return the arrays.
 
         In a divided function each number is computed just before its use, so that few numbers are in registers between
         parts; LLVM reorders instructions only within a part.
@@ -421,14 +422,14 @@ class Lowering(Algebra[Value]):
         return arrays
 
     def forms(self, graph: Graph, forms: Sequence[Affine]) -> list[Value]:
-        """Return the values of expressions, after writing code for the quantities that were not computed before."""
+        """Return the values of expressions, after writing code for their quantities that were not computed before."""
         quantities = graph.in_order_of_use(forms, self._computed)
         self.run(graph, quantities)
         self._computed.update(quantities)
         return [self.affine(form) for form in forms]
 
     def holds(self, program: Program, values: Sequence[Value]) -> Value:
-        """Return whether the conditions of a program hold, all `values` are finite, and no angle is too large."""
+        """Return whether the conditions of a program hold, `values` are finite, and angles are below LARGEST_ANGLE."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN
@@ -444,6 +445,6 @@ class Lowering(Algebra[Value]):
 def lower(
     emit: Emitter, program: Program, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[Lowering, list[list[Value]]]:
-    """Write code for a program at `inputs`; return the Lowering that wrote the code, and the arrays of the program."""
+    """Write code that evaluates a program at `inputs`; return the Lowering that wrote it, and the program's arrays."""
     lowering = Lowering(emit, numbers)
     return lowering, program.run(lowering, inputs)
