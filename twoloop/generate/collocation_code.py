@@ -91,14 +91,14 @@ def tables() -> Tables:
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
         for sign in (-1, 1)
     ]
-    exact = (
+    extended = (
         *((each + 1) / 2 for each in (x[1:], between)),
         *_integrals(coefficients, x[1:])[1:],
         *_integrals(coefficients, between),
         coefficients[1:].T,
         *(coefficients.T @ each.astype(np.longdouble) for each in powers),
     )
-    return Tables(*(each.astype(np.float64) for each in exact))
+    return Tables(*(each.astype(np.float64) for each in extended))
 
 
 def _nodes() -> Extended:
@@ -116,7 +116,10 @@ def _legendre(z: Extended) -> Extended:
 
 
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
-    """Return values, single and double integrals from 0 of the Lagrange polynomials on [0, 1]; a row for each node."""
+    """Return values at z, single and double integrals to z, of the Lagrange polynomials, each with a row for each node.
+
+    `z` is on [-1, 1]; integrals are over the corresponding interval of [0, 1], from 0.
+    """
     values = _legendre(z)
     # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
     once = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
@@ -125,7 +128,7 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
 
 
 MOST_OPERATIONS = 5000  # largest number of operations of the equations: code of this length takes 2 s to compile
-SMALLEST = 1e-300  # smallest divisor, and smallest allowed error: replaces 0
+SMALLEST = 1e-300  # smallest divisor, and smallest allowed error, which replaces 0
 FAILED = -1.0  # result of `audit` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
 # number of further steps that eliminate M first, after a step whose accelerations by the shorter program were invalid
@@ -133,32 +136,33 @@ STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
 # the iteration; its contraction rho is the ratio of the changes of velocities in two successive sweeps
-KAPPA = 0.02  # error at which the iteration stops, relative to the tolerance: total errors are at most those of DOP853
+KAPPA = 0.02  # iteration error, in tolerances, at which the sweeps end: then total errors are at most those of DOP853
 TARGET_SWEEPS = 6.0  # number of sweeps for which the step size is chosen; larger with predictions of degree 6 and more
 EXTRA_SWEEPS = 7  # number of sweeps beyond the target at which a step that has not converged is rejected
-MAX_CONTRACTION = 0.8  # contraction from which on a step is rejected in its fourth sweep, or later
+MAX_CONTRACTION = 0.8  # contraction at or above which a step is rejected in its fourth sweep or later
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # lower and upper bound that replace a measured contraction outside of them
 # smallest and largest contraction with which the guessed size of the first step is accepted
 FAST_START, SLOW_START = 0.04, 0.3
-# contraction from which on the changes are rounding errors if they are below NOISE, relative to the values
+# contraction at or above which changes below NOISE, relative to the values, count as rounding errors
 STAGNATION_RATIO = 0.5
-# in steps of fixed size, values of KAPPA, of NOISE (as forces may have rounding errors), and of the limit of sweeps
+# in steps of fixed size: values that replace KAPPA, NOISE (forces may have rounding errors) and the limit of sweeps
 KAPPA_OF_FIXED, NOISE_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
-LEAST_CHANGE = 1e-30  # added to the ratio of the iteration's error to KAPPA before its logarithm is computed
-ERROR_WEIGHT = 0.5  # factor of the error estimate
+LEAST_CHANGE = 1e-30  # added to the ratio of the iteration error to KAPPA, whose logarithm would be infinite at 0
+ERROR_WEIGHT = 0.5  # factor by which the error estimate is multiplied
 # allowed defect at the midpoints between nodes, relative to the tolerances: most of its effect averages out in a step
 ALLOWED_DEFECT = 16.0
 
 
 def compiles_quickly(own: SharedCode) -> bool:
-    """Return whether the collocation code of a mechanism compiles within a few seconds."""
+    """Return whether the collocation code of a mechanism compiles within a few seconds, see MOST_OPERATIONS."""
     return own.equations.n_operations <= MOST_OPERATIONS
 
 
 class CollocationCode:
     """Generator of the functions for the collocation steps of one mechanism.
 
-    In the methods, `emit` writes operations on vectors of LANES numbers, and `one` operations on single numbers.
+    In the methods, `emit` writes operations on vectors of LANES numbers, `one` on single numbers, `two` on vectors of
+    two numbers, and `wide` on vectors of coordinates.
 
     Parameters
     ----------
@@ -244,15 +248,15 @@ class CollocationCode:
             return iterate_mass_first()
 
         if self.has_reduced:
-            remaining = one.load(work, at.CAREFUL)
-            with self._returning_if(emit, builder.compare("fcmp ogt", remaining, llvm_code.ZERO)):
-                one.store(one.subtract(remaining, llvm_code.ONE), work, at.CAREFUL)
+            n_careful = one.load(work, at.CAREFUL)
+            with self._returning_if(emit, builder.compare("fcmp ogt", n_careful, llvm_code.ZERO)):
+                one.store(one.subtract(n_careful, llvm_code.ONE), work, at.CAREFUL)
                 builder.ret(iterate_mass_first())
         self._call(emit, "begin_nodes", self._begin_nodes, [work, state, tolerances])
         return self._iterate(emit, work, state, tolerances, evaluate, otherwise)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of the function that iterates and eliminates M first; write the function if it is missing."""
+        """Return the name of the function that iterates with the elimination of M first; write it if it is missing."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -265,10 +269,10 @@ class CollocationCode:
 
     def _caller(self, emit: LaneEmitter, work: Value, index: int) -> Callable[[list[Value]], Callable[[], Value]]:
         """Return the argument `evaluate` of `_iterate` that uses the program `index`, see `call_accelerations`."""
-        filled = Emitter(emit.builder).pointer(work, self.a)
+        accelerations = Emitter(emit.builder).pointer(work, self.a)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
-            holds = call_accelerations(emit, self.equations, index, inputs, self.numbers, filled)
+            holds = call_accelerations(emit, self.equations, index, inputs, self.numbers, accelerations)
             return lambda: holds
 
         return evaluate
@@ -305,27 +309,27 @@ class CollocationCode:
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
         h, rtol = one.load(work, at.H), builder.select(fixed, llvm_code.ONE, one.load(tolerances, RTOL))
-        several, starts = self._vector_emitter(emit)
-        zero = several.constant(0.0)
-        length, half, relative = (several.splat(each) for each in (h, one.multiply(h, constant(DOUBLE, 0.5)), rtol))
+        wide, begins = self._vector_emitter(emit)
+        zero = wide.constant(0.0)
+        length, half, relative = (wide.splat(each) for each in (h, one.multiply(h, constant(DOUBLE, 0.5)), rtol))
         largest = [zero] * 3
-        for start in starts:
-            q, v, a = (several.function("fabs", several.load(one.pointer(state, m * n + start))) for m in range(3))
-            sizes = several.larger(q, several.multiply(half, v)), several.larger(v, several.multiply(half, a))
-            atol = several.load(one.pointer(tolerances, ATOL + start))
-            atol = builder.select(fixed, several.constant(1.0), atol)
-            of_q, of_v = (several.fused(relative, each, atol) for each in sizes)
-            by_v = builder.compare("fcmp olt", several.multiply(of_v, length), of_q)
-            allowed = several.larger(builder.select(by_v, of_v, of_q), several.constant(SMALLEST))
-            weight = several.divide(builder.select(by_v, several.constant(1.0), length), allowed)
-            several.store(weight, one.pointer(work, at.WEIGHTS + start))
-            iterated = [float(start + k in self.iterated) for k in range(several.lanes)]
-            iterated_weight = several.multiply(
-                weight, constants(iterated) if several.lanes > 1 else constant(DOUBLE, *iterated)
+        for begin in begins:
+            q, v, a = (wide.function("fabs", wide.load(one.pointer(state, m * n + begin))) for m in range(3))
+            sizes = wide.larger(q, wide.multiply(half, v)), wide.larger(v, wide.multiply(half, a))
+            atol = wide.load(one.pointer(tolerances, ATOL + begin))
+            atol = builder.select(fixed, wide.constant(1.0), atol)
+            of_q, of_v = (wide.fused(relative, each, atol) for each in sizes)
+            is_v_stricter = builder.compare("fcmp olt", wide.multiply(of_v, length), of_q)
+            allowed = wide.larger(builder.select(is_v_stricter, of_v, of_q), wide.constant(SMALLEST))
+            weight = wide.divide(builder.select(is_v_stricter, wide.constant(1.0), length), allowed)
+            wide.store(weight, one.pointer(work, at.WEIGHTS + begin))
+            is_iterated = [float(begin + k in self.iterated) for k in range(wide.lanes)]
+            iterated_weight = wide.multiply(
+                weight, constants(is_iterated) if wide.lanes > 1 else constant(DOUBLE, *is_iterated)
             )
-            size = several.multiply(iterated_weight, several.fused(length, a, v))
-            largest = [several.larger(*pair) for pair in zip((weight, iterated_weight, size), largest, strict=True)]
-        of_all, of_iterated, size = (several.largest_lane(each) for each in largest)
+            size = wide.multiply(iterated_weight, wide.fused(length, a, v))
+            largest = [wide.larger(*pair) for pair in zip((weight, iterated_weight, size), largest, strict=True)]
+        of_all, of_iterated, size = (wide.largest_lane(each) for each in largest)
         if self.iterated:
             one.store(one.divide(of_all, of_iterated), work, at.STRICTER)
             one.store(size, work, at.SIZE)
@@ -334,13 +338,13 @@ class CollocationCode:
         degree = emit.splat(one.load(work, at.DEGREE))
         exponents = constants([float(k) for k in range(LANES)])
         used_powers = builder.select(builder.compare("fcmp olt", exponents, degree), powers, emit.constant(0.0))
-        old = self._polynomial(emit, work, other=False)
+        polynomial = self._polynomial(emit, work, other=False)
         nodes = np.array(tables().nodes)
         # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
         with loop_over(emit, self.iterated) as (k, i, _, _):
-            scaled = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), used_powers)
+            scaled = emit.multiply(load_lanes(emit, one.pointer(polynomial, vector_index(emit, k))), used_powers)
             store_lanes(emit, scaled, work, at.SCALED)
             terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(work, at.SCALED + j) for j in range(LANES))]
             self._store_stages(
@@ -358,7 +362,7 @@ class CollocationCode:
         return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
 
     def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """Return an emitter for vectors of coordinates, and the first coordinate of each vector; two may overlap."""
+        """Return an emitter for vectors of coordinates, and the first coordinate of each; the last two may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
@@ -467,42 +471,42 @@ class CollocationCode:
         because the estimate is of order 12.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        m, change, target, rho = (one.load(work, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
+        n_sweeps, change, target, rho = (one.load(work, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
         two = LaneEmitter(builder, 2)
-        excess = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
-        excess = one.add(excess, constant(DOUBLE, LEAST_CHANGE))
-        by_rho = two.logarithm(two.vector([excess, rho]))
-        exponent = one.fused(one.subtract(target, m), builder.extract(by_rho, 1), builder.extract(by_rho, 0))
-        by_convergence = one.divide(one.add(exponent, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
+        error_to_kappa = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
+        error_to_kappa = one.add(error_to_kappa, constant(DOUBLE, LEAST_CHANGE))
+        logs = two.logarithm(two.vector([error_to_kappa, rho]))
+        exponent = one.fused(one.subtract(target, n_sweeps), builder.extract(logs, 1), builder.extract(logs, 0))
+        log_convergence = one.divide(one.add(exponent, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
         with one.loop(integer(0), integer(n), []) as (i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * n)
             values = emit.function("fabs", self._weighted_rows(emit, tables().spectrum, a0, work, i))
             pairs = emit.larger(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
             store_lanes(emit, pairs, one.pointer(work, vector_index(emit, i)), self.spectra)
-        several, starts = self._vector_emitter(emit)
-        error = curved = several.constant(0.0)
-        least = several.constant(SMALLEST)
-        for start in starts:
-            vectors = [load_lanes(emit, work, self.spectra + LANES * (start + k)) for k in range(several.lanes)]
+        wide, begins = self._vector_emitter(emit)
+        error = curved = wide.constant(0.0)
+        smallest = wide.constant(SMALLEST)
+        for begin in begins:
+            vectors = [load_lanes(emit, work, self.spectra + LANES * (begin + k)) for k in range(wide.lanes)]
             first, before, top = (column(emit, vectors, lane) for lane in (2, 4, 6))
-            weight = several.load(one.pointer(work, at.WEIGHTS + start))
-            of_last = several.larger(several.larger(before, top), least)
-            decay = several.divide(top, of_last)
-            total_decay = several.divide(top, several.larger(first, of_last))
-            decay = several.larger(several.multiply(decay, several.function("sqrt", decay)), total_decay)
-            error = several.larger(several.multiply(several.multiply(top, weight), decay), error)
-            curved = several.larger(several.multiply(before, weight), curved)
+            weight = wide.load(one.pointer(work, at.WEIGHTS + begin))
+            of_last = wide.larger(wide.larger(before, top), smallest)
+            decay = wide.divide(top, of_last)
+            total_decay = wide.divide(top, wide.larger(first, of_last))
+            decay = wide.larger(wide.multiply(decay, wide.function("sqrt", decay)), total_decay)
+            error = wide.larger(wide.multiply(wide.multiply(top, weight), decay), error)
+            curved = wide.larger(wide.multiply(before, weight), curved)
         h = one.load(work, at.H)
-        error = one.multiply(one.multiply(several.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
+        error = one.multiply(one.multiply(wide.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
         one.store(error, work, at.ERROR)
-        one.store(one.multiply(several.largest_lane(curved), h), work, at.CURVED)
-        by_error = one.multiply(builder.extract(two.logarithm(two.splat(error)), 0), constant(DOUBLE, 1.0 / at.ORDER))
-        factors = two.exponential(two.negative(two.vector([by_convergence, by_error])))
+        one.store(one.multiply(wide.largest_lane(curved), h), work, at.CURVED)
+        log_error = one.multiply(builder.extract(two.logarithm(two.splat(error)), 0), constant(DOUBLE, 1.0 / at.ORDER))
+        factors = two.exponential(two.negative(two.vector([log_convergence, log_error])))
         one.store(builder.extract(factors, 0), work, at.FACTOR)
         one.store(builder.extract(factors, 1), work, at.FACTOR_OF_ERROR)
 
     def audit(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Return the largest defect at the midpoints between nodes, relative to its limit, or FAILED.
+        """Return the largest defect between nodes, relative to its limit, or FAILED if accelerations are invalid.
 
         Store FACTOR_OF_DEFECT, the largest ratio of the next step size to this one that the defect allows.
         """
@@ -518,9 +522,9 @@ class CollocationCode:
             of_q = self._weighted_rows(emit, tables().positions_between, a0, work, integer(i))
             v[i] = emit.fused(h, of_v, emit.splat(v0))
             q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(elapsed, emit.splat(v0), emit.splat(q0)))
-        inputs, filled = [emit.add(t, elapsed), *q, *v], builder.room(DOUBLE, LANES * n)
-        holds = call_accelerations(emit, self.equations, -1, inputs, self.numbers, filled)
-        a = [emit.load(filled, i) for i in range(n)]
+        inputs, accelerations = [emit.add(t, elapsed), *q, *v], builder.room(DOUBLE, LANES * n)
+        holds = call_accelerations(emit, self.equations, -1, inputs, self.numbers, accelerations)
+        a = [emit.load(accelerations, i) for i in range(n)]
         worst = largest = zero
         for i, value in enumerate(a):
             a0 = one.load(state, 2 * n + i)
@@ -540,7 +544,7 @@ class CollocationCode:
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
 
     def retry(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Store the polynomial of a rejected step, so that it predicts the shorter step that replaces the step."""
+        """Store the polynomial of a rejected step, which predicts the shorter step taken instead."""
         one, old = Emitter(emit.builder), self._polynomial(emit, work, other=False)
         with loop_over(emit, self.iterated) as (k, i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * self.n)
@@ -558,19 +562,19 @@ class CollocationCode:
         powers, new = load_lanes(emit, work, at.POWERS), self._polynomial(emit, work, other=True)
         old, zero = self._polynomial(emit, work, other=False), emit.constant(0.0)
         with loop_over(emit, self.iterated, [zero]) as (k, i, (worst,), carried):
-            place = one.pointer(work, vector_index(emit, k))
+            stage = one.pointer(work, vector_index(emit, k))
             target = one.pointer(new_state, i)
             a0, a1 = (
                 one.load(one.pointer(state, i), 2 * n),
                 one.load(one.pointer(work, vector_index(emit, i)), self.a + last),
             )
-            for value, begin in ((one.load(place, self.q + last), 0), (one.load(place, self.v + last), n), (a1, 2 * n)):
+            for value, begin in ((one.load(stage, self.q + last), 0), (one.load(stage, self.v + last), n), (a1, 2 * n)):
                 one.store(value, target, begin)
-            sums = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), powers)
-            for distance in (1, 2, 4):  # partial sums of all terms up to each degree
+            partial_sums = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), powers)
+            for distance in (1, 2, 4):  # element k becomes the sum of the elements 0 to k
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
-                sums = emit.add(sums, builder.shuffle(sums, zero, shifted))
-            errors = emit.add(sums, emit.splat(one.subtract(a0, a1)))
+                partial_sums = emit.add(partial_sums, builder.shuffle(partial_sums, zero, shifted))
+            errors = emit.add(partial_sums, emit.splat(one.subtract(a0, a1)))
             weight = emit.splat(one.load(one.pointer(work, i), at.WEIGHTS))
             carried.append(emit.larger(emit.multiply(emit.function("fabs", errors), weight), worst))
             store_lanes(
@@ -586,17 +590,20 @@ class CollocationCode:
                 q, v, a0 = (one.load(first, m * n) for m in range(3))
                 of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in ends))
                 of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(of_first, (of_v, of_q), strict=True))
-                further = one.multiply(h, one.fused(h, of_q, v))
-                one.store(one.add(q, further), target, 0)
+                displacement = one.multiply(h, one.fused(h, of_q, v))
+                one.store(one.add(q, displacement), target, 0)
                 one.store(one.add(v, one.multiply(h, of_v)), target, n)
                 one.store(builder.extract(a, last), target, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, work: Value, worst: Value) -> None:
-        """Store NEXT_DEGREE, near DEGREE; `worst`: errors of predictions of degree 1 to 8 at the end of the step."""
+        """Store NEXT_DEGREE, at most 2 from DEGREE: the lowest degree with an error of at most 1.2 times the least one.
+
+        `worst`: errors of the predictions of degree 1 to 8 at the end of the step.
+        """
         builder, one = emit.builder, Emitter(emit.builder)
         least = one.negative(emit.largest_lane(emit.negative(worst)))
-        good = builder.compare("fcmp ole", worst, emit.splat(one.multiply(least, constant(DOUBLE, 1.2))))
-        bits = builder.convert("zext", builder.convert("bitcast", good, f"i{LANES}"), INTEGER)
+        is_good = builder.compare("fcmp ole", worst, emit.splat(one.multiply(least, constant(DOUBLE, 1.2))))
+        bits = builder.convert("zext", builder.convert("bitcast", is_good, f"i{LANES}"), INTEGER)
         bits = builder.operation("or", bits, integer(1 << LANES - 1))
         first = builder.call("llvm.cttz.i64", INTEGER, [bits, Value(BIT, "true")])
         best, before = one.add(one.number(first), llvm_code.ONE), one.load(work, at.DEGREE)
@@ -606,7 +613,7 @@ class CollocationCode:
         one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, at.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project the positions at the ends of eight steps in place; store FINE (success) and MOVED, the changes."""
+        """Project the positions at the ends of eight steps in place; store FINE (success) and MOVED (changes)."""
         if self.parts is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:
@@ -687,11 +694,11 @@ class CollocationCode:
         return [first, *(one.load(memory, self.a + node) for node in range(LANES))]
 
     def _weighted_rows(self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value) -> Value:
-        """Return the sum of the rows of a table, multiplied by the accelerations of coordinate i (see `_at_nodes`)."""
+        """Return the sum of the rows of a table, multiplied by the accelerations of coordinate i at the nodes."""
         return self._weighted_sum(emit, table, self._at_nodes(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
-        """Return the sum of the rows of a table, multiplied by `terms`; two accumulators make it faster."""
+        """Return the sum of the rows of a table, multiplied by `terms`; two independent partial sums are faster."""
         sums = [emit.multiply(emit.splat(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)]
         for k, (term, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fused(emit.splat(term), constants(row), sums[(k + 1) % 2])
@@ -700,9 +707,9 @@ class CollocationCode:
     def _polynomial(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
         """Return a pointer to the polynomial of the last accepted step or, if `other`, of the attempted step."""
         builder, one = emit.builder, Emitter(emit.builder)
-        second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(work, at.CURRENT), llvm_code.ZERO)
-        size = LANES * len(self.iterated)
-        offset = builder.select(second, integer(self.polynomials + size), integer(self.polynomials))
+        is_second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(work, at.CURRENT), llvm_code.ZERO)
+        polynomial_size = LANES * len(self.iterated)
+        offset = builder.select(is_second, integer(self.polynomials + polynomial_size), integer(self.polynomials))
         return one.pointer(work, offset)
 
 
@@ -725,7 +732,7 @@ def _compiled(own: SharedCode) -> Collocation:
     from twoloop.kernels.data.common import KIT
 
     code = CollocationCode(own)
-    parts: dict[str, Callable[..., Any]] = {
+    writers: dict[str, Callable[..., Any]] = {
         "attempt_nodes": code.attempt,
         "audit_nodes": code.audit,
         "retry_nodes": code.retry,
@@ -737,11 +744,11 @@ def _compiled(own: SharedCode) -> Collocation:
 
     def write() -> tuple[list[str], str]:
         module = Module(divided=is_split)
-        for name, emit in parts.items():
+        for name, emit in writers.items():
             llvm_code.write(module, name, KIT.llvm_type(name), emit, partial(LaneEmitter, lanes=LANES))
         # with coefficients that were added while writing, the functions would read beyond the end of the array
         assert len(code.numbers.values) == len(numbers)
-        return list(parts), str(module)
+        return list(writers), str(module)
 
     functions = DeferredFunctions(
         lambda: generated_functions("collocation", _stamp(), code.structure, write, passes=not is_split)

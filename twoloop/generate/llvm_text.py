@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
 DOUBLES_PER_CACHE_LINE = 8  # size of a cache line of the processor, in doubles
-# largest number of instructions in a block of a divided function: longer blocks take more than twice as long to compile
+# largest number of instructions in a block of a divided function: longer blocks more than double the compile time
 MAX_BLOCK_LENGTH = 400
 
 
@@ -42,7 +42,7 @@ class Phi(Value):
         self.incoming.append((value, block))
 
     def line(self) -> str:
-        """Return the text of the instruction."""
+        """Return the text of the instruction that defines the node."""
         pairs = ", ".join(f"[{value.text}, %{block.name}]" for value, block in self.incoming)
         return f"{self.text} = phi {self.type} {pairs}"
 
@@ -61,22 +61,22 @@ class Block:
 
 
 def vector_of(kind: str, width: int) -> str:
-    """Return the type of a vector of `width` elements of type `kind`; if `width` is 1, `kind` itself."""
+    """Return the text of the type of a vector with `width` elements of type `kind`; if `width` is 1, return `kind`."""
     return kind if width == 1 else f"<{width} x {kind}>"
 
 
 def width_of(kind: str) -> int:
-    """Return the number of elements of a type; 1 for a number."""
+    """Return the number of elements of a type, which is 1 unless the type is a vector."""
     return int(kind[1:].split()[0]) if kind.startswith("<") else 1
 
 
 def element_of(kind: str) -> str:
-    """Return the type of the elements of a vector; for the type of a number, this type."""
+    """Return the type of the elements of a vector type; return any other type unchanged."""
     return kind[1:-1].split(" x ")[1] if kind.startswith("<") else kind
 
 
 def constant(kind: str, number: float) -> Value:
-    """Return a literal number, or a vector of equal literals."""
+    """Return the literal `number` of type `kind`; if `kind` is a vector type, all elements are `number`."""
     element, width = element_of(kind), width_of(kind)
     bits = struct.unpack("<Q", struct.pack("<d", number))[0]
     text = f"0x{bits:016X}" if element == DOUBLE else str(number)
@@ -84,18 +84,18 @@ def constant(kind: str, number: float) -> Value:
 
 
 def constants(numbers: Iterable[float]) -> Value:
-    """Return a vector of literal numbers."""
-    each = [str(constant(DOUBLE, float(number))) for number in numbers]
-    return Value(vector_of(DOUBLE, len(each)), f"<{', '.join(each)}>")
+    """Return a literal vector whose elements are `numbers`."""
+    texts = [str(constant(DOUBLE, float(number))) for number in numbers]
+    return Value(vector_of(DOUBLE, len(texts)), f"<{', '.join(texts)}>")
 
 
 def integer(number: int) -> Value:
-    """Return a literal integer."""
+    """Return a literal integer of 64 bits."""
     return Value(INTEGER, str(number))
 
 
 def undefined(kind: str) -> Value:
-    """Return an undefined value."""
+    """Return an undefined value of type `kind`, for example a vector before its elements are inserted."""
     return Value(kind, "undef")
 
 
@@ -120,7 +120,7 @@ class Module:
         return builder
 
     def defines(self, name: str) -> bool:
-        """Return whether the module has a function of this name."""
+        """Return whether the module contains a function of this name, not only its declaration."""
         return any(function.name == name for function in self._functions)
 
     def table(self, places: Sequence[int]) -> Value:
@@ -194,7 +194,7 @@ class Builder:
     def _value(self, kind: str, text: str) -> Value:
         if self.module.divided and len(self.block.lines) >= MAX_BLOCK_LENGTH:
             self._divide()
-        value = Value(kind, f"%{self._n}")  # LLVM reads numbers in a third less time than names
+        value = Value(kind, f"%{self._n}")  # LLVM reads numbered values in a third less time than named values
         self._n += 1
         self.block.lines.append(f"{value.text} = {text}")
         return value
@@ -228,11 +228,11 @@ class Builder:
         return self.operation("mul", a, b)
 
     def both(self, a: Value, b: Value) -> Value:
-        """Return the bitwise conjunction of a and b."""
+        """Return the bitwise "and" of a and b."""
         return self.operation("and", a, b)
 
     def convert(self, name: str, a: Value, kind: str) -> Value:
-        """Return a value converted to another type by an instruction such as "sitofp" or "bitcast"."""
+        """Return a value converted to the type `kind` by an instruction `name`, such as "sitofp" or "bitcast"."""
         return self._value(kind, f"{name} {a.type} {a.text} to {kind}")
 
     def compare(self, name: str, a: Value, b: Value) -> Value:
@@ -245,7 +245,7 @@ class Builder:
         return self._value(a.type, f"select {condition}, {a}, {b}")
 
     def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
-        """Return the result of a call; declare a function that the module does not define. `flags`: fast-math flags."""
+        """Return the result of calling the function `name`, and declare the function. `flags`: fast-math flags."""
         self.module.declare(name, kind, [value.type for value in arguments])
         return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
@@ -254,7 +254,7 @@ class Builder:
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:
-        """Return a pointer to stack memory, allocated in the first block: in a loop the stack would grow each time."""
+        """Return a pointer to `size` numbers of stack memory, allocated in the first block, outside of loops."""
         pointer = Value(f"{kind}*", f"%room{self._n_rooms}")
         self._blocks[0].lines.insert(
             self._n_rooms, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
@@ -263,7 +263,7 @@ class Builder:
         return pointer
 
     def far(self, number: float) -> Value:
-        """Return a number loaded where it is used: a literal would occupy a register or the stack for long."""
+        """Return a number loaded just before its use: a literal would occupy a register or stack memory for long."""
         if self._far is None:
             self._far = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
@@ -271,7 +271,7 @@ class Builder:
         return self.load(self.gep(self._far, integer(self.module.far_number(number))))
 
     def leave_unless(self, condition: Value) -> None:
-        """Write a return from the function, with the result false, that is executed if a condition is false."""
+        """Write code that returns false from the function if a condition is false."""
         go_on, leave = self.append_block(), self.append_block()
         self.branch(condition, go_on, leave)
         self.position_at_end(leave)
@@ -284,33 +284,33 @@ class Builder:
 
     def load(self, pointer: Value, align: int = 8, constant: bool = False) -> Value:
         """Return the value to which a pointer points; `constant`: this value does not change during a call."""
-        kind, never = pointer.type[:-1], ", !invariant.load !0" if constant else ""
-        return self._value(kind, f"load {kind}, {pointer}, align {align}{never}")
+        kind, metadata = pointer.type[:-1], ", !invariant.load !0" if constant else ""
+        return self._value(kind, f"load {kind}, {pointer}, align {align}{metadata}")
 
     def store(self, value: Value, pointer: Value, align: int = 8) -> None:
         """Store a value at the address `pointer`."""
         self._line(f"store {value}, {pointer}, align {align}")
 
     def insert(self, vector: Value, value: Value, place: int) -> Value:
-        """Return a vector with one element replaced."""
+        """Return a vector whose element number `place` is replaced by `value`."""
         return self._value(vector.type, f"insertelement {vector}, {value}, {WORD} {place}")
 
     def extract(self, vector: Value, place: int) -> Value:
-        """Return an element of a vector."""
+        """Return the element number `place` of a vector."""
         return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
 
     def shuffle(self, a: Value, b: Value, places: Sequence[int]) -> Value:
-        """Return a vector of elements of a and b with the indices `places`; the indices of b follow those of a."""
+        """Return a vector of the elements `places` of the vectors a and b, whose indices follow those of a."""
         mask = f"<{len(places)} x {WORD}> <{', '.join(f'{WORD} {place}' for place in places)}>"
         return self._value(vector_of(element_of(a.type), len(places)), f"shufflevector {a}, {b}, {mask}")
 
     def first_everywhere(self, vector: Value) -> Value:
-        """Return a vector filled with the first element of a vector."""
+        """Return a vector whose elements all equal the first element of `vector`."""
         mask = f"<{width_of(vector.type)} x {WORD}> zeroinitializer"
         return self._value(vector.type, f"shufflevector {vector}, {vector}, {mask}")
 
     def phi(self, kind: str) -> Phi:
-        """Append a phi node without values; `Phi.add_incoming` adds the value for each preceding block."""
+        """Append a phi node to the current block, and return it; `Phi.add_incoming` adds its values."""
         phi = Phi(kind, f"%{self._n}")
         self._n += 1
         self.block.lines.append(phi)
@@ -326,7 +326,7 @@ class Builder:
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
-        """Return a context for instructions that run only if a condition is true."""
+        """Return a context that writes instructions which run only if a condition is true."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
         self.position_at_end(then)
