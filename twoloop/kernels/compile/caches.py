@@ -67,13 +67,13 @@ def read_trusted(path: Path) -> bytes:
 
 
 def write_trusted(path: Path, content: bytes) -> None:
-    """Write a new file that no other user can write, whatever the umask."""
+    """Write `content` to a new file; no other user can write this file, whatever the umask."""
     with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as file:
         file.write(content)
 
 
 def make_trusted_folder(folder: Path) -> None:
-    """Create a folder and missing folders above it, which no other user can write, whatever the umask."""
+    """Create a folder and the missing folders above it; no other user can write these folders, whatever the umask."""
     for each in [*reversed(folder.parents), folder]:
         if not each.exists():
             each.mkdir(0o755, exist_ok=True)
@@ -101,17 +101,17 @@ def reason_to_distrust(folder: Path) -> str:
     """Return why another user could have written to a folder or a folder above it, or "" if nobody could."""
     if os.name != "posix":  # on other systems, the mode does not contain the access rights
         return ""
-    real = Path(os.path.realpath(folder))
-    for each in [real, *real.parents]:
+    real_path = Path(os.path.realpath(folder))
+    for each in [real_path, *real_path.parents]:
         try:
             status = each.stat()
         except FileNotFoundError:  # the folder does not exist yet
             continue
         except OSError as error:
             return f"{each} cannot be examined ({error.strerror})"
-        # in a sticky folder only the owner of an entry can replace it
-        sticky = each != real and status.st_mode & stat.S_ISVTX
-        reason = _reason_of_owner(status) if sticky else _reason_of_mode(status)
+        # in a sticky folder, others than the owner of a file or folder cannot replace it
+        is_sticky = each != real_path and status.st_mode & stat.S_ISVTX
+        reason = _reason_of_owner(status) if is_sticky else _reason_of_mode(status)
         if reason:
             return f"{each} {reason}"
     return ""
@@ -131,7 +131,7 @@ def _reason_of_mode(status: os.stat_result) -> str:
 
 
 def _reason_of_owner(status: os.stat_result) -> str:
-    """Return the text that a file or folder belongs to another user, or "" if it belongs to the user or root."""
+    """Return "belongs to user N" for a file or folder of another user N, or "" if the user or root owns it."""
     return "" if status.st_uid in (0, os.geteuid()) else f"belongs to user {status.st_uid}"
 
 
@@ -143,13 +143,13 @@ def _is_private_group(gid: int) -> bool:
 
     try:
         user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(gid)
-    except KeyError:  # a user without an entry, as in containers
+    except KeyError:  # the user or the group has no entry in the system's databases, as in containers
         return False
     is_own = gid == 0 or (gid == user.pw_gid and group.gr_name == user.pw_name)
     return is_own and set(group.gr_mem) <= {"root", user.pw_name}
 
 
-_temporary: list[tempfile.TemporaryDirectory[str]] = []
+_temporary: list[tempfile.TemporaryDirectory[str]] = []  # the temporary folder of this process, once it exists
 
 
 def _temporary_folder() -> str:
@@ -159,7 +159,7 @@ def _temporary_folder() -> str:
     return _temporary[0].name
 
 
-_warnings: list[str] = []
+_warnings: list[str] = []  # the warning that `_warn_first` has printed, if any
 
 
 def _warn_first(text: str) -> None:
@@ -170,7 +170,7 @@ def _warn_first(text: str) -> None:
 
 
 MAX_ON_DISK = 500  # largest number of files on disk for each kind of function generated for single mechanisms
-CHECKSUM = hashlib.sha256().digest_size  # length of the checksum at the beginning of a file, bytes
+CHECKSUM_SIZE = hashlib.sha256().digest_size  # length of the checksum at the beginning of a file, bytes
 
 
 class CodeFiles:
@@ -210,9 +210,9 @@ class CodeFiles:
             content = read_trusted(self._path(key))
         except OSError:
             return None
-        if hashlib.sha256(content[CHECKSUM:]).digest() != content[:CHECKSUM]:
+        if hashlib.sha256(content[CHECKSUM_SIZE:]).digest() != content[:CHECKSUM_SIZE]:
             return None
-        made_of, data = pickle.loads(content[CHECKSUM:])
+        made_of, data = pickle.loads(content[CHECKSUM_SIZE:])
         return pickle.loads(data) if made_of == repr((*self.made_of, key)) else None
 
     def flush(self) -> None:
@@ -221,11 +221,11 @@ class CodeFiles:
             path.unlink(missing_ok=True)
 
     def _all_files(self) -> list[Path]:
-        """Return the files of all keys."""
+        """Return the paths of the files of all keys."""
         return list(self.folder.glob(f"{glob.escape(self.name)}.*.nbc"))
 
     def _path(self, key: Any) -> Path:
-        """Return the file for a key."""
+        """Return the path of the file for a key."""
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
 
 
@@ -357,10 +357,10 @@ class _Cache(FunctionCache):
             with suppress(OSError):
                 make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
-        source = self._cache_file._source_stamp
+        source_stamp = self._cache_file._source_stamp
         folder = trusted_folder(Path(self._cache_path))
         self._cache_path = str(folder)
-        self._cache_file = CodeFiles(folder, self._impl.filename_base, (source, stamp))
+        self._cache_file = CodeFiles(folder, self._impl.filename_base, (source_stamp, stamp))
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -408,7 +408,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         watched = digests_of(function)
         dispatcher = njit(**options)(with_unique_name(function, watched))
         if watched is not None:
-            # a callback that uses this function as a closure variable must not compile it again
+            # so that a callback that uses this function as a closure variable does not compile the function again
             _COMPILED_DIGESTS[dispatcher] = watched
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
@@ -420,9 +420,9 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
     """Return two digests of everything on which the machine code of a function depends; replace its helpers' caches.
 
-    The first digest is that of its code, defaults, globals, and the attributes that it uses of modules. The second
-    digest is that of its closure variables. For a compiled helper among these values, the values that the helper uses
-    are hashed, too; numba's cache of the helper is replaced by that of twoloop. Returns None if a value may change
+    The first digest is that of the function's code, defaults, globals, and the attributes that it uses of modules. The
+    second digest is that of its closure variables. For a compiled helper among these values, the values that the helper
+    uses are hashed, too; numba's cache of the helper is replaced by that of twoloop. Returns None if a value may change
     without a change of the digest.
     """
     watched, helpers = _digests_and_helpers(function)
@@ -468,17 +468,17 @@ def _use_twoloop_cache(helper: Any) -> None:
     use the code of the helper that numba compiled or loaded first, perhaps before the first call of this function.
     """
     watched, compiled = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
-    changed = compiled is not None and compiled != watched
+    has_changed = compiled is not None and compiled != watched
     if watched is not None:
         _COMPILED_DIGESTS[helper] = watched
     if jitable_templates(helper):
-        if changed or compiled is None:
+        if has_changed or compiled is None:
             forget_compiled(helper)
         return
-    if isinstance(helper._cache, FunctionCache) and (changed or not isinstance(helper._cache, _Cache)):
+    if isinstance(helper._cache, FunctionCache) and (has_changed or not isinstance(helper._cache, _Cache)):
         try:
             helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
         except RuntimeError:
             helper._cache = NullCache()
-    if helper.overloads and (changed or (compiled is None and (helper._can_compile or helper.stats.cache_hits))):
+    if helper.overloads and (has_changed or (compiled is None and (helper._can_compile or helper.stats.cache_hits))):
         helper.recompile()

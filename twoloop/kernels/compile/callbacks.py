@@ -39,7 +39,7 @@ SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed
 
 
 def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return a function, or its copy that calls bounds-checked copies of helpers, and numba's options to compile it."""
+    """Return `function`, or its copy that calls bounds-checked copies of helpers, and numba's options to compile it."""
     helpers = [helper for place in frozen_locations(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
         return FunctionCopier(_compile_with_bounds_checks).copy_of(function), BOUNDS_CHECK
@@ -61,7 +61,7 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
         return False
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    except (OSError, TypeError, SyntaxError):  # typed at a prompt, or only part of a statement
+    except (OSError, TypeError, SyntaxError):  # the function was typed at a prompt, or is only part of a statement
         return True
     computed = _computed_names(tree)
     return any(not _is_safe_index(node.slice, computed) for node in ast.walk(tree) if isinstance(node, ast.Subscript))
@@ -71,7 +71,7 @@ def _computed_names(tree: ast.AST) -> set[str]:
     """Return the names in a function whose values may be other than constants, loop counters and array sizes."""
     computed = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
-        before = len(computed)
+        n_before = len(computed)
         for node in ast.walk(tree):
             if isinstance(node, ast.For):
                 targets, value = [node.target], node.iter
@@ -84,7 +84,7 @@ def _computed_names(tree: ast.AST) -> set[str]:
             if value is None or not _is_safe_index(value, computed):
                 names = [node for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
                 computed |= {name.id for name in names if isinstance(name.ctx, ast.Store)}
-        if len(computed) == before:
+        if len(computed) == n_before:
             return computed
 
 
@@ -103,8 +103,8 @@ def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
     if isinstance(node, ast.Subscript):
         return _is_safe_index(node.value, computed) and _is_safe_index(node.slice, computed)
     if isinstance(node, ast.BinOp | ast.UnaryOp | ast.Tuple | ast.List | ast.Slice):
-        skip = (ast.operator, ast.unaryop, ast.expr_context)
-        return all(_is_safe_index(each, computed) for each in ast.iter_child_nodes(node) if not isinstance(each, skip))
+        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # nodes that are no expressions
+        return all(_is_safe_index(each, computed) for each in ast.iter_child_nodes(node) if not isinstance(each, kinds))
     return False
 
 
@@ -390,7 +390,7 @@ def compile_callback(
         watched = f"{watched[0]} {options}", watched[1]
     try:
         dispatcher = compile_cached(compiled, KINDS[kind].read_only_signature, watched, **options)
-    except Exception as error:  # numba lets some of its own assertions through
+    except Exception as error:  # not only errors of numba: its assertions may fail, too
         dispatcher = _compile_writable(kind, compiled, watched, named or function, error, options)
     else:
         add_signature(dispatcher, KINDS[kind].signature)
@@ -478,8 +478,8 @@ def _without_colours(error: Exception) -> str:
 
 def _informative_line(error: Exception) -> str:
     """Return the type of an error, and the last line of numba's message that gives a reason."""
-    plain = _without_colours(error)
-    plain = re.sub(r":\s*>>> ", ": ", _EXCERPT.sub("", plain))  # >>> marks a signature without a match
-    lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
+    message = _without_colours(error)
+    message = re.sub(r":\s*>>> ", ": ", _EXCERPT.sub("", message))  # >>> marks a signature without a match
+    lines = [line.strip() for line in message.splitlines() if line and not line.startswith("    ")]
     informative = [line for line in lines if line and not _UNINFORMATIVE.match(line) and not line.startswith("def ")]
-    return f"{type(error).__name__}: {informative[-1] if informative else plain.strip()[:200]}"
+    return f"{type(error).__name__}: {informative[-1] if informative else message.strip()[:200]}"

@@ -136,7 +136,7 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
-        """Register a new value and return True; for a registered value, add its position to the hash, return False."""
+        """Register a new value and return True; hash the position of a value registered before, and return False."""
         key = (id(value), name)
         if key in self.seen:
             self.hash.update(f"<again {self.seen[key]}>".encode())
@@ -147,8 +147,8 @@ class Digest:
 
 def names_of_code(code: types.CodeType) -> set[str]:
     """Return the names of all globals and attributes that a code object and the functions within it use."""
-    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
-    return set(code.co_names).union(*map(names_of_code, inner))
+    inner_codes = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    return set(code.co_names).union(*map(names_of_code, inner_codes))
 
 
 def globals_of(function: Any) -> dict[str, Any]:
@@ -244,10 +244,10 @@ def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[Fr
     if id(function) in seen:
         return
     seen.add(id(function))
-    is_ours = is_twoloop(function.__globals__.get("__name__", ""))
+    is_of_twoloop = is_twoloop(function.__globals__.get("__name__", ""))
     for used in _direct_locations(function):
         for location in _value_and_items(used, seen):
-            if not is_ours and _is_frozen(location.value):
+            if not is_of_twoloop and _is_frozen(location.value):
                 yield location
             helper = python_function(location.value)
             if helper is not None:
@@ -309,7 +309,7 @@ def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
 def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
     """Yield the attributes that are used of a user's module, and of modules within it.
 
-    `attributes` are the names loaded one after another, as in `module.inner.K`. If there are none, the module itself is
+    `attributes` are the names loaded one after another, as in `module.inner.K`. Without any, the module itself is
     passed on, for example to a local variable or a helper, and all attributes listed in `names` are yielded.
     """
     if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
@@ -326,19 +326,19 @@ def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], nam
 def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
     """Return the globals and closure variables that a code object and the functions within it load."""
     loaded_names: dict[_LoadedName, None] = {}
-    loaded = None
+    current = None
     for each in dis.get_instructions(code):
-        if loaded is not None and each.opname in LOADS_ATTRIBUTE:
-            loaded = loaded._replace(attributes=(*loaded.attributes, each.argval))
+        if current is not None and each.opname in LOADS_ATTRIBUTE:
+            current = current._replace(attributes=(*current.attributes, each.argval))
         elif each.opname not in NO_EFFECT:
-            if loaded is not None:
-                loaded_names[loaded] = None
+            if current is not None:
+                loaded_names[current] = None
             free = each.opname == "LOAD_DEREF" and each.argval in code.co_freevars
-            loaded = _LoadedName(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
-    inner = [
+            current = _LoadedName(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
+    inner_names = [
         entry for constant in code.co_consts if isinstance(constant, CodeType) for entry in _loaded_names(constant)
     ]
-    loaded_names.update((entry, None) for entry in inner if not entry.free or entry.name in code.co_freevars)
+    loaded_names.update((entry, None) for entry in inner_names if not entry.free or entry.name in code.co_freevars)
     return tuple(loaded_names)
 
 
@@ -386,13 +386,13 @@ class FunctionCopier:
     def _add_copy(self, helper: Any) -> None:
         """Add the replacement of a helper or function to `self.known`."""
         function = getattr(helper, "py_func", helper)
-        own, names = names_of_code(function.__code__), frozenset(reachable_names(function))
+        used_names, names = names_of_code(function.__code__), frozenset(reachable_names(function))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
         self.known[id(helper)] = self.wrap(copy, helper)  # before its values are replaced: they may include it
-        for name in own & set(own_globals):
+        for name in used_names & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
         if function.__defaults__ is not None:
             copy.__defaults__ = self.value(function.__defaults__, names)

@@ -60,7 +60,7 @@ class DeferredFunctions:
         return self.functions.addresses
 
 
-_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # functions by kind, then by key
+_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # generated functions by kind, then by key
 
 
 def generated_functions(
@@ -81,7 +81,7 @@ def generated_functions(
     write : callable
         Returns the names of the functions and the text of the LLVM module.
     passes : bool
-        See `object_code`.
+        Whether LLVM optimises the code.
     """
     if (functions := _IN_MEMORY[kind].get(key)) is not None:
         return functions  # type: ignore[no-any-return]

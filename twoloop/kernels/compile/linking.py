@@ -56,8 +56,8 @@ def jitable_templates(function: Any) -> list[Any]:
     except ValueError:  # no function that numba supports
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
-    owned = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
-    return templates if all(owned) else []  # otherwise, another implementation may replace the function
+    is_own = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
+    return templates if all(is_own) else []  # otherwise, another implementation may replace the function
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
@@ -110,8 +110,8 @@ def _element_address(
         return _numba_indexing(context, builder, kind, array, index_types, indices, **options)
     sizes = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
     index_arguments = zip(index_types, indices, sizes, strict=True)
-    resolved = [arrayobj.fix_integer_index(context, builder, *each) for each in index_arguments]
-    return cgutils.get_item_pointer2(context, builder, array.data, sizes, None, "C", resolved), [], []
+    final_indices = [arrayobj.fix_integer_index(context, builder, *each) for each in index_arguments]
+    return cgutils.get_item_pointer2(context, builder, array.data, sizes, None, "C", final_indices), [], []
 
 
 _numba_call_type: Any = BaseFunction.get_call_type
@@ -175,14 +175,14 @@ def _variables(self: Any, part: Any) -> list[Any]:
         return [part]
     if isinstance(part, ir.Inst):
         return part.list_vars()  # type: ignore[no-any-return]
-    found: list[Any] = []
+    variables: list[Any] = []
     if isinstance(part, (dict, list, tuple)):
         for each in part.values() if isinstance(part, dict) else part:
             if type(each) is ir.Var:
-                found.append(each)
+                variables.append(each)
             elif type(each) not in _LEAF_TYPES:
-                found += _variables(self, each)
-    return found
+                variables += _variables(self, each)
+    return variables
 
 
 _numba_load_registries: Any = CPUContext.load_additional_registries
@@ -200,7 +200,7 @@ def _load_registries_once(self: Any) -> None:
         _numba_load_registries(self)
 
 
-_LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
+_LOCKS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of numba's events of locks
 
 
 def _without_lock_events(report: Any) -> Any:
@@ -226,7 +226,7 @@ _depth = [0]  # number of nested compilations of kernels
 
 @contextmanager
 def kernel_rules() -> Iterator[None]:
-    """Replace numba's functions by those of `_RULES` while a kernel is compiled."""
+    """Return a context for compiling a kernel, in which functions of numba are replaced by those of `_RULES`."""
     if _depth[0] == 0:
         before = [vars(owner).get(name, _MISSING) for owner, name, _ in _RULES]
         for owner, name, rule in _RULES:
@@ -245,7 +245,7 @@ def kernel_rules() -> Iterator[None]:
 
 
 class _WithoutEnvironment:
-    """Wrapper of numba's code generator for code that is never loaded, whose environment needs no address."""
+    """Wrapper of numba's code generator for code that is never loaded, so that its environment needs no address."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
