@@ -103,11 +103,11 @@ def tables() -> Tables:
 
 def _nodes() -> Extended:
     """Return the nodes on [-1, 1]: -1, the zeros of P_8', and 1."""
-    inner = legendre.legroots(legendre.legder([0] * (N - 1) + [1])).astype(np.longdouble)
+    zeros = legendre.legroots(legendre.legder([0] * (N - 1) + [1])).astype(np.longdouble)
     derivative = legendre.legder(np.array([0] * (N - 1) + [1], dtype=np.longdouble))
     for _ in range(3):
-        inner = inner - legendre.legval(inner, derivative) / legendre.legval(inner, legendre.legder(derivative))
-    return np.concatenate([[np.longdouble(-1)], np.sort(inner), [np.longdouble(1)]])
+        zeros = zeros - legendre.legval(zeros, derivative) / legendre.legval(zeros, legendre.legder(derivative))
+    return np.concatenate([[np.longdouble(-1)], np.sort(zeros), [np.longdouble(1)]])
 
 
 def _legendre(z: Extended) -> Extended:
@@ -122,9 +122,9 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     """
     values = _legendre(z)
     # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
-    once = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
-    twice = np.array([once[1] + once[0], *((once[k + 1] - once[k - 1]) / (2 * k + 1) for k in range(1, N))])
-    return coefficients.T @ values[:N], coefficients.T @ once[:N] / 2, coefficients.T @ twice / 4
+    single = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
+    double = np.array([single[1] + single[0], *((single[k + 1] - single[k - 1]) / (2 * k + 1) for k in range(1, N))])
+    return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
 MOST_OPERATIONS = 5000  # largest number of operations of the equations: code of this length takes 2 s to compile
@@ -153,9 +153,9 @@ ERROR_WEIGHT = 0.5  # factor by which the error estimate is multiplied
 ALLOWED_DEFECT = 16.0
 
 
-def compiles_quickly(own: SharedCode) -> bool:
+def compiles_quickly(shared: SharedCode) -> bool:
     """Return whether the collocation code of a mechanism compiles within a few seconds, see MOST_OPERATIONS."""
-    return own.equations.n_operations <= MOST_OPERATIONS
+    return shared.equations.n_operations <= MOST_OPERATIONS
 
 
 class CollocationCode:
@@ -166,8 +166,8 @@ class CollocationCode:
 
     Parameters
     ----------
-    own : SharedCode
-        Code of the equations, whose coefficients the functions share.
+    shared : SharedCode
+        Code of the equations, whose coefficients the functions use, too.
 
     Attributes
     ----------
@@ -179,8 +179,8 @@ class CollocationCode:
         Digest of everything that the functions depend on, except the values of `numbers`.
     """
 
-    def __init__(self, own: SharedCode):
-        self.equations, self.numbers, self.parts = own.equations, own.numbers, own.parts
+    def __init__(self, shared: SharedCode):
+        self.equations, self.numbers, self.parts = shared.equations, shared.numbers, shared.parts
         self.n, self.n_rows = self.equations.system.n_q, len(self.equations.all_rows)
         self.iterated = self._iterated()
         self.others = [i for i in range(self.n) if i not in self.iterated]
@@ -191,11 +191,11 @@ class CollocationCode:
 
         if self.parts is None:
             outputs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # the digest of `own` covers the other programs
+        else:  # the digest of `shared` covers the other programs
             outputs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in outputs]
-        self.structure = hashlib.sha256(repr([own.digest, description]).encode()).hexdigest()
+        self.structure = hashlib.sha256(repr([shared.digest, description]).encode()).hexdigest()
 
     def _iterated(self) -> list[int]:
         graph, forms = self.equations.graph, []
@@ -233,15 +233,15 @@ class CollocationCode:
                 for i, value in zip(coordinates, lowering.forms(graph, [forms[i] for i in coordinates]), strict=True):
                     store_lanes(emit, value, work, self.a + LANES * i)
 
-            def finish() -> Value:
+            def store_others() -> Value:
                 store_accelerations(self.others)
                 lowering.forms(graph, [form for pair in outputs.conditions for form in pair])
                 return lowering.holds(outputs, self._accelerations(emit, work))
 
             store_accelerations(self.iterated)
-            return finish
+            return store_others
 
-        def otherwise() -> Value:
+        def fallback() -> Value:
             if not self.has_reduced:
                 return constant(DOUBLE, float(at.NOT_COMPUTED))
             one.store(constant(DOUBLE, STEPS_BY_MASS_FIRST), work, at.CAREFUL)
@@ -253,7 +253,7 @@ class CollocationCode:
                 one.store(one.subtract(n_careful, llvm_code.ONE), work, at.CAREFUL)
                 builder.ret(iterate_mass_first())
         self._call(emit, "begin_nodes", self._begin_nodes, [work, state, tolerances])
-        return self._iterate(emit, work, state, tolerances, evaluate, otherwise)
+        return self._iterate(emit, work, state, tolerances, evaluate, fallback)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
         """Return the name of the function that iterates with the elimination of M first; write it if it is missing."""
@@ -307,8 +307,8 @@ class CollocationCode:
         In steps of fixed size, which have no error estimate, rtol = atol = 1.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
-        h, rtol = one.load(work, at.H), builder.select(fixed, llvm_code.ONE, one.load(tolerances, RTOL))
+        has_fixed_size = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
+        h, rtol = one.load(work, at.H), builder.select(has_fixed_size, llvm_code.ONE, one.load(tolerances, RTOL))
         wide, begins = self._vector_emitter(emit)
         zero = wide.constant(0.0)
         length, half, relative = (wide.splat(each) for each in (h, one.multiply(h, constant(DOUBLE, 0.5)), rtol))
@@ -317,7 +317,7 @@ class CollocationCode:
             q, v, a = (wide.function("fabs", wide.load(one.pointer(state, m * n + begin))) for m in range(3))
             sizes = wide.larger(q, wide.multiply(half, v)), wide.larger(v, wide.multiply(half, a))
             atol = wide.load(one.pointer(tolerances, ATOL + begin))
-            atol = builder.select(fixed, wide.constant(1.0), atol)
+            atol = builder.select(has_fixed_size, wide.constant(1.0), atol)
             of_q, of_v = (wide.fused(relative, each, atol) for each in sizes)
             is_v_stricter = builder.compare("fcmp olt", wide.multiply(of_v, length), of_q)
             allowed = wide.larger(builder.select(is_v_stricter, of_v, of_q), wide.constant(SMALLEST))
@@ -327,12 +327,12 @@ class CollocationCode:
             iterated_weight = wide.multiply(
                 weight, constants(is_iterated) if wide.lanes > 1 else constant(DOUBLE, *is_iterated)
             )
-            size = wide.multiply(iterated_weight, wide.fused(length, a, v))
-            largest = [wide.larger(*pair) for pair in zip((weight, iterated_weight, size), largest, strict=True)]
-        of_all, of_iterated, size = (wide.largest_lane(each) for each in largest)
+            scaled_v = wide.multiply(iterated_weight, wide.fused(length, a, v))
+            largest = [wide.larger(*pair) for pair in zip((weight, iterated_weight, scaled_v), largest, strict=True)]
+        of_all, of_iterated, scaled_v = (wide.largest_lane(each) for each in largest)
         if self.iterated:
             one.store(one.divide(of_all, of_iterated), work, at.STRICTER)
-            one.store(size, work, at.SIZE)
+            one.store(scaled_v, work, at.SIZE)
         powers = self._powers(emit, one.divide(h, one.load(work, at.H_BEFORE)))
         store_lanes(emit, powers, work, at.POWERS)
         degree = emit.splat(one.load(work, at.DEGREE))
@@ -373,20 +373,20 @@ class CollocationCode:
         state: Value,
         tolerances: Value,
         evaluate: Callable[[list[Value]], Callable[[], Value]],
-        otherwise: Callable[[], Value],
+        fallback: Callable[[], Value],
     ) -> Value:
         """Sweep over the stages until they converge, or the step is rejected; return the code of `attempt`.
 
         `evaluate` stores the accelerations of the iterated coordinates at [t, q, v]; the function that it returns
         stores the other accelerations, and returns whether all accelerations are valid. If they are not, the code is
-        that of `otherwise`.
+        that of `fallback`.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
 
         def number(value: float) -> Value:
             return constant(DOUBLE, value)
 
-        estimated = builder.compare("fcmp one", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
+        has_estimate = builder.compare("fcmp one", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
         degree, stricter = one.load(work, at.DEGREE), one.load(work, at.STRICTER)
         target = builder.select(
             builder.compare("fcmp oge", degree, number(6.0)),
@@ -395,9 +395,9 @@ class CollocationCode:
             ),
             number(TARGET_SWEEPS),
         )
-        max_sweeps = builder.select(estimated, one.add(target, number(EXTRA_SWEEPS)), number(MAX_SWEEPS_OF_FIXED))
+        max_sweeps = builder.select(has_estimate, one.add(target, number(EXTRA_SWEEPS)), number(MAX_SWEEPS_OF_FIXED))
         kappa, noise = (
-            builder.select(estimated, number(usual), number(fixed))
+            builder.select(has_estimate, number(usual), number(fixed))
             for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (at.NOISE, NOISE_OF_FIXED))
         )
         noise = one.multiply(noise, one.multiply(one.load(work, at.SIZE), stricter))
@@ -415,7 +415,7 @@ class CollocationCode:
         q, v = [emit.constant(0.0)] * n, [emit.constant(0.0)] * n
         for k, i in enumerate(self.iterated):
             q[i], v[i] = load_lanes(emit, work, self.q + LANES * k), load_lanes(emit, work, self.v + LANES * k)
-        finish = evaluate([times, *q, *v])
+        store_others = evaluate([times, *q, *v])
         change = one.multiply(stricter, self._integrate(emit, work, state))
         sweep = one.add(sweeps, llvm_code.ONE)
 
@@ -428,36 +428,36 @@ class CollocationCode:
         contraction = one.divide(change, one.larger(change_before, number(SMALLEST)))
         contraction = one.smaller(one.larger(contraction, number(MIN_RHO)), number(MAX_RHO))
         rho_now = builder.select(compare("ogt", sweep, 1.0), contraction, rho)
-        out_of_range = either(compare("olt", rho_now, FAST_START), compare("ogt", rho_now, SLOW_START))
-        guessed = builder.both(
+        is_out_of_range = either(compare("olt", rho_now, FAST_START), compare("ogt", rho_now, SLOW_START))
+        was_guessed = builder.both(
             builder.both(may_guess, compare("oeq", sweep, 2.0)),
-            builder.both(out_of_range, compare("ogt", change, 0.0)),
+            builder.both(is_out_of_range, compare("ogt", change, 0.0)),
         )
-        stagnant = builder.both(
+        is_stagnant = builder.both(
             compare("ogt", sweep, 2.0),
             builder.both(
                 compare("oge", change, one.multiply(number(STAGNATION_RATIO), change_before)),
                 compare("ole", change, noise),
             ),
         )
-        converged = either(compare("ole", one.multiply(rho_now, change), kappa), stagnant)
-        slow = builder.both(
-            builder.both(compare("ogt", sweep, 3.0), estimated), compare("oge", rho_now, MAX_CONTRACTION)
+        has_converged = either(compare("ole", one.multiply(rho_now, change), kappa), is_stagnant)
+        is_slow = builder.both(
+            builder.both(compare("ogt", sweep, 3.0), has_estimate), compare("oge", rho_now, MAX_CONTRACTION)
         )
-        refused = either(either(slow, compare("oge", sweep, max_sweeps)), compare("uge", change, INFINITE))
-        stops = builder.operation("or", either(guessed, converged), refused)
+        is_refused = either(either(is_slow, compare("oge", sweep, max_sweeps)), compare("uge", change, INFINITE))
+        stops = builder.operation("or", either(was_guessed, has_converged), is_refused)
         for phi, value in zip(carried, (sweep, change, rho_now), strict=True):
             phi.add_incoming(value, builder.block)
         builder.branch(stops, after, loop)
         builder.position_at_end(after)
-        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [finish()])
+        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [store_others()])
         with self._returning_if(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
-            builder.ret(otherwise())
+            builder.ret(fallback())
         for value, place in ((sweep, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
             one.store(value, work, place)
-        code = builder.select(converged, number(at.CONVERGED), number(at.REFUSED))
-        code = builder.select(guessed, number(at.GUESSED), code)
-        with builder.if_then(builder.both(builder.compare("fcmp oeq", code, number(at.CONVERGED)), estimated)):
+        code = builder.select(has_converged, number(at.CONVERGED), number(at.REFUSED))
+        code = builder.select(was_guessed, number(at.GUESSED), code)
+        with builder.if_then(builder.both(builder.compare("fcmp oeq", code, number(at.CONVERGED)), has_estimate)):
             self._call(emit, "judge_nodes", self._estimate_error, [work, state])
         return code
 
@@ -488,14 +488,14 @@ class CollocationCode:
         smallest = wide.constant(SMALLEST)
         for begin in begins:
             vectors = [load_lanes(emit, work, self.spectra + LANES * (begin + k)) for k in range(wide.lanes)]
-            first, before, top = (column(emit, vectors, lane) for lane in (2, 4, 6))
+            largest_34, largest_56, largest_78 = (column(emit, vectors, lane) for lane in (2, 4, 6))
             weight = wide.load(one.pointer(work, at.WEIGHTS + begin))
-            of_last = wide.larger(wide.larger(before, top), smallest)
-            decay = wide.divide(top, of_last)
-            total_decay = wide.divide(top, wide.larger(first, of_last))
+            largest_58 = wide.larger(wide.larger(largest_56, largest_78), smallest)
+            decay = wide.divide(largest_78, largest_58)
+            total_decay = wide.divide(largest_78, wide.larger(largest_34, largest_58))
             decay = wide.larger(wide.multiply(decay, wide.function("sqrt", decay)), total_decay)
-            error = wide.larger(wide.multiply(wide.multiply(top, weight), decay), error)
-            curved = wide.larger(wide.multiply(before, weight), curved)
+            error = wide.larger(wide.multiply(wide.multiply(largest_78, weight), decay), error)
+            curved = wide.larger(wide.multiply(largest_56, weight), curved)
         h = one.load(work, at.H)
         error = one.multiply(one.multiply(wide.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
         one.store(error, work, at.ERROR)
@@ -536,10 +536,10 @@ class CollocationCode:
         scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED_DEFECT)))
         defect = one.larger(emit.largest_lane(scaled), llvm_code.ZERO)
         two = LaneEmitter(builder, 2)
-        power = two.multiply(
+        log_factor = two.multiply(
             two.logarithm(two.splat(one.larger(defect, constant(DOUBLE, 1e-9)))), two.constant(-1.0 / 9)
         )
-        one.store(builder.extract(two.exponential(power), 0), work, at.FACTOR_OF_DEFECT)
+        one.store(builder.extract(two.exponential(log_factor), 0), work, at.FACTOR_OF_DEFECT)
         all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds])
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
 
@@ -582,14 +582,14 @@ class CollocationCode:
             )
         self._choose_degree(emit, work, carried[0])
         if self.others:
-            ends = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
-            of_first = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
+            last_weights = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
+            weights_0 = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
             with loop_over(emit, self.others) as (_, i, _, _):
                 first, target = one.pointer(state, i), one.pointer(new_state, i)
                 a = load_lanes(emit, one.pointer(work, vector_index(emit, i)), self.a)
                 q, v, a0 = (one.load(first, m * n) for m in range(3))
-                of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in ends))
-                of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(of_first, (of_v, of_q), strict=True))
+                of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in last_weights))
+                of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(weights_0, (of_v, of_q), strict=True))
                 displacement = one.multiply(h, one.fused(h, of_q, v))
                 one.store(one.add(q, displacement), target, 0)
                 one.store(one.add(v, one.multiply(h, of_v)), target, n)
@@ -653,10 +653,10 @@ class CollocationCode:
         return {"q": self.ends + LANES, "v": self.ends + LANES * (1 + self.n), "a": self.end_a, "lam": self.lam}
 
     def _store_largest_move(self, emit: LaneEmitter, work: Value, values: Sequence[Value], holds: Value) -> None:
-        moved = emit.constant(0.0)
+        largest = emit.constant(0.0)
         for value in values:
-            moved = emit.larger(emit.function("fabs", value), moved)
-        store_lanes(emit, moved, work, at.MOVED)
+            largest = emit.larger(emit.function("fabs", value), largest)
+        store_lanes(emit, largest, work, at.MOVED)
         before = load_lanes(emit, work, at.FINE)
         store_lanes(emit, emit.builder.select(holds, before, emit.constant(0.0)), work, at.FINE)
 
@@ -682,9 +682,9 @@ class CollocationCode:
         place, begin = one.pointer(work, vector_index(emit, k)), one.pointer(state, i)
         q0, v0 = (emit.splat(one.load(begin, m * self.n)) for m in range(2))
         v = emit.fused(h, sums[0], v0)
-        inner = emit.fused(h, sums[1], emit.multiply(constants(tables().nodes), v0))
+        displacement_rate = emit.fused(h, sums[1], emit.multiply(constants(tables().nodes), v0))
         store_lanes(emit, v, place, self.v)
-        store_lanes(emit, emit.fused(h, inner, q0), place, self.q)
+        store_lanes(emit, emit.fused(h, displacement_rate, q0), place, self.q)
         return v
 
     def _at_nodes(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
@@ -728,10 +728,10 @@ def compiled_collocation(generated: GeneratedCode) -> Collocation:
     return collocation._replace(numbers=generated.evaluate(collocation.numbers))
 
 
-def _compiled(own: SharedCode) -> Collocation:
+def _compiled(shared: SharedCode) -> Collocation:
     from twoloop.kernels.data.common import KIT
 
-    code = CollocationCode(own)
+    code = CollocationCode(shared)
     writers: dict[str, Callable[..., Any]] = {
         "attempt_nodes": code.attempt,
         "audit_nodes": code.audit,
@@ -740,7 +740,7 @@ def _compiled(own: SharedCode) -> Collocation:
         "correct_ends": code.project_positions,
         "project_ends": code.project_states,
     }
-    is_split, numbers = own.parts is not None, code.numbers.formulas
+    is_split, numbers = shared.parts is not None, code.numbers.formulas
 
     def write() -> tuple[list[str], str]:
         module = Module(divided=is_split)

@@ -237,11 +237,11 @@ class LaneSteps:
         def root(x: Value) -> Value:
             return emit.exponential(emit.multiply(emit.logarithm(x), per_order))
 
-        by_departure = root(emit.divide(emit.constant(TARGET_ERROR), off))
-        factor = select(builder.compare("fcmp ogt", off, one), by_departure, one)
-        by_defect = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
-        by_defect = emit.smaller(factor, emit.larger(shortest, by_defect))
-        factor = select(builder.compare("fcmp ogt", defect, one), by_defect, factor)
+        departure_factor = root(emit.divide(emit.constant(TARGET_ERROR), off))
+        factor = select(builder.compare("fcmp ogt", off, one), departure_factor, one)
+        defect_factor = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
+        defect_factor = emit.smaller(factor, emit.larger(shortest, defect_factor))
+        factor = select(builder.compare("fcmp ogt", defect, one), defect_factor, factor)
         factor = select(is_valid, factor, shortest)
         running, refused = is_set(emit, work, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
         accepted = builder.both(running, builder.compare("fcmp oge", factor, one))

@@ -166,13 +166,13 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
     """Return the elements number `lane` of all `vectors` as one vector; of a single vector, return this element."""
-    builder, lanes = emit.builder, [lane, STAGES + lane]
+    builder, indices = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
     while len(vectors) > 1:
         pairs = zip(vectors[::2], vectors[1::2], strict=True)
-        vectors = [builder.shuffle(*pair, lanes) for pair in pairs]
-        lanes = list(range(2 * len(lanes)))
+        vectors = [builder.shuffle(*pair, indices) for pair in pairs]
+        indices = list(range(2 * len(indices)))
     return vectors[0]
 
 
@@ -247,10 +247,10 @@ class LaneSeries:
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(sums.row.tolist(), sums.more_column.tolist(), sums.more_coefficient.tolist(), strict=True):
             more[row].append((i, c))
-        firsts = zip(rows, sums.column.tolist(), sums.coefficient.tolist(), sums.constant.tolist(), strict=True)
+        first_terms = zip(rows, sums.column.tolist(), sums.coefficient.tolist(), sums.constant.tolist(), strict=True)
         return [
             self.numbers.of(tuple(term for term in ((i, c), *more[row]) if term[1] != 0.0), constant)
-            for row, i, c, constant in firsts
+            for row, i, c, constant in first_terms
         ]
 
     def _rows(self, sums: Sums, places: Any) -> list[tuple[int, tuple[Terms, float]]]:
@@ -260,9 +260,9 @@ class LaneSeries:
         firsts, seconds = (self._forms(each, range(len(each.column))) for each in (table.first, table.second))
         operations = []
         for kind, begin, end in table.groups[:, :3].tolist():
-            half = (end - begin) // 2 if kind == SINE else end - begin
-            for k in range(begin, begin + half):
-                results = (quantity + k, quantity + k + half) if kind == SINE else (quantity + k,)
+            count = (end - begin) // 2 if kind == SINE else end - begin
+            for k in range(begin, begin + count):
+                results = (quantity + k, quantity + k + count) if kind == SINE else (quantity + k,)
                 operations.append(Operation(kind, results, firsts[k], seconds[k]))
         return operations
 
@@ -344,9 +344,9 @@ class LaneSeries:
         for place, (terms, _) in self.rows:
             c[place] = emit.multiply(minus_rate, quantities.sum(terms))
         r = [emit.load(scratch, self.r + i) for i in range(n)]
-        kept = [emit.load(scratch, i) for i in range(self.solution.n_stored)]
+        stored = [emit.load(scratch, i) for i in range(self.solution.n_stored)]
         solution = self.solution
-        _, (a, lam) = lower(emit, solution.solved, [*r, *c, *kept], self.numbers)
+        _, (a, lam) = lower(emit, solution.solved, [*r, *c, *stored], self.numbers)
         per_v, per_q = emit.multiply(unit, per_order), emit.divide(unit, emit.number(next_order))
         before = Quantities(emit, lambda i: zero)  # a and lam of order k - 1
         for j in range(n):
@@ -423,10 +423,10 @@ class LaneSeries:
             group = keys[begin : begin + SUMS_IN_LOOP]
             with emit.loop(integer(2), k, [emit.constant(0.0)] * len(group)) as (j, totals, new):
                 up, down = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(next_order, j))
-                below = self._row(emit, scratch, builder.sub(j, integer(1)))
+                row_before = self._row(emit, scratch, builder.sub(j, integer(1)))
                 loaded: dict[tuple[Value, int], Value] = {}
                 for ((x, y), for_next_order), total in zip(group, totals, strict=True):
-                    places = ((up, x), (down, y)) if for_next_order else ((down, x), (below, y))
+                    places = ((up, x), (down, y)) if for_next_order else ((down, x), (row_before, y))
                     for base, place in places:
                         if (base, place) not in loaded:
                             loaded[base, place] = emit.load(base, place)

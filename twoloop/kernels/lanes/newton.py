@@ -105,15 +105,15 @@ def memory_size(s: int, n: int) -> int:
 
 
 @merged
-def vector_at(memory, n, which):
-    """Return the offset of block `which` (n vectors), such as START; `memory`: offset of the method's memory."""
-    return memory + N_OF_LANES + which * n
+def vector_at(memory, n, block):
+    """Return the offset of a block of n vectors, such as START; `memory`: offset of the method's memory."""
+    return memory + N_OF_LANES + block * n
 
 
 @merged
-def block_at(memory, n, s, which):
-    """Return the offset of block `which` ((s, n) vectors), such as STAGES."""
-    return memory + N_OF_LANES + (N_VECTORS + which * s) * n
+def block_at(memory, n, s, block):
+    """Return the offset of a block of (s, n) vectors, such as STAGES; `memory`: offset of the method's memory."""
+    return memory + N_OF_LANES + (N_VECTORS + block * s) * n
 
 
 @merged
@@ -123,9 +123,9 @@ def _weights_at(memory, n, s):
 
 
 @merged
-def matrix_at(memory, n, s, which):
-    """Return the offset of matrix `which` (n, n), such as BY_Q; the parts of system k begin at SYSTEMS + 2 k."""
-    return _weights_at(memory, n, s) + s * s + which * n * n
+def matrix_at(memory, n, s, index):
+    """Return the offset of a matrix (n, n) by an index such as BY_Q; those of system k are SYSTEMS + 2 k and + 1."""
+    return _weights_at(memory, n, s) + s * s + index * n * n
 
 
 @merged
@@ -255,9 +255,9 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
         sum_rows(A2[j], stage_rows, total)
         for m in range(n):
             for k in range(LANES):
-                x, at = work[X * LANES + k], (begin + m) * LANES + k
-                displacement = x * c[j] * work[at + n * LANES] + x * x * work[(sums + m) * LANES + k]
-                work[(new + m) * LANES + k] = work[at] + displacement
+                x, index = work[X * LANES + k], (begin + m) * LANES + k
+                displacement = x * c[j] * work[index + n * LANES] + x * x * work[(sums + m) * LANES + k]
+                work[(new + m) * LANES + k] = work[index] + displacement
         sum_rows(A[j], stage_rows, total)
         for m in range(n):
             for k in range(LANES):
@@ -309,9 +309,9 @@ def _correct_stages(settings, method_options, s, work):
 def _store_largest(work, target, begin, n):
     """Increase the vector `target` to the largest |value| of the n vectors from `begin` on, or to NaN if one is NaN."""
     for i in range(n * LANES):
-        magnitude, at = abs(work[begin * LANES + i]), target * LANES + i % LANES
-        if magnitude > work[at] or magnitude != magnitude:
-            work[at] = magnitude
+        magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
+        if magnitude > work[index] or magnitude != magnitude:
+            work[index] = magnitude
 
 
 @compiled
@@ -394,16 +394,16 @@ def state_from_stages(settings, b, bA, work):
     stage_rows, total = table(work, block_at(memory, n, s, STAGES), s, n), vectors(work, sums, n)
     sum_rows(bA, stage_rows, total)
     for i in range(n * LANES):
-        x, at = work[X * LANES + i % LANES], begin * LANES + i
-        work[new * LANES + i] = work[at] + (x * work[at + n * LANES] + x * x * work[sums * LANES + i])
+        x, index = work[X * LANES + i % LANES], begin * LANES + i
+        work[new * LANES + i] = work[index] + (x * work[index + n * LANES] + x * x * work[sums * LANES + i])
     sum_rows(b, stage_rows, total)
     for i in range(n * LANES):
-        x, at = work[X * LANES + i % LANES], (begin + n) * LANES + i
-        work[(new + n) * LANES + i] = work[at] + x * work[sums * LANES + i]
+        x, index = work[X * LANES + i % LANES], (begin + n) * LANES + i
+        work[(new + n) * LANES + i] = work[index] + x * work[sums * LANES + i]
 
 
 @merged
-def _allowed(control, work, state, new, j, entry, k):
+def _allowed_error(control, work, state, new, j, entry, k):
     """Return the allowed error, in lane k, of entry `entry` of a state [q, v], which belongs to coordinate j."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[ATOL + j] + control[RTOL] * magnitude
@@ -480,8 +480,8 @@ def _velocity_error(control, work, n, error_v, duration, state, new, k):
     """Return the largest error, in tolerances, that a velocity error of `duration` (s) causes in lane k."""
     error = 0.0
     for j in range(n):
-        weight_q = duration / _allowed(control, work, state, new, j, j, k)
-        weight_v = 1.0 / _allowed(control, work, state, new, j, n + j, k)
+        weight_q = duration / _allowed_error(control, work, state, new, j, j, k)
+        weight_v = 1.0 / _allowed_error(control, work, state, new, j, n + j, k)
         error = max(error, abs(work[(error_v + j) * LANES + k]) * min(weight_q, weight_v))
     return error
 
@@ -494,8 +494,8 @@ def _motion_time(control, work, n, memory, k):
     for j in range(n):
         largest_v = max(largest_v, abs(work[(begin + j) * LANES + k]))
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
-    longest = LONGEST_GAPS * control[GAP]
-    return largest_v / largest_a if largest_v < longest * largest_a else longest
+    max_time = LONGEST_GAPS * control[GAP]
+    return largest_v / largest_a if largest_v < max_time * largest_a else max_time
 
 
 @compiled
@@ -503,14 +503,14 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
     """Increase ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
+    e_v, error_field, fine_copy = vector_at(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
     has_large_error = False
     for k in range(LANES):
         error = 0.0
         if work[ERROR * LANES + k] <= 1.0:
             motion_time = _motion_time(control, work, n, memory, k)
             error = _velocity_error(control, work, n, e_v, motion_time, state, new, k)
-        work[most * LANES + k], work[fine * LANES + k] = error, work[FINE * LANES + k]
+        work[error_field * LANES + k], work[fine_copy * LANES + k] = error, work[FINE * LANES + k]
         has_large_error = has_large_error or error > 1.0
     if not has_large_error:
         return
@@ -525,12 +525,12 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
     factor_lanes(work, matrix, pivots, n, 0)
     solve_lanes(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
-        error = work[most * LANES + k]
+        error = work[error_field * LANES + k]
         if work[FINE * LANES + k] == 1.0:  # in unstable motion the filtered error may be larger: the smaller one counts
             motion_time = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, motion_time, state, new, k))
-        work[FINE * LANES + k] = work[fine * LANES + k]
-        if work[most * LANES + k] > 1.0:
+        work[FINE * LANES + k] = work[fine_copy * LANES + k]
+        if work[error_field * LANES + k] > 1.0:
             work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
 
 

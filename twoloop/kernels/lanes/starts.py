@@ -369,9 +369,9 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
     x, change, nearest, correction = memory + x, memory + change, memory + nearest, memory + correction
     weakest, displacement, factors = memory + weakest, memory + displacement, memory + at_nearest
     _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest)
-    for own, other in OTHER_GUESSES:
+    for by_correction, by_weakest in OTHER_GUESSES:
         for j in range(n * LANES):
-            shift = own * work[correction * LANES + j] + other * work[weakest * LANES + j]
+            shift = by_correction * work[correction * LANES + j] + by_weakest * work[weakest * LANES + j]
             work[displacement * LANES + j], work[new * LANES + j] = shift, work[nearest * LANES + j] + shift
         _gauss_newton(code, settings, control, pattern, moves, work)
         for i in range(n_rows):
