@@ -25,12 +25,12 @@ Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # row and column indices
 
 LARGE = 64  # number of coordinates from which on entries are faster than dense matrices (from 36 on for chains of bars)
-# kinds that return the values of entries, by their dense kinds
+# for the kind of callback that returns a dense matrix, the kind that returns the values of its entries
 VALUES_OF = {"mass": "mass_values", "jacobian": "jacobian_values"}
 
 
 def check_entries(name: str, given: Any, shape: tuple[int, int], symmetric: bool) -> Entries:
-    """Return the rows and columns of the entries of a matrix as vectors, or raise if they are wrong."""
+    """Return rows and columns of the entries of a matrix as int64 vectors; raise TypeError or ValueError if wrong."""
     try:
         rows, columns = map(np.asarray, given)
     except (TypeError, ValueError):
@@ -62,7 +62,7 @@ def _check_both_triangles(name: str, rows: Integers, columns: Integers) -> None:
 
 
 def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatcher:
-    """Compile the dense callback "mass" or "jacobian" from a callback that returns values at these entries."""
+    """Compile the dense callback "mass" or "jacobian" from a callback that returns the values at `entries`."""
     rows, columns = entries
     n = len(rows)
 
@@ -77,7 +77,7 @@ def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatche
 
 @dataclass(frozen=True, eq=False)
 class DenseFunction:
-    """Build the dense matrix from a plain Python function that returns values of entries; called in the same way."""
+    """Plain function of a dense matrix, by the plain function `values` of its entries with the same arguments."""
 
     values: Callable[..., Any]
     entries: Entries
@@ -87,21 +87,21 @@ class DenseFunction:
         """Return the matrix; of symbols if the function returns symbols."""
         values = np.asarray(self.values(t, q, *p))
         if values.shape != self.entries[0].shape:
-            return values  # the caller refuses its shape
+            return values  # `store` refuses this shape
         matrix = np.zeros(self.shape, dtype=values.dtype if values.dtype == object else np.float64)
         for i, j, value in zip(*(indices.tolist() for indices in self.entries), values, strict=True):
             matrix[i, j] = matrix[i, j] + value
         return matrix
 
 
-# first displacement, relative to max(1, |q|); a power of two, so that q + displacement is exact
+# first displacement h of a coordinate q, relative to max(1, |q|); a power of two, so that q + h is exact
 FIRST_DISPLACEMENT = 2.0**-6
-SHRINKAGE = 0.125  # factor on the next displacement, if the constraints bend too much over this one
-N_DISPLACEMENTS = 9
-AGREEMENT = 1e-11  # relative to an entry: if the formulas of order 6 and 8 agree to this, the displacement is kept
+SHRINKAGE = 0.125  # factor on a displacement over which the constraints are too nonlinear
+N_DISPLACEMENTS = 9  # largest number of displacements that are tried
+AGREEMENT = 1e-11  # difference of the formulas of order 6 and 8, relative to an entry, up to which h is accepted
 ROUNDING = 1e-14  # rounding error of a constraint, relative to its largest value at the displaced points
 
-# d/dx at 0 from f(k h) - f(-k h), k = 1 ... 4, over h
+# weights of (f(k h) - f(-k h)) / h, k = 1 ... 4, in formulas of order 8 and 6 for the derivative of f at 0
 ORDER_8 = (4.0 / 5.0, -1.0 / 5.0, 4.0 / 105.0, -1.0 / 280.0)
 ORDER_6 = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0, 0.0)
 
@@ -161,14 +161,14 @@ def differenced_jacobian(constraint: Dispatcher) -> Dispatcher:
 Address = tuple[int, tuple[int, ...]]  # address and shape of a contiguous float64 array, whose boxing would take 0.5 us
 
 KIND_NAMES = tuple(KINDS)
-_ARRAYS: dict[Address, Array] = {}  # by address: arrays of a run do not move
-MAX_ARRAYS = 1000
+_ARRAYS: dict[Address, Array] = {}  # cached arrays by address and shape: the arrays of a run do not move
+MAX_ARRAYS = 1000  # largest number of cached arrays
 REAL_DTYPES = "fiu"  # kinds of real dtypes; durations, which NumPy counts as integers, are excluded
-HANDLE_BITS = 52  # so that a float64 holds a handle exactly, and handles of different processes differ
+HANDLE_BITS = 52  # random bits of a handle: a float64 represents it exactly, and those of two processes differ
 
 
 class PythonFunctions:
-    """Register the plain Python functions of a system, so that the compiled `through_python` can call them.
+    """Plain Python functions of a system, registered so that the compiled `through_python` can call them.
 
     A number, the handle, is stored before the parameters and identifies this object. It is valid in this process and
     its forks; unpickling registers the functions again. Functions of the kinds in `taking` get the parameters.
@@ -188,7 +188,7 @@ class PythonFunctions:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the samples at the beginning of a run."""
+        """Discard the samples, at the beginning of a run."""
         self.samples: list[tuple[tuple[Any, ...], Any]] = []
         self._calls, self._next = 0, 1
 
@@ -277,7 +277,7 @@ def through_python(kind: str) -> Dispatcher:
 
 @njit
 def _fill(value, out):  # type: ignore[no-untyped-def]
-    """Copy an array to one of the same shape; numba takes two seconds longer to compile `out[:] = value`."""
+    """Copy `value` into `out` of the same shape; numba takes two seconds longer to compile `out[:] = value`."""
     for k in range(out.size):
         out.flat[k] = value.flat[k]
 
@@ -337,7 +337,7 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
 
 @dataclass(frozen=True, eq=False)
 class ConstantMatrix:
-    """Return a constant mass matrix when called as mass(t, q)."""
+    """Constant mass matrix, which can be called as mass(t, q)."""
 
     matrix: Array
 
@@ -349,7 +349,7 @@ class ConstantMatrix:
 def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -> bool:
     """Return whether a function that returns its array takes `p` after the arguments of its kind.
 
-    With `parameters` it does, unless that argument is missing, or has a default and another name.
+    If the system has `parameters`, it does, unless this argument is missing, or has a default and another name.
 
     Raises
     ------
@@ -442,7 +442,7 @@ def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, ja
 
 
 class PlainFunctions(NamedTuple):
-    """Plain functions by kind, the entries whose values they return, and which of them take the parameters p."""
+    """Plain functions by kind, entries whose values they return, kinds `taking` the parameters, and these, p."""
 
     functions: dict[str, Any]
     entries: dict[str, Entries]
@@ -454,7 +454,7 @@ class PlainFunctions(NamedTuple):
 def plain_functions(
     functions: dict[str, Any], sizes: tuple[int, int, int], entries: tuple[Any, Any], parameters: Any, name: str
 ) -> PlainFunctions:
-    """Check the arguments of a system of plain functions; `entries` are those of M and C_q."""
+    """Return checked plain functions of a system; `sizes`: n_q, n_c, n_a; `entries`: those of M and C_q, or None."""
     n_q, n_c, n_a = sizes
     if functions.get("kinematics") is not None:
         raise TypeError(
@@ -487,12 +487,12 @@ def plain_functions(
 
 
 def substitute(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
-    """Return the replacement of a callback that is not given."""
+    """Return the callback of a kind that is not given: differences of the constraints, or zero."""
     if KINDS[kind].absent != "differences" or "constraint" not in given:
         return zero_callback(kind)
     return differenced_jacobian(given["constraint"])
 
 
 def callbacks_in(names: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the callbacks of a module, each named by its kind, for a ConstrainedSystem."""
+    """Return the callbacks among a module's `names`, by kind, as arguments of a ConstrainedSystem."""
     return {kind: names[kind] for kind in KINDS if kind in names}

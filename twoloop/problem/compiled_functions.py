@@ -67,21 +67,21 @@ class GeneratedCode:
 
     @property
     def kinds(self) -> list[str]:
-        """Return the kinds of its callbacks."""
+        """Return the kinds of callbacks that the source defines."""
         return [kind for kind in KINDS if f"def {kind}(" in self.source]
 
     def value(self, name: str) -> Any:
-        """Return the object that the source defines under a name: functions as plain Python."""
+        """Return the object that the source defines as `name`; functions are plain Python functions."""
         return _functions(self)[name]
 
     def callback(self, kind: str) -> Dispatcher:
-        """Return a compiled callback, whose machine code is cached on disk."""
+        """Return the compiled callback of a kind; its machine code is cached on disk."""
         return _compiled(self, kind)
 
 
 @dataclass(frozen=True)
 class GeneratedEnergy:
-    """Evaluate kinetic plus potential energy, J, at t, q and v: for one state or for the columns of many."""
+    """Kinetic plus potential energy, J, as a function of t, q and v, for one state or for the columns of many."""
 
     code: GeneratedCode
     parameters: tuple[float, ...]
@@ -105,7 +105,7 @@ def _functions(code: GeneratedCode) -> dict[str, Any]:
 
 
 def module_of(name: str, path: Path, text: str, missing: bool, names: dict[str, Any]) -> dict[str, Any]:
-    """Execute generated source as a module with the given names; first write it to a file if that is missing."""
+    """Execute source `text` as a module with globals `names`; return its namespace; write its file if `missing`."""
     if missing:
         _write(path, text)
     module = types.ModuleType(name)
@@ -131,7 +131,7 @@ def _head(source: str) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file atomically; if no folder can be written, every process derives and compiles again."""
+    """Write a file atomically; warn if the folder is not writable, as every process then compiles again."""
     unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
     try:
         make_trusted_folder(path.parent)
@@ -184,13 +184,13 @@ class FrozenValues:
         self.any = bool(cells or names or arrays)
 
     def change(self) -> Change | None:
-        """Return the first change, or None. It must be fast, because every call of `solve_dae` checks it."""
+        """Return the first change of a value, or None; this is fast, because every call of `solve_dae` checks it."""
         for cell, value, kind, name in self._cells:
             if cell.cell_contents is not value and _differ(cell.cell_contents, value):
                 return Change(kind, name, value, cell.cell_contents)
-        for space, key, value, kind, name in self._names:
-            if key in space and space[key] is not value and _differ(space[key], value):
-                return Change(kind, name, value, space[key])
+        for namespace, key, value, kind, name in self._names:
+            if key in namespace and namespace[key] is not value and _differ(namespace[key], value):
+                return Change(kind, name, value, namespace[key])
         for array, content, kind, name in self._arrays:
             if array.tobytes() != content:
                 return Change(kind, name, np.frombuffer(content, array.dtype).reshape(array.shape), array)
@@ -198,19 +198,19 @@ class FrozenValues:
 
 
 def _differ(a: Any, b: Any) -> bool:
-    """Return whether two values differ for a compiled function; helpers are compared by code and frozen values."""
+    """Return whether a compiled function would distinguish a and b; functions differ by code or frozen values."""
     if a is b:
         return False
     if isinstance(a, tuple) and isinstance(b, tuple):
-        fields = getattr(a, "_fields", None) != getattr(b, "_fields", None)
-        return fields or len(a) != len(b) or any(map(_differ, a, b))
+        names_differ = getattr(a, "_fields", None) != getattr(b, "_fields", None)
+        return names_differ or len(a) != len(b) or any(map(_differ, a, b))
     if python_function(a) and python_function(b):
         return _code_of(a) != _code_of(b)
     return not np.array_equal(a, b)
 
 
 def _code_of(helper: Any) -> str:
-    """Return a digest of a helper and of all that it names, or its id if parts of it cannot be digested."""
+    """Return a digest of a function and of all objects that it names, or its id if one of these has no digest."""
     digest = Digest()
     try:
         digest.add(helper)
@@ -220,7 +220,7 @@ def _code_of(helper: Any) -> str:
 
 
 class PickledCall:
-    """Object that is pickled as a call, `find(*arguments)`, which unpickling makes."""
+    """Object that is pickled as the call `find(*arguments)`, whose result unpickling returns."""
 
     def __init__(self, find: Callable[..., Any], *arguments: Any):
         self.call = find, arguments
@@ -240,7 +240,7 @@ def portable(system_name: str, kind: str, function: Any) -> Any:
     Raises
     ------
     TypeError
-        If it is a plain function that pickle cannot find by its name.
+        If the function is a plain one that pickle cannot find by its name.
     """
     if isinstance(function, Dispatcher):
         if (code := code_of(function)) is not None:
@@ -264,7 +264,7 @@ def portable(system_name: str, kind: str, function: Any) -> Any:
 
 
 def pickled(system: ConstrainedSystem) -> tuple[Any, ...]:
-    """Return the arguments of `unpickled`, except the class of the system."""
+    """Return the arguments of `unpickled` after `cls` for a system."""
     plain = system._returning or system.python_functions
     options: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c, "n_a": system.n_a}
     options |= {"bandwidth": system.bandwidth, "joints": system.joints, "name": system.name}

@@ -1,4 +1,4 @@
-"""Description of a system for its results, besides the equations: drawing, names, energy, joints, stops."""
+"""Data of a system besides its equations, for results: names of coordinates, energy, drawing, joints, stops."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Description:
-    """Names and pictures of a system for its results; a `Problem` hands them to its system.
+    """Names, energy and drawing of a system, for its results; a `Problem` gives them to its system.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class Description:
     conserved : bool or None
         Whether the energy is an invariant; None: not known.
     drawing : Drawing or None
-        What to draw.
+        Drawing of the mechanism.
     joint_coordinates : tuple of JointCoordinate
         Angles and displacements of the joints of a model.
     """
@@ -146,7 +146,7 @@ def body_names(*bodies: str) -> tuple[str, ...]:
     return tuple(f"{part} of {body}" for body in bodies for part in ("x (m)", "y (m)", "angle (rad)"))
 
 
-# numbers of coordinates of a rotation, by those of the translation
+# for two or three coordinates of a body's translation, the possible numbers of coordinates of its rotation
 ROTATIONS = {2: (0, 1), 3: (0, 4, 9)}
 
 
@@ -233,19 +233,19 @@ class Joint:
 
 
 def unused_name(name: str, names: Container[str]) -> str:
-    """Return `name`, with a number where joints between the same bodies have it already: "pin a-b 2"."""
+    """Return `name`, or if it is in `names`, the first new name with a number, such as "pin a-b 2"."""
     return name if name not in names else next(new for k in count(2) if (new := f"{name} {k}") not in names)
 
 
 def check_joints(joints: object, n_q: int, n_rows: int) -> tuple[Joint, ...]:
-    """Return the joints of a system, or say which does not fit its numbers of coordinates and rows."""
+    """Return the joints of a system as a tuple; raise TypeError or ValueError if one does not fit n_q or n_rows."""
     if not isinstance(joints, (tuple, list)) or not all(isinstance(joint, Joint) for joint in joints):
         raise TypeError(f"joints must be a list of twoloop.Joint; given {joints!r}")
     names = [joint.name for joint in joints]
     if len(set(names)) < len(names):
         duplicate = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"joints must have names of their own; given {duplicate!r} twice")
-    previous: Array | None = None  # equations of the joint before, which most joints share
+    previous: Array | None = None  # equations that were checked last: most joints have the same ones
     for joint in joints:
         if max(joint.rows) >= n_rows:
             raise ValueError(
@@ -270,7 +270,7 @@ def check_joints(joints: object, n_q: int, n_rows: int) -> tuple[Joint, ...]:
 
 @dataclass(frozen=True)
 class Stop:
-    """Define a one-sided constraint: its gap stays at zero or above, by impacts or by a force, and it may rub.
+    """One-sided constraint: its gap stays at zero or above, by impacts or by a contact force, maybe with friction.
 
     Attributes
     ----------
@@ -278,12 +278,12 @@ class Stop:
         gap(t, q), m or rad: positive where the stop is not touched. It is run once on symbols, so that its derivatives
         are exact: numpy's functions, without branches.
     restitution : float
-        From 0 to 1: the speed at which the gap opens after an impact over that at which it closed before.
+        Speed at which the gap opens after an impact, over the speed at which it closed before; from 0 to 1.
     name : str
     friction : float
         Coefficient of Coulomb friction, zero or more.
     slide : callable, optional
-        slide(t, q), m: how far the point in contact is along the surface, for friction in a plane.
+        slide(t, q), m: position of the contact point along the surface, for friction in a plane.
 
     Raises
     ------

@@ -11,7 +11,7 @@ import numpy as np
 
 from twoloop.checks.arguments import Array, check_call, shown
 
-SAMPLES = 4  # least number of parts of a step, at whose ends the sign is checked
+SAMPLES = 4  # smallest number of equal parts of a step at whose ends the signs of event functions are checked
 WHOLE = 1.0 - 1e-9  # factor on the number of parts before rounding up, so that rounding errors do not add a part
 PRECISION = 4.0 * float(np.finfo(float).eps)  # relative precision of the time of an event, as in SciPy
 # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
@@ -38,8 +38,8 @@ class Event:
 
     number: int
     function: Callable[..., Any]
-    terminal: float  # occurrences after which the run ends; infinite: never
-    direction: float
+    terminal: float  # number of occurrences after which the run ends; infinite: never
+    direction: float  # sign of the slope at zeros that count; 0: both
 
     @property
     def name(self) -> str:
@@ -110,16 +110,16 @@ class EventSearch:
     t0, row : float, ndarray
         The start, and [q, v] there.
     every : float
-        The longest time between two samples, s; an event function may have an attribute `every` of its own.
+        Longest time between two samples, s, unless an event function has an attribute `every` of its own.
 
     Attributes
     ----------
     found : list of list of (float, ndarray)
         For each event its times and rows [q, v].
     ended : (Event, float) or None
-        The terminal event that ends the run, and when.
+        The terminal event that ends the run, and its time, s.
     reached : float
-        The end of the last step that was searched.
+        End of the last step that was searched, s.
     """
 
     def __init__(self, events: list[Event], t0: float, row: Array, every: float):
@@ -150,8 +150,8 @@ class EventSearch:
             self._in_steps(states, times, rows, ends[1:].tolist())
             return
         for k, end in enumerate(ends[1:].tolist()):
-            within = slice(first[k], first[k + 1] + 1)
-            self._in_steps(states, *self._with_turns(states, times[within], rows[within]), [end])
+            samples = slice(first[k], first[k + 1] + 1)
+            self._in_steps(states, *self._with_turns(states, times[samples], rows[samples]), [end])
             if self.ended is not None:
                 return
 
@@ -161,7 +161,7 @@ class EventSearch:
             self.found = [[(t, row) for t, row in events if t <= self.reached] for events in self.found]
 
     def _with_turns(self, states: States, times: Array, rows: Array) -> tuple[Array, Array]:
-        """Insert times at which a gap's rate changes its sign: a gap may be open at both samples, closed between."""
+        """Return times and rows with samples added where a gap is smallest: it may be closed only between samples."""
         if not self._rates:
             return times, rows
         states_at = zip(times.tolist(), *np.split(rows, 2, axis=1), strict=True)
@@ -181,7 +181,7 @@ class EventSearch:
         return [(list(rows[:, : self._n_q].copy()), list(rows[:, self._n_q :].copy())) for _ in self.events]
 
     def _in_steps(self, states: States, times: Array, rows: Array, ends: list[float]) -> None:
-        """Search between the samples of the steps that end at `ends`."""
+        """Search for events between samples (times and rows) of the steps that end at `ends`; record them."""
         t, copies, steps = times.tolist(), self._copies(rows), iter(ends)
         end = next(steps)
         for k in range(1, len(t)):
@@ -213,7 +213,7 @@ class EventSearch:
 def _root(
     event: Callable[..., float], states: States, ends: tuple[float, float], values: tuple[float, float]
 ) -> tuple[float, Array]:
-    """Return the time, to rounding, at which an event is zero between two times of known values, and the row there."""
+    """Return the time between `ends` at which an event is zero, and the row [q, v]; `values`: the event at `ends`."""
     from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
 
     values_at_ends = dict(zip(ends, values, strict=True))

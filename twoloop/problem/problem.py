@@ -19,7 +19,7 @@ TAGS = (
 
 @dataclass(frozen=True)
 class Reference:
-    """Hold a state that is known from elsewhere.
+    """Reference state of a mechanism at one time, with its source and accuracy.
 
     Attributes
     ----------
@@ -28,15 +28,15 @@ class Reference:
     q, v : ndarray (n_q,)
         Coordinates and velocities; NaN where none is known.
     source : str
-        Where the numbers come from, and how far they were checked.
+        Where the values come from, and how they were checked.
     period : float or None
         Period of the motion, s, where it is periodic.
     lam : ndarray (n_c + n_a,) or None
         Multipliers, where known.
     digits : mapping
-        "q", "v", "lam": how many decimals of the values over max(1, largest of them) hold.
+        Number of correct decimals of "q", "v" and "lam" after division by max(1, largest value).
     verified : str
-        The second route by which they were checked, and how far it agrees.
+        Second method by which the values were checked, and how closely it agrees.
 
     Examples
     --------
@@ -67,11 +67,11 @@ class Condition:
     t_end : float
         Length of the run, s.
     n_outputs : int
-        Outputs, evenly spaced.
+        Number of evenly spaced output times.
     coordinates, velocities : tuple of int
-        Which quantities count.
+        Indices of the coordinates and velocities that count.
     threshold : float
-        Least magnitude by which a difference is divided.
+        Smallest magnitude by which a difference is divided.
     low, high : float
         Largest error allowed at low and at high precision.
     source : str
@@ -93,7 +93,7 @@ class Condition:
     source: str
 
     def error(self, q: Array, v: Array, q_known: Array, v_known: Array) -> float:
-        """Return the error of the states q, v (n_q, n_outputs) against the known states."""
+        """Return the error of the states q, v (n_q, n_outputs) relative to reference states of the same shape."""
         positions, speeds = list(self.coordinates), list(self.velocities)
         states, expected = np.vstack([q[positions], v[speeds]]), np.vstack([q_known[positions], v_known[speeds]])
         relative = np.abs(states - expected) / np.maximum(np.abs(expected), self.threshold)
@@ -102,13 +102,13 @@ class Condition:
 
 @dataclass(frozen=True)
 class Problem:
-    """Hold a mechanism ready to run.
+    """Mechanism with a consistent start, ready to run, and data to judge and draw its motion.
 
     Attributes
     ----------
     name : str
     system : ConstrainedSystem
-        A copy of the one given, which knows the names, the energy and the drawing: results take them from it.
+        Copy of the argument, with names, energy and drawing in its description, from which results take them.
     q0, v0 : ndarray (n_q,)
         Consistent start.
     t_span : (float, float)
@@ -116,9 +116,9 @@ class Problem:
     energy : callable
         energy(t, q, v) in J, for one state or, with q and v (n_q, n_t), for many.
     parameters : dict
-        Geometry, masses and what else defines the case, with names.
+        Geometry, masses and other numbers that define the case, by name.
     note : str
-        What is assumed; shown wherever the problem is.
+        Assumptions, shown with the problem.
     reference : Reference or None
         The most accurate state known.
     published : Reference or None
@@ -128,9 +128,9 @@ class Problem:
     source : str
         Who posed the problem, and where.
     tags : tuple of str
-        Its kinds, of `TAGS`.
+        Kinds of the mechanism, from `TAGS`.
     purpose : str
-        What it tests, in plain words.
+        What the problem tests, in plain words.
     conserved : bool or None
         Whether the energy is an invariant. None: unknown, and nothing is judged by it; `studies.compare` then checks
         the energy of its reference.

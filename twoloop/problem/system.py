@@ -37,12 +37,12 @@ from twoloop.problem.callbacks import (
 from twoloop.problem.compiled_functions import FrozenValues, pickled, unpickled
 from twoloop.problem.description import Description, Joint, check_joints
 
-# placeholder in a docstring; Python before 3.13 keeps the indentation of the source, which the expression allows for
+# pattern of the docstring line that is replaced by the callbacks; group 1: indentation, which Python before 3.13 keeps
 PLACEHOLDER = re.compile(r"^( *)\{callbacks\}\n", re.MULTILINE)
 
 
 def add_callbacks(cls: Any) -> Any:
-    """Add a method for each kind of callback to a class, and list all kinds in its signature and docstring."""
+    """Add a method for each kind of callback to a class, list the kinds in its signature and docstring; return it."""
     for kind in KINDS:
         setattr(cls, kind, _method(kind))
     plain = cls.from_python.__func__
@@ -73,12 +73,12 @@ def _method(kind: str) -> Callable[..., Any]:
 
 
 def _with_entries(text: str | None, plain: bool) -> str | None:
-    """Return a docstring with the callbacks in place of PLACEHOLDER; None without docstrings (python -OO)."""
+    """Return a docstring with the callbacks in place of PLACEHOLDER; None if `text` is None (python -OO)."""
     return text and PLACEHOLDER.sub(lambda place: "".join(_entry(kind, plain, place[1]) for kind in KINDS), text)
 
 
 def _entry(kind: str, plain: bool, indent: str) -> str:
-    """Return the entry of a kind of callback in the section Parameters of a docstring."""
+    """Return the lines about a kind of callback for the section Parameters of a docstring."""
     entry = KINDS[kind]
     called = f"{kind}({', '.join(('t', *entry.state))}) -> {entry.size}: " if plain else ""
     text = f"{called}{entry.meaning}{'' if plain else ', ' + entry.size}. {entry.note}"
@@ -90,7 +90,7 @@ def _entry(kind: str, plain: bool, indent: str) -> str:
 
 
 def _full_signature(function: Any) -> inspect.Signature:
-    """Return the signature of a constructor, with each callback as a named argument."""
+    """Return the signature of a constructor, with a keyword argument for each kind of callback instead of `**`."""
     parameters = inspect.signature(function).parameters.values()
     keyword = inspect.Parameter.KEYWORD_ONLY
     defaults = {kind: None if entry.optional else inspect.Parameter.empty for kind, entry in KINDS.items()}
@@ -118,18 +118,18 @@ class ConstrainedSystem:
     n_a : int
         Number of non-holonomic constraints.
     parameters : array_like, optional
-        The vector `p` that every callback gets. It stays as it is: `with_parameters` makes a system of others.
+        The vector `p` that every callback gets. It cannot be changed: `with_parameters` makes a system with another.
     constant_mass : bool
         True: M depends neither on t nor on q, and is factored once.
     mass_entries, jacobian_entries : (rows, columns), optional
-        Where the entries are that `mass_values` and `jacobian_values` give: two vectors of int each, of M for both
-        triangles. All others are zero at every state. Values of an entry that is named twice are added.
+        Indices of the entries whose values `mass_values` and `jacobian_values` return: two vectors of int each, for
+        both triangles of M. Other entries are always zero. Values of an entry that is named twice are added.
     bandwidth : int, optional
         No entry (i, j) with |i - j| > bandwidth is other than zero in M, in the derivatives of the force by q and v,
         and in the second derivatives of each constraint by q; C_q itself may be full. With it the cost of a step of a
         large system grows in proportion to n_q. Needs a constant M. None: nothing is known.
     joints : sequence of Joint
-        Named rows, whose forces and torques `Result.reactions` gives.
+        Named rows, whose forces and torques `Result.reactions` returns.
     name : str
         Shown in messages.
 
@@ -222,10 +222,10 @@ class ConstrainedSystem:
             kind: [tuple(getattr(self, size) for size in shape) for _, shape in entry.outputs]
             for kind, entry in KINDS.items()
         }
-        self.within_bounds: set[str] = set()  # kinds that check_callback has checked
+        self.within_bounds: set[str] = set()  # kinds of callbacks that check_callback has checked
         self.checked = False  # whether check_derivatives has passed
         self.derived: dict[Any, Any] = {}  # cache of quantities that follow from the equations, see `remembered`
-        self.shared: dict[Any, Any] = {}  # cache shared with systems of other parameters: checked options, and runs
+        self.shared: dict[Any, Any] = {}  # cache shared with systems with other parameters: checked options, and runs
 
     @property
     def n_mass_values(self) -> int:
@@ -250,7 +250,7 @@ class ConstrainedSystem:
 
     @property
     def parameters(self) -> Array:
-        """Return the vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
+        """Return the vector `p` that every callback gets, read-only: `with_parameters` makes a system with another."""
         # the first number is the handle of Python functions, not a parameter of the user
         p = self.functions.p[self.called_in_python :].copy()  # kernels require writable arrays
         p.setflags(write=False)
@@ -264,7 +264,7 @@ class ConstrainedSystem:
         )
 
     def with_parameters(self, parameters: ArrayLike) -> ConstrainedSystem:
-        """Make a system of the same callbacks, without compilation, and other parameters.
+        """Return a system with the same compiled callbacks and other parameters.
 
         The new system keeps the names of the coordinates, joints without `point` and `equations`, and an energy that
         was generated with the equations. It drops another energy, a drawing and other joints, as these may enclose the
@@ -329,7 +329,7 @@ class ConstrainedSystem:
             Number of non-holonomic constraints.
         parameters : array_like, optional
             A vector `p` that the functions take as their last argument; those that do without may leave it out.
-            `with_parameters` makes a system of others, of which nothing is compiled again.
+            `with_parameters` makes a system with another vector, without compiling anything again.
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now: once these change, calls are refused. The functions
@@ -394,7 +394,7 @@ class ConstrainedSystem:
         return {} if self._python is None else self._python.functions
 
     def parameters_for(self, kind: str) -> tuple[Array, ...]:
-        """Return the additional arguments of a plain function of a kind: the parameters, or nothing."""
+        """Return the arguments of a plain function of a kind after its state: a copy of the parameters, or none."""
         return (self.parameters.copy(),) if self.takes_parameters(kind) else ()
 
     def takes_parameters(self, kind: str) -> bool:
@@ -420,7 +420,7 @@ class ConstrainedSystem:
         return self.derived[key]
 
     def remembered_at(self, key: Any, state: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()`, cached for this state."""
+        """Return `make()`, cached for the last `state` of each key; not cached for Python functions."""
         if self._python is not None:
             return make()
         cached = self.derived.get(key)
@@ -429,12 +429,12 @@ class ConstrainedSystem:
         return cached[1]
 
     def remember_at(self, key: Any, state: Any, value: Any) -> None:
-        """Put a value into the cache of `remembered_at`."""
+        """Store `value` for a key and state in the cache of `remembered_at`."""
         if self._python is None:
             self.derived[key] = state, value
 
     def arrays_of(self, kind: str) -> list[Array]:
-        """Return arrays of zeros for a callback of a kind to fill."""
+        """Return arrays of zeros with the shapes of the outputs of a kind of callback."""
         return [np.zeros(shape) for shape in self._shapes[kind]]
 
     def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Any:
@@ -443,8 +443,8 @@ class ConstrainedSystem:
         Raises
         ------
         TypeError, ValueError
-            If an argument is wrong, if the callback goes out of the bounds of its arrays, or if there is none and
-            nothing can stand for it, as for gamma: the integrator then finds it by differences.
+            If an argument is wrong, if the callback goes out of the bounds of its arrays, or if it is not given and
+            has no replacement, as gamma, which the integrator computes by differences.
         """
         if kind not in KINDS:
             raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {shown(kind)}")
@@ -489,7 +489,7 @@ class ConstrainedSystem:
         return self.jacobian(t, q) if self.n_a == 0 else np.vstack([self.jacobian(t, q), self.nonholonomic(t, q)])
 
     def sparse_rows(self, t: float, q: ArrayLike) -> Rows:
-        """Evaluate the rows by their entries, where `jacobian_values` returns these."""
+        """Evaluate C_q as SparseRows if `jacobian_values` is given and n_a = 0, else C_q, then A, as an array."""
         if self.n_a > 0 or "jacobian" not in self.entries:
             return self.rows(t, q)
         values, shape = self.jacobian_values(t, q), (self.n_c, self.n_q)
@@ -521,7 +521,7 @@ class ConstrainedSystem:
 
 
 def check_system(system: object) -> None:
-    """Raise unless this is a ConstrainedSystem whose compiled functions still enclose the values as compiled."""
+    """Raise unless `system` is a ConstrainedSystem, and the values that its compiled functions froze are unchanged."""
     if isinstance(system, ConstrainedSystem):
         change = None if system.enclosed is None else system.enclosed.change()
         if change is None:

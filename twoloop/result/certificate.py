@@ -17,19 +17,19 @@ from twoloop.run.record import Record
 from twoloop.run.rerun import FINEST, IndependentRerun, RerunPiece, nonstiff_method, stiff_method, tighter_tolerances
 from twoloop.run.signals import SignalHandlers
 
-PIECES = 200  # smallest number of intervals into which the run is divided; steps of reruns are no longer than one
-LIMIT = 100.0  # largest defect of a step, and largest error of a state, of a run that passes, over the tolerance
-FASTEST = 10.0  # largest rate of the motion by which errors of velocities are divided, 1/s; untested ones always
+PIECES = 200  # smallest number of intervals into which the run is divided; also limits the step size of reruns
+LIMIT = 100.0  # largest defect of a step, and largest error of a state, in tolerances, of a run that passes
+FASTEST = 10.0  # largest rate of the motion, 1/s, by which errors of velocities are divided; untested ones always
 SECOND_RUN_FACTOR = 0.1  # factor on the tolerances of the second run, because its errors grow over the whole run
-STIFF = 4  # explicit steps per step of the run, above which untested velocities have vibrations that are not resolved
-CHAOTIC = 10.0  # errors up to this many times the growth of a tolerance at the start are explained by that growth
+STIFF = 4  # number of explicit steps per step of the run above which the run did not resolve untested velocities
+CHAOTIC = 10.0  # largest ratio of an error to the growth of an initial error of one tolerance that explains this error
 ROUNDING = 1e-14  # deviation attributed to rounding, relative to the largest coordinate or velocity
-SPLIT = 100.0  # defect of an interval above which its steps are checked one by one
+SPLIT = 100.0  # defect of an interval, in tolerances, above which its steps are checked one by one
 MAX_WRONG = 3  # number of wrong steps after which the rest of an interval is skipped
-NEGLIGIBLE = 1e-10  # singular values of the rows below this share of the largest count as zero
-USUAL_GROWTH = 10.0  # error growth over an interval up to which the defect is not corrected for it
-MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # attempted steps per interval, plus those per step of the run in it
-LOOSER = (10.0, 100.0)  # factors of the tolerances with which a failed reintegration is repeated
+NEGLIGIBLE = 1e-10  # singular value of the constraint rows, relative to the largest, below which it counts as zero
+USUAL_GROWTH = 10.0  # factor of error growth over an interval up to which the defect is not divided by this factor
+MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # attempted steps in an interval: constant, and per step of the run in it
+LOOSER = (10.0, 100.0)  # factors on the tolerances with which a failed reintegration is repeated
 
 
 class CertificateWarning(UserWarning):
@@ -155,7 +155,7 @@ def _local_errors(checker: _Checker) -> tuple[float, float, list[tuple[float, fl
 
 
 def _tolerances(result: Record, n_q: int, rtol: float | None, atol: ArrayLike | None) -> tuple[float, Array]:
-    """Return the tolerances given, or those of the run; raise ValueError if none are known."""
+    """Return rtol and atol (n_q,), by default those of the run; raise ValueError if the run has no tolerances."""
     if result.t.size < 2:
         raise ValueError(f"certify needs a result with two times or more; this one has {result.t.size}")
     rtol, atol = result.rtol if rtol is None else rtol, result.atol if atol is None else atol
@@ -169,7 +169,7 @@ def _tolerances(result: Record, n_q: int, rtol: float | None, atol: ArrayLike | 
 
 
 class _Checker:
-    """Verify the intervals between the states of a result by reintegration.
+    """Checker of the intervals between the states of a result, by reintegration.
 
     Attributes
     ----------
@@ -200,16 +200,16 @@ class _Checker:
         untested = np.zeros(m, dtype=bool) if result.untested is None else result.untested
         start = self.t[0] if result.sol is None else result.sol.t_min
         ends = start + np.cumsum(result.h)
-        near = 1e-9 * (self.t[-1] - self.t[0])
-        if m == 0 or (result.success and abs(ends[-1] - self.t[-1]) > near):  # it is unknown where the steps end
+        tolerance = 1e-9 * (self.t[-1] - self.t[0])
+        if m == 0 or (result.success and abs(ends[-1] - self.t[-1]) > tolerance):  # it is unknown where the steps end
             return np.full(n, -(-m // n) + 1), np.full(n, untested.any())
-        first = np.minimum(np.searchsorted(ends, self.t[:-1] + near), m - 1)
-        last = np.minimum(np.searchsorted(ends, self.t[1:] - near), m - 1)
-        before = np.append(0, np.cumsum(untested))
-        return last - first + 1, before[last + 1] > before[first]
+        first = np.minimum(np.searchsorted(ends, self.t[:-1] + tolerance), m - 1)
+        last = np.minimum(np.searchsorted(ends, self.t[1:] - tolerance), m - 1)
+        n_untested = np.append(0, np.cumsum(untested))
+        return last - first + 1, n_untested[last + 1] > n_untested[first]
 
     def pieces(self) -> Iterator[tuple[int, int, float]]:
-        """Yield first and last state of each interval and its defect; infinite if reintegration fails."""
+        """Yield indices of first and last state, and defect, of each interval; inf if reintegration fails."""
         for i, j in self._intervals():
             defect = self._defect(i, j)
             if SPLIT < defect < np.inf and j > i + 1:
@@ -220,7 +220,7 @@ class _Checker:
                 yield i, j, defect
 
     def _intervals(self) -> Iterator[tuple[int, int]]:
-        """Yield first and last state of intervals that are as long as possible up to `longest`."""
+        """Yield the indices of first and last state of intervals of at most `self.longest` s, or of one step."""
         i, last = 0, len(self.t) - 1
         while i < last:
             j = i + 1
@@ -254,24 +254,24 @@ class _Checker:
         return float(largest.max()), float(t[worst]), np.inf
 
     def _second_run(self, start: Array) -> tuple[Array, Array]:
-        """Return the states of a run from `start` at all times, and the weights of errors of velocities there.
+        """Return the states (n, 2 n_q) of a second run from `start`, and the weights (n,) of its errors of velocities.
 
-        After a failure, e.g. near a singular position, it continues from the stored state; `pieces` reports failures.
+        After a failure, e.g. near a singular position, this run continues from the stored state (see `pieces`).
         """
         states, weights = np.empty_like(self.states), np.full(len(self.t), 1.0 / self._rate())
         states[0] = start
         newton = bool(self.result.stats.n_jacobians)
         for i, j in self._intervals():
             stiff = "positions" if self.untested[i] else "all"
-            tries = [(method, looser) for looser in (SECOND_RUN_FACTOR, 1.0, *LOOSER) for method in ("explicit", stiff)]
-            for method, looser in tries:
-                rerun = self._rerun(method, looser, states[i], i, j, self.t[i + 1 : j + 1])
+            pairs = [(method, factor) for factor in (SECOND_RUN_FACTOR, 1.0, *LOOSER) for method in ("explicit", stiff)]
+            for method, factor in pairs:
+                rerun = self._rerun(method, factor, states[i], i, j, self.t[i + 1 : j + 1])
                 if rerun is not None:
                     break
             states[i + 1 : j + 1] = self.states[i + 1 : j + 1] if rerun is None else rerun.states
             if self.untested[i] and newton:
-                most = STIFF * max(j - i, int(self.n_steps[i:j].sum()))
-                resolved = rerun is not None and method == "explicit" and rerun.n_steps <= most
+                max_steps = STIFF * max(j - i, int(self.n_steps[i:j].sum()))
+                resolved = rerun is not None and method == "explicit" and rerun.n_steps <= max_steps
                 weights[i + 1 : j + 1] = 1.0 / FASTEST if resolved else 0.0
         return states, weights
 
@@ -281,7 +281,7 @@ class _Checker:
         return float(np.clip(largest[0] / max(largest[1], np.finfo(float).tiny), 1.0, FASTEST))
 
     def _single_steps(self, i: int, j: int) -> Iterator[tuple[int, int, float]]:
-        """Yield first and last state and the defect of each step, in an interval with a large defect."""
+        """Yield the indices of first and last state, and the defect, of each step in a wrong interval i to j."""
         n_wrong = 0
         for k in range(i, j):
             defect = self._defect(k, k + 1)
@@ -294,7 +294,7 @@ class _Checker:
                 return
 
     def _defect(self, i: int, j: int) -> float:
-        """Return the defect from state i to state j by one method; if it is too large, the smaller one of two."""
+        """Return the defect from state i to j by one method; if it is too large, the smaller defect by two methods."""
         newton = bool(self.result.stats.n_jacobians) and (self.result.untested is None or self.untested[i])
         stiff = "positions" if self.untested[i] else "all"
         order = (stiff, "explicit") if newton else ("explicit", stiff)
@@ -307,18 +307,18 @@ class _Checker:
         if smallest < np.inf:  # a large defect may be the growth of small errors
             growth = self._growth(best, i, j)
             return smallest / (growth if growth > USUAL_GROWTH else 1.0) if growth <= LIMIT else np.inf
-        for looser in LOOSER:  # near a singular position rounding may prevent the full accuracy
+        for factor in LOOSER:  # near a singular position rounding may prevent the full accuracy
             for method in order:
-                smallest = self._defect_by(method, looser, i, j)
+                smallest = self._defect_by(method, factor, i, j)
                 if smallest < np.inf:
                     return smallest
         return np.inf
 
-    def _defect_by(self, method: str, looser: float, i: int, j: int) -> float:
-        """Return the defect from state i to state j by one method, with tolerances relaxed by a factor."""
+    def _defect_by(self, method: str, factor: float, i: int, j: int) -> float:
+        """Return the defect from state i to state j by one method, with tolerances times `factor`."""
         between, end = self._check_time(i, j), float(self.t[j])
         times = np.array([between, end] if self.t[i] < between < end else [end])
-        rerun = self._rerun(method, looser, self.states[i], i, j, times)
+        rerun = self._rerun(method, factor, self.states[i], i, j, times)
         if rerun is None:
             return np.inf
         end_defect = self._distance(rerun.states[-1], self.states[j], i, j)
@@ -359,23 +359,23 @@ class _Checker:
         return np.tile(self.atol, 2) + self.rtol * np.abs(state) + self.rounding
 
     def _distance(self, state: Array, reference: Array, i: int, j: int) -> float:
-        """Return the largest difference of two states over the tolerance; without velocities if untested."""
+        """Return the largest difference of two states in tolerances, without velocities if a step did not test them."""
         with np.errstate(invalid="ignore"):  # states that are not finite give NaN
             error = np.abs(state - reference) / self._allowed(reference)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
 
-    def _rerun(self, method: str, looser: float, start: Array, i: int, j: int, times: Array) -> RerunPiece | None:
-        """Integrate from `start` at the time of state i to state j, landing on `times`; None if that fails."""
-        key = (method, looser)
+    def _rerun(self, method: str, factor: float, start: Array, i: int, j: int, times: Array) -> RerunPiece | None:
+        """Integrate from `start`, at the time of state i, to the time of state j; land on `times`; None on failure."""
+        key = (method, factor)
         if key not in self.reruns:
             chosen = nonstiff_method() if method == "explicit" else stiff_method(method == "all")
             q, v = self.states[0].reshape(2, -1).copy()
-            rtol, atol = (np.maximum(looser * tighter_tolerances(each), FINEST) for each in (self.rtol, self.atol))
+            rtol, atol = (np.maximum(factor * tighter_tolerances(each), FINEST) for each in (self.rtol, self.atol))
             run = self.system, float(self.t[0]), q, v, chosen, float(rtol), atol, self.longest
             self.reruns[key] = IndependentRerun(*run)
         rerun, t0, t1 = self.reruns[key], float(self.t[i]), float(self.t[j])
         n_steps = int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)
-        max_attempts = MAX_ATTEMPTS + (MAX_ATTEMPTS_PER_STEP * n_steps if looser == 1.0 else 0)
+        max_attempts = MAX_ATTEMPTS + (MAX_ATTEMPTS_PER_STEP * n_steps if factor == 1.0 else 0)
         piece = rerun.integrate(t0, start, times, max_attempts)
         self.handlers.check()
         if piece is not None:

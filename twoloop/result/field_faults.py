@@ -13,7 +13,7 @@ from twoloop.run.record import Record, Status
 
 Array = NDArray[np.float64]
 
-NEAR = 1e-9  # distance of times that count as equal, relative to the length of the run
+NEAR = 1e-9  # difference of times, relative to the duration of the run, up to which they count as equal
 ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
 PATTERNS = 3  # number of sign patterns of the perturbations by which the effect of a tolerance is measured
 
@@ -34,14 +34,14 @@ def all_states(result: Record) -> tuple[Array, Array]:
 
 
 def end_of_run(result: Record) -> float:
-    """Return the time that the run claims to have reached; -inf if it is not known."""
+    """Return the time, s, that the run claims to have reached; -inf if unknown."""
     if result.status == Status.EVENT:
         return max((float(t[-1]) for t in result.t_events or () if len(t)), default=-np.inf)
     return -np.inf if result.t_end is None else result.t_end
 
 
 def field_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
-    """Yield the contradictions in a result, as clauses of a message; errors up to `limit` tolerances are allowed."""
+    """Yield contradictions in a result as clauses of a message; errors of up to `limit` tolerances are allowed."""
     shapes = list(_wrong_shapes(result, system))
     yield from shapes
     if shapes:
@@ -52,7 +52,7 @@ def field_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: A
 
 
 def _wrong_shapes(result: Record, system: ConstrainedSystem) -> Iterator[str]:
-    """Yield the fields whose shapes do not fit the system and the times."""
+    """Yield clauses about fields whose shapes do not fit the system and the number of times."""
     n_t, n_rows = len(result.t), system.n_c + system.n_a
     for name, n in (("q", system.n_q), ("v", system.n_q), ("a", system.n_q), ("lam", n_rows)):
         shape = np.shape(getattr(result, name))
@@ -61,15 +61,15 @@ def _wrong_shapes(result: Record, system: ConstrainedSystem) -> Iterator[str]:
 
 
 def _times_and_steps(result: Record) -> Iterator[str]:
-    """Yield the contradictions between times, steps, counts and status."""
+    """Yield clauses about contradictions between times, steps, counts and status."""
     t, h = result.t, result.h
-    length = abs(float(t[-1] - t[0]))
+    duration = abs(float(t[-1] - t[0]))
     if not (np.diff(t) >= 0.0).all():
         yield "the times of the result do not increase"
     if len(h) and not (np.isfinite(h).all() and (h >= 0.0).all()):
         yield "the sizes of the steps, h, are not all positive numbers"
-    elif len(h) and h.sum() < length * (1.0 - NEAR):
-        yield f"the steps, h, add up to {h.sum():.6g} s, and the result covers {length:.6g} s"
+    elif len(h) and h.sum() < duration * (1.0 - NEAR):
+        yield f"the steps, h, add up to {h.sum():.6g} s, and the result covers {duration:.6g} s"
     n_accepted = result.stats.n_accepted
     if len(h) and n_accepted is not None and n_accepted != len(h):
         yield f"stats counts {n_accepted} accepted steps, and h has {len(h)}"
@@ -77,45 +77,45 @@ def _times_and_steps(result: Record) -> Iterator[str]:
         yield "the status says that an event ended the run, and the result has no events"
     if result.t_end is None:
         return
-    near = NEAR * max(abs(result.t_end - float(t[0])), abs(result.t_end))
-    if t[-1] > result.t_end + near:
+    tolerance = NEAR * max(abs(result.t_end - float(t[0])), abs(result.t_end))
+    if t[-1] > result.t_end + tolerance:
         yield f"the result goes on to t = {t[-1]:.6g}, beyond the end of the run at t = {result.t_end:.6g}"
     start = float(t[0]) if result.sol is None else result.sol.t_min
-    if result.status == Status.REACHED_END and len(h) and start + h.sum() < result.t_end - near:
+    if result.status == Status.REACHED_END and len(h) and start + h.sum() < result.t_end - tolerance:
         yield f"the status says that the end was reached, and the steps, h, end at t = {start + h.sum():.6g}"
 
 
 def _start_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
-    """Yield how the first state violates the constraints; `certify` compares later states with integrated states."""
+    """Yield clauses about constraints that the first state violates; `certify` reintegrates the later states."""
     t, q, v = float(result.t[0]), result.q[:, 0], result.v[:, 0]
     if system.n_c + system.n_a == 0 or not np.isfinite([q, v]).all():
         return
     rows = np.abs(system.rows(t, q))
     allowed_q, allowed_v = (limit * (atol + rtol * np.abs(x)) for x in (q, v))
-    off = np.abs(system.constraint(t, q))
-    if (off > rows[: system.n_c] @ allowed_q + ROUNDING).any():
-        yield f"the first state violates the constraints by {off.max():.2g}"
-    off = np.abs(system.velocity_constraint(t, q, v))
-    if (off > rows @ allowed_v + np.abs(rows).sum(axis=1) * allowed_q.max() * np.abs(v).max() + ROUNDING).any():
-        yield f"the first velocities violate the constraints by {off.max():.2g}"
+    violation = np.abs(system.constraint(t, q))
+    if (violation > rows[: system.n_c] @ allowed_q + ROUNDING).any():
+        yield f"the first state violates the constraints by {violation.max():.2g}"
+    violation = np.abs(system.velocity_constraint(t, q, v))
+    if (violation > rows @ allowed_v + np.abs(rows).sum(axis=1) * allowed_q.max() * np.abs(v).max() + ROUNDING).any():
+        yield f"the first velocities violate the constraints by {violation.max():.2g}"
 
 
 def _acceleration_faults(
     result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float
 ) -> Iterator[str]:
-    """Yield how stored a and lam deviate from the solution of the equations at the stored states.
+    """Yield clauses about stored a and lam that deviate from the solution of the equations at the stored states.
 
     A deviation is allowed if errors of `limit` tolerances in the state can cause it; perturbed states measure this.
     """
     n, t = system.n_q, np.ascontiguousarray(result.t)
     states, stored = np.vstack([result.q, result.v]).T.copy(), np.vstack([result.a, result.lam]).T
-    known = ~np.isnan(stored).all(axis=1) & np.isfinite(states).all(axis=1)
-    if not known.any():
+    is_stored = ~np.isnan(stored).all(axis=1) & np.isfinite(states).all(axis=1)
+    if not is_stored.any():
         return
-    t, states, stored = t[known], states[known], stored[known]
-    first = np.concatenate([states[0], np.zeros(n)])
+    t, states, stored = t[is_stored], states[is_stored], stored[is_stored]
+    row = np.concatenate([states[0], np.zeros(n)])
     ranks = ranks_at(system, float(t[0]), states[0, :n], states[0, n:], rtol)
-    interpolator = Interpolator(system, float(t[0]), first, rtol, atol, ranks)
+    interpolator = Interpolator(system, float(t[0]), row, rtol, atol, ranks)
     interpolator.warns = False
 
     def evaluated(times: Array, rows: Array) -> Array:
@@ -133,13 +133,13 @@ def _acceleration_faults(
             with np.errstate(invalid="ignore"):
                 effect = np.fmax(effect, np.abs(evaluated(t + sign * span, states + sign * signs * change) - exact))
     largest = np.nanmax(np.abs(exact), axis=0, initial=0.0)
-    blocks = np.concatenate(
+    sizes = np.concatenate(
         [np.full(n, largest[:n].max(initial=0.0)), np.full(len(largest) - n, largest[n:].max(initial=0.0))]
     )
-    allowed = limit * effect + ROUNDING * blocks
+    allowed = limit * effect + ROUNDING * sizes
     with np.errstate(invalid="ignore"):
-        off = np.abs(stored - exact)
-        wrong = np.isfinite(exact) & ~(off <= allowed)
+        deviation = np.abs(stored - exact)
+        wrong = np.isfinite(exact) & ~(deviation <= allowed)
     for name, part in (("a", slice(0, n)), ("lam", slice(n, None))):
         if wrong[:, part].any():
             i, k = np.argwhere(wrong[:, part])[0]

@@ -10,7 +10,7 @@ from twoloop.problem.description import Joint
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
 
-NEGLIGIBLE = 1e-6  # a reaction counts as unique if the null space of C_q^T changes it by less than this share
+NEGLIGIBLE = 1e-6  # largest change of a unique reaction by unit multipliers with C_q^T lam = 0, relative to the rows
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ def reaction(result: Record, name: str) -> Reaction:
         generalized[:, k] = -_rows(system, joint, t, result.q[:, k]).T @ multipliers[list(joint.rows), k]
     point = _point(joint, result.q)
     force, torque = _force_and_torque(joint, result.q, point, generalized)
-    return Reaction(force, torque, point, _unique(result, system, joint))
+    return Reaction(force, torque, point, _is_unique(result, system, joint))
 
 
 def _rows(system: ConstrainedSystem, joint: Joint, t: float, q: Array) -> Array:
-    """Return the derivatives of the joint's rows with respect to the coordinates of its body."""
+    """Return the entries of the joint's constraint rows in the columns of the coordinates of its body."""
     columns = joint.translation + joint.rotation
     if joint.equations is not None:
         return (joint.equations @ system.rows(t, q))[np.ix_(joint.rows, columns)]
@@ -103,24 +103,24 @@ def _point(joint: Joint, q: Array) -> Array:
 
 
 def _force_and_torque(joint: Joint, q: Array, point: Array, generalized: Array) -> tuple[Array, Array]:
-    """Return force and torque about the point equivalent to a generalised force (n, n_t) on the body."""
+    """Return the force, and the torque about `point`, that a generalised force (n, n_t) exerts on the joint's body."""
     dimension = len(joint.translation)
-    force, turning = generalized[:dimension], generalized[dimension:]
+    force, moments = generalized[:dimension], generalized[dimension:]
     angles, arm = q[list(joint.rotation)], point - q[list(joint.translation)]
-    if len(turning) == 0:
+    if len(moments) == 0:
         return force, np.zeros(force.shape[1:] if dimension == 2 else force.shape)
     if dimension == 2:
-        return force, turning[0] - (arm[0] * force[1] - arm[1] * force[0])
-    if len(turning) == 4:  # e' = G^T spin / 2, so the torque in body axes is G g / 2
+        return force, moments[0] - (arm[0] * force[1] - arm[1] * force[0])
+    if len(moments) == 4:  # e' = G^T spin / 2, so the torque in body axes is G g / 2
         from twoloop.bodies.rotation import half_spin, rotated  # compiled on import
 
-        torque = 0.5 * np.stack(rotated.py_func(*angles, *half_spin.py_func(*angles, *turning)))
+        torque = 0.5 * np.stack(rotated.py_func(*angles, *half_spin.py_func(*angles, *moments)))
     else:  # each column of the matrix rotates like a lever arm
-        torque = np.cross(angles.reshape(3, 3, -1), turning.reshape(3, 3, -1), axis=1).sum(axis=0)
+        torque = np.cross(angles.reshape(3, 3, -1), moments.reshape(3, 3, -1), axis=1).sum(axis=0)
     return force, torque - np.cross(arm, force, axis=0)
 
 
-def _unique(result: Record, system: ConstrainedSystem, joint: Joint) -> bool:
+def _is_unique(result: Record, system: ConstrainedSystem, joint: Joint) -> bool:
     """Return True if no multipliers with C_q^T lam = 0 change the reaction, at the first time of the result."""
     n_rows = len(result.lam)
     if result.t.size == 0 or result.rank == n_rows:
@@ -128,11 +128,11 @@ def _unique(result: Record, system: ConstrainedSystem, joint: Joint) -> bool:
     t, q = result.t[0], result.q[:, 0]
     all_rows = system.rows(t, q)
     rank = np.linalg.matrix_rank(all_rows) if result.rank is None else result.rank
-    idle = np.linalg.svd(all_rows)[0][:, rank:]
+    null_space = np.linalg.svd(all_rows)[0][:, rank:]
     if joint.equations is not None:
-        idle = np.linalg.solve(joint.equations.T, idle)
+        null_space = np.linalg.solve(joint.equations.T, null_space)
     rows = _rows(system, joint, t, q)
-    generalized = rows.T @ idle[list(joint.rows)]
-    q = np.repeat(q[:, None], idle.shape[1], axis=1)
+    generalized = rows.T @ null_space[list(joint.rows)]
+    q = np.repeat(q[:, None], null_space.shape[1], axis=1)
     force, torque = _force_and_torque(joint, q, _point(joint, q), generalized)
     return bool(max(np.abs(force).max(initial=0.0), np.abs(torque).max(initial=0.0)) <= NEGLIGIBLE * np.abs(rows).max())

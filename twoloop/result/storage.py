@@ -20,13 +20,13 @@ from twoloop.run.record import OF_STEPS, FileStore, Record, Statistics, Status, 
 
 FORMAT = "twoloop result 1"
 STATES = ("q", "v", "a", "lam")
-COUNTS = ("rejected_error", "rejected_convergence", "partitioned")
-NUMBERS = ("rtol", "defect", "widest_gap", "t_end")  # each may be None
+COUNTS = ("rejected_error", "rejected_convergence", "partitioned")  # arrays of counts, one per step
+NUMBERS = ("rtol", "defect", "widest_gap", "t_end")  # fields that are a float or None
 EVENT_FIELDS = ("t_events", "q_events", "v_events")
-REQUIRED = ("t", *STATES, "h")
-OPTIONAL = (*COUNTS, "redundant", "atol", "untested")
-METADATA_FILE = "words.json"
-STREAMED = ("t", *OF_STEPS, "sol_t", "sol_states", "sol_kinds")
+REQUIRED = ("t", *STATES, "h")  # arrays of every result
+OPTIONAL = (*COUNTS, "redundant", "atol", "untested")  # arrays that a result may have
+METADATA_FILE = "words.json"  # file of a folder with all fields that are not arrays
+STREAMED = ("t", *OF_STEPS, "sol_t", "sol_states", "sol_kinds")  # arrays that are written to a folder during the run
 INTERRUPTED = (
     "The run was interrupted: its process died, or it raised an exception. The result contains what had been stored; "
     "information written at the end of a run, such as its cost and redundant rows, is missing."
@@ -34,7 +34,7 @@ INTERRUPTED = (
 
 
 def fields_of(result: Record, inside: bool = True) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return the arrays of a result by name, with or without states within steps, and all other fields as metadata."""
+    """Return the arrays of a result, and all other fields, by name; `inside`: with states within steps, if any."""
     arrays: dict[str, Any] = {name: getattr(result, name) for name in REQUIRED}
     arrays |= {name: getattr(result, name) for name in OPTIONAL if getattr(result, name) is not None}
     n_events = None if result.t_events is None else len(result.t_events)
@@ -81,38 +81,38 @@ def check_folder(store: Any) -> Path:
 
 
 def begin_folder(path: Path, n_q: int) -> FileStore:
-    """Create the folder of a run; until `end_folder`, its metadata describe an interrupted run."""
-    buffers = FileStore(path)
+    """Create the folder of a run, and return its store; until `end_folder`, it describes an interrupted run."""
+    store = FileStore(path)
     metadata = {"format": FORMAT, "n_q": n_q, "status": int(Status.INTERRUPTED), "message": INTERRUPTED, "stats": {}}
     (path / METADATA_FILE).write_text(json.dumps(metadata), encoding="utf-8")
-    return buffers
+    return store
 
 
-def end_folder(buffers: FileStore, result: Record) -> None:
-    """Write the arrays and metadata that were not written during the run."""
+def end_folder(store: FileStore, result: Record) -> None:
+    """Write those arrays and fields of a result to its folder that were not written during the run."""
     arrays, metadata = fields_of(result, inside=False)
     for name in arrays.keys() - {*STREAMED, *STATES}:
-        buffers.add(name, arrays[name])
+        store.add(name, arrays[name])
     for t, states in () if result.sol is None else result.sol.interpolator.interiors(result.sol.table):
-        buffers.add("sol_interior_t", t)
-        buffers.add("sol_interior_states", states)
+        store.add("sol_interior_t", t)
+        store.add("sol_interior_states", states)
     metadata |= {"n_q": len(result.q), "untested": None if result.untested is None else bool(result.untested.all())}
-    (buffers.folder / METADATA_FILE).write_text(json.dumps(metadata), encoding="utf-8")
+    (store.folder / METADATA_FILE).write_text(json.dumps(metadata), encoding="utf-8")
 
 
 def checksum(array: NDArray[Any]) -> int:
-    """Return a checksum of the values of an array, which detects interchanged arrays."""
+    """Return a checksum of the values of an array, which detects damaged or interchanged arrays."""
     return zlib.crc32(np.ascontiguousarray(array).tobytes())
 
 
 KINDS = (indices.APART, indices.VELOCITIES, indices.ACCELERATIONS, indices.ACROSS)
-INTEGER_LIMIT = 2**63  # limit of counts
-BLOCK = 1024  # rows of an array checked at a time
-MIN_INTERIOR = 2  # smallest number of states within an interval: its two ends
+INTEGER_LIMIT = 2**63  # counts must be below this, to fit an int64
+BLOCK = 1024  # number of rows of an array that are checked at a time
+MIN_INTERIOR = 2  # smallest number of stored states of a divided interval: its two ends
 
 
 def read_fields(path: Path, system: ConstrainedSystem | None) -> dict[str, Any]:
-    """Return the fields of a saved result, each of which is validated before compiled code relies on it."""
+    """Return the validated fields of a saved result by name; wrong ones could crash compiled code."""
     arrays, metadata = _read_folder(path) if path.is_dir() else _read_file(path)
     saved = SavedFields(str(path), arrays, metadata)
     if system is not None:
@@ -205,12 +205,12 @@ def _solution(system: ConstrainedSystem, arrays: dict[str, Any], metadata: dict[
 
 
 def _is_number(value: Any) -> bool:
-    """Return whether a JSON value is a finite number; integers, which may have any number of digits, are limited."""
+    """Return whether a JSON value is a finite float, or an int whose magnitude is below INTEGER_LIMIT."""
     return math.isfinite(value) if type(value) is float else type(value) is int and abs(value) < INTEGER_LIMIT
 
 
 class SavedFields:
-    """Check the arrays and other fields of a file one by one.
+    """Fields of a file, which are checked one by one.
 
     Raises
     ------
@@ -283,7 +283,7 @@ class SavedFields:
             self._check_interior(t)
 
     def _check_interior(self, t: Array) -> None:
-        """Check the states within intervals: in each row the first and last at the ends of the interval, then NaN."""
+        """Check states within intervals: each row begins and ends at the ends of an interval, and is filled by NaN."""
         times = self._array("sol_interior_t", (None, None))
         states = self._array("sol_interior_states", (*times.shape, 3 * self.sizes[0]))
         finite = np.isfinite(times)
@@ -315,7 +315,7 @@ class SavedFields:
         return Statistics(**stats)
 
     def _array(self, name: str, shape: tuple[int | None, ...], dtype: type = np.float64) -> NDArray[Any]:
-        """Return an array by name and check its shape, in which None stands for any length."""
+        """Return the array `name`; raise ValueError if its type or shape differs; None in `shape`: any length."""
         array = self.arrays.get(name)
         sizes = ", ".join("n" if size is None else str(size) for size in shape) + ("," if len(shape) == 1 else "")
         expected = f"an array of {np.dtype(dtype).name} of shape ({sizes})"

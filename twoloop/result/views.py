@@ -84,14 +84,14 @@ def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
     return figure
 
 
-def _curves(panel: Any, t: Array, label: str, curves: list[tuple[str, Array]], what: str) -> None:
+def _curves(panel: Any, t: Array, label: str, curves: list[tuple[str, Array]], noun: str) -> None:
     for name, values in curves:
         panel.plot(t, values, lw=1.0, label=name)
     panel.set_ylabel(label)
     if len(curves) <= MAX_LEGEND:
         panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="x-small")
     else:
-        panel.set_title(f"{len(curves)} {what}", fontsize="x-small")
+        panel.set_title(f"{len(curves)} {noun}", fontsize="x-small")
 
 
 def _violation(panel: Any, result: Record) -> None:
@@ -115,21 +115,21 @@ def violation(result: Record) -> tuple[Array, Array]:
 
 
 FRAME_RATE = 25  # frames per second
-SHORTEST, LONGEST = 3.0, 12.0  # s, unless the user gives a duration
+SHORTEST, LONGEST = 3.0, 12.0  # limits of the duration of an animation, s, unless the user gives the duration
 AZIMUTH, ELEVATION = -60.0, 22.0  # degrees: view of a spatial mechanism
-WIDTH, HEIGHTS, MARGIN = 480, (200, 480), 28  # pixels
+WIDTH, HEIGHTS, MARGIN = 480, (200, 480), 28  # width, limits of the height, and margin of a frame, pixels
 COLORS = 64  # palette size of a GIF
 OVERSAMPLING = 2  # oversampling factor, for antialiasing
-PATH_POINTS = 4  # points of a path per frame
-FIXED_TOLERANCE = 1e-3  # relative to the extent: a point that moves less counts as fixed
-MAX_JOINTS = 12  # largest number of points of a planar mechanism drawn as circles
+PATH_POINTS = 4  # number of points per frame of a drawn path
+FIXED_TOLERANCE = 1e-3  # largest movement of a fixed point, relative to the extent of all points
+MAX_JOINTS = 12  # largest number of points of a planar mechanism that are drawn as circles
 BAR, TRACE, FIXED, PAPER = "#1f4e79", "#e07b39", "#444444", "#ffffff"
 SUFFIXES = (".html", ".gif", ".mp4")
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Contents of the frames.
+    """Contents of the frames of an animation.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class Scene:
         Times of the frames, s.
     points : ndarray (n_points, 2 or 3, n)
     paths : ndarray (n_traces, 2 or 3, PATH_POINTS (n - 1) + 1)
-        Paths drawn.
+        Points of the drawn paths.
     bars, traces, fixed, joints : list
         Pairs of points connected by a line; points with paths, fixed points, and points drawn as circles.
     """
@@ -180,11 +180,11 @@ def animate(result: Record, path: str | os.PathLike[str], seconds: float | None)
 def _scene(result: Record, n_frames: int) -> Scene:
     drawing = result._known("drawing")
     times = np.linspace(result.t[0], result.t[-1], n_frames)
-    fine = np.linspace(result.t[0], result.t[-1], PATH_POINTS * (n_frames - 1) + 1)
-    all_points = drawing.at(_positions(result, fine))
+    path_times = np.linspace(result.t[0], result.t[-1], PATH_POINTS * (n_frames - 1) + 1)
+    all_points = drawing.at(_positions(result, path_times))
     points = all_points[..., ::PATH_POINTS]
-    moved = np.ptp(points, axis=2).max(axis=1)
-    fixed = np.flatnonzero(moved <= FIXED_TOLERANCE * np.ptp(points, axis=(0, 2)).max()).tolist()
+    movements = np.ptp(points, axis=2).max(axis=1)
+    fixed = np.flatnonzero(movements <= FIXED_TOLERANCE * np.ptp(points, axis=(0, 2)).max()).tolist()
     planar = points.shape[1] == 2 and len(points) <= MAX_JOINTS
     joints = [k for k in range(len(points)) if k not in fixed and (planar or k in drawing.traces)]
     name = "" if result.system is None else result.system.name
@@ -193,7 +193,7 @@ def _scene(result: Record, n_frames: int) -> Scene:
 
 
 def _positions(result: Record, times: Array) -> Array:
-    """Return the coordinates (n_q, n) at the times of the frames."""
+    """Return the coordinates (n_q, n) at `times` (n,), from `sol` or by Hermite interpolation of q, v and a."""
     if result.sol is not None:
         return np.asarray(result.sol(times).q)
     from scipy.interpolate import BPoly  # slow to import
@@ -271,7 +271,7 @@ def _frames(scene: Scene) -> list[Any]:
 
 
 def _draw_frame(pen: Any, scene: Scene, pixels: Array, trails: Array) -> None:
-    """Draw a frame: points (n_points, 2), and the paths (n_traces, 2, m) up to it."""
+    """Draw a frame by `pen`: points (n_points, 2) and the paths so far (n_traces, 2, m), both in pixels."""
 
     def dot(point: int, radius: float, shape: str, **colors: str) -> None:
         x, y = pixels[point]

@@ -403,7 +403,7 @@ class Run:
         if self.static is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
-        for row, factor in zip(rows, factors, strict=False):  # the factors of the other rows in the sum that equals it
+        for row, factor in zip(rows, factors, strict=False):  # row = factor @ independent rows
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
         return equations_in_words(rows, counted, factors[:, counted], norms(all_rows))
 
