@@ -4,9 +4,9 @@ The operations of an elimination become LLVM instructions one by one, without nu
 hundred operations. The code is cached on disk like that of the kernels.
 
 **Accelerations** are computed by one of two programs. The program with the fewest operations (null_space.py) divides by
-fixed pivots. If one of these pivots is small, a function of the module computes the accelerations by the elimination of
-M. In SIMD lanes this function is called for all lanes if one lane needs it; the other lanes keep their results, so that
-no run depends on its neighbours.
+fixed pivots. If one of these pivots is small, a function of the module computes the accelerations by an elimination
+that begins with M. In SIMD lanes this function is called for all lanes if one lane needs it; the other lanes keep their
+results, so that the result of a run does not depend on the runs in other lanes.
 
 **Long equations** are split into functions that call one another, each compiled once: the time that LLVM takes grows
 faster than the length of a block. The values of long equations are stored in memory in any case. Accelerations and both
@@ -39,9 +39,9 @@ ARRAY = f"{DOUBLE}*"
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations at `inputs`, [t, q, v]; return their values, and whether they are valid.
+    """Write code for the accelerations at `inputs`, [t, q, v]; return their values, and a flag: whether they are valid.
 
-    The builder may be in another block afterwards. `emit` must have the pointers to the coefficients.
+    On return, the builder may be in another block. `emit` must have the pointers to the coefficients.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -59,104 +59,108 @@ def write_accelerations(
 def write_acceleration_function(
     module: Module, name: str, kind: tuple[str, list[str]], equations: Elimination, numbers: Coefficients
 ) -> None:
-    """Write a function of t, q, v and the coefficients that fills an array a, and returns whether a is valid."""
+    """Write a function that computes accelerations from t, q, v and the coefficients.
 
-    def emit_all(emit: Emitter, t: Value, q: Value, v: Value, given: Value, filled: Value) -> Value:
-        lowering, emit.numbers = Lowering(emit, numbers), given
+    The function stores them in its last argument and returns true if they are valid, else it stores nothing.
+    """
+
+    def emit_all(emit: Emitter, t: Value, q: Value, v: Value, coefficients: Value, out: Value) -> Value:
+        lowering, emit.numbers = Lowering(emit, numbers), coefficients
         lowering.define_inputs(equations.graph, [t, q, v])
-        a, holds = _accelerations(emit, equations, lowering, lambda: [t, q, v])
-        with emit.builder.if_then(holds):
+        a, is_valid = _accelerations(emit, equations, lowering, lambda: [t, q, v])
+        with emit.builder.if_then(is_valid):
             for i, value in enumerate(a):
-                emit.store(value, filled, i)
-        return holds
+                emit.store(value, out, i)
+        return is_valid
 
     llvm_code.write(module, name, kind, emit_all)
 
 
 def call_accelerations(
-    emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, filled: Value
+    emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, out: Value
 ) -> Value:
-    """Write a call that fills the array `filled` with the accelerations at `inputs`; return whether they are valid.
+    """Write a call that stores the accelerations at `inputs`, [t, q, v], in `out`; return whether they are valid.
 
-    `index`: of a program in `equations.accelerations`: 0 has the fewest operations, -1 eliminates M first.
+    `index`: position of the program in `equations.accelerations`; 0: fewest operations, -1: elimination begins with M.
     """
-    array = _stack_array(emit, 2 * equations.system.n_q)
+    state = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
-        emit.store(value, array, i)
-    arguments = [inputs[0], array, emit.pointer(array, equations.system.n_q), *_numbers(emit), filled]
+        emit.store(value, state, i)
+    arguments = [inputs[0], state, emit.pointer(state, equations.system.n_q), *_coefficient_pointers(emit), out]
     return emit.builder.call(_acceleration_function(emit, equations, index, numbers), emit.bit, arguments)
 
 
 def _accelerations(
     emit: Emitter, equations: Elimination, lowering: Lowering, state: Callable[[], list[Value]]
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations; return their values and whether they are valid.
+    """Write code for the accelerations; return their values, and a flag: whether they are valid.
 
-    `state` returns t and pointers to q and v, the arguments of the function that eliminates M; it may write code.
+    `state` returns t and pointers to q and v, the arguments of the function that is called if pivots are small: its
+    elimination begins with M. `state` may write code.
     """
-    outputs, *alternatives = equations.accelerations
-    a, holds = _run_accelerations(emit, equations, lowering, outputs)
+    program, *alternatives = equations.accelerations
+    a, is_valid = _run_accelerations(emit, equations, lowering, program)
     if not alternatives:
-        return a, holds
+        return a, is_valid
     builder = emit.builder
-    all_hold = holds
-    if (width := width_of(holds.type)) > 1:
-        all_hold = builder.call(f"llvm.vector.reduce.and.v{width}i1", BIT, [holds])
-    before, fallback, after = builder.block, builder.append_block(), builder.append_block()
-    builder.branch(all_hold, after, fallback)
+    all_valid = is_valid
+    if (width := width_of(is_valid.type)) > 1:
+        all_valid = builder.call(f"llvm.vector.reduce.and.v{width}i1", BIT, [is_valid])
+    first_block, fallback, after = builder.block, builder.append_block(), builder.append_block()
+    builder.branch(all_valid, after, fallback)
     builder.position_at_end(fallback)
-    name, place = _acceleration_function(emit, equations, -1, lowering.numbers), _stack_array(emit, len(a))
-    finite = builder.call(name, emit.bit, [*state(), *_numbers(emit), place])
-    b = [builder.select(holds, value, emit.load(place, i)) for i, value in enumerate(a)]
-    finite, last = builder.operation("or", holds, finite), builder.block
+    name, array = _acceleration_function(emit, equations, -1, lowering.numbers), _stack_array(emit, len(a))
+    fallback_valid = builder.call(name, emit.bit, [*state(), *_coefficient_pointers(emit), array])
+    b = [builder.select(is_valid, value, emit.load(array, i)) for i, value in enumerate(a)]
+    fallback_valid, fallback_end = builder.operation("or", is_valid, fallback_valid), builder.block
     builder.go_to(after)
     builder.position_at_end(after)
     merged: list[Value] = []
-    for value, alternative in zip([*a, holds], [*b, finite], strict=True):
+    for value, alternative in zip([*a, is_valid], [*b, fallback_valid], strict=True):
         phi = builder.phi(value.type)
-        phi.add_incoming(value, before)
-        phi.add_incoming(alternative, last)
+        phi.add_incoming(value, first_block)
+        phi.add_incoming(alternative, fallback_end)
         merged.append(phi)
-    *a, holds = merged
-    return a, holds
+    *a, is_valid = merged
+    return a, is_valid
 
 
 def _run_accelerations(
-    emit: Emitter, equations: Elimination, lowering: Lowering, outputs: Program
+    emit: Emitter, equations: Elimination, lowering: Lowering, program: Program
 ) -> tuple[list[Value], Value]:
-    (a,) = outputs.run(lowering)
-    return a, lowering.holds(outputs, a)
+    (a,) = program.run(lowering)
+    return a, lowering.holds(program, a)
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
     """Return the name of the function for a program of `equations.accelerations`; write it if the module has none."""
-    outputs, mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
+    program, mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
-        n, given = equations.system.n_q, _numbers(emit)
-        kinds = [emit.double, ARRAY, ARRAY, *[ARRAY] * len(given), ARRAY]
+        n, pointers = equations.system.n_q, _coefficient_pointers(emit)
+        kinds = [emit.double, ARRAY, ARRAY, *[ARRAY] * len(pointers), ARRAY]
         builder = module.function(name, emit.bit, kinds, internal=True)
-        inner = emit.like(builder)
-        t, q, v, *places, filled = builder.arguments
-        for attribute, place in zip(("numbers", "constants"), places, strict=False):
-            setattr(inner, attribute, place)
+        inner_emit = emit.like(builder)
+        t, q, v, *coefficients, out = builder.arguments
+        for attribute, pointer in zip(("numbers", "constants"), coefficients, strict=False):
+            setattr(inner_emit, attribute, pointer)
         if mass_first and equations.parts is not None:
-            builder.ret(equations.parts.accelerations(inner, t, q, v, places[0], filled))
+            builder.ret(equations.parts.accelerations(inner_emit, t, q, v, coefficients[0], out))
             return name
-        lowering = Lowering(inner, numbers)
+        lowering = Lowering(inner_emit, numbers)
         lowering.define(0, t)
         for first, array in ((1, q), (1 + n, v)):
             for i in range(n):
-                lowering.define(first + i, inner.load(array, i))
-        a, holds = _run_accelerations(inner, equations, lowering, outputs)
+                lowering.define(first + i, inner_emit.load(array, i))
+        a, is_valid = _run_accelerations(inner_emit, equations, lowering, program)
         for i, value in enumerate(a):
-            inner.store(value, filled, i)
-        builder.ret(holds)
+            inner_emit.store(value, out, i)
+        builder.ret(is_valid)
     return name
 
 
-def _numbers(emit: Emitter) -> list[Value]:
-    """Return the pointer to the coefficients; in SIMD lanes, those to the varying and to the shared coefficients."""
+def _coefficient_pointers(emit: Emitter) -> list[Value]:
+    """Return the pointers to the coefficients: one; in SIMD lanes two, to the varying and to the shared ones."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -165,8 +169,9 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
-# numbers of operations above which equations are split into functions, which halves the time to compile. SPLIT_ALL: if
-# there is no reduced program for the accelerations, which is never split; split accelerations take 50 % longer to run
+# numbers of operations above which equations are split into functions, which halves the time to compile. SPLIT_ALL
+# replaces SPLIT_PROJECTIONS if there is no reduced program for the accelerations: they are then split, too, and take
+# 50 % longer to run
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
@@ -201,19 +206,19 @@ class SplitFunctions:
         if self.redundant:
             self.with_factors["least"] = self.solution.least
         self._parts: dict[str, Callable[..., Value]] = {"factors": self._factors}
-        for name, outputs in self.at_position.items():
-            self._parts[name] = partial(self._part, outputs, self.solution.stored)
-        for name, outputs in self.with_factors.items():
-            self._parts[name] = partial(self._part, outputs, {})
+        for name, program in self.at_position.items():
+            self._parts[name] = partial(self._part, program, self.solution.stored)
+        for name, program in self.with_factors.items():
+            self._parts[name] = partial(self._part, program, {})
 
     def structure(self) -> Iterable[Any]:
         """Yield everything that the functions depend on, except the values of coefficients."""
         solution, numbers = self.solution, self.numbers
         yield solution.kept.sizes, list(numbers.structure(solution.kept))
-        for outputs in self.at_position.values():
-            yield outputs.sizes, list(numbers.structure(outputs, solution.stored))
-        for outputs in self.with_factors.values():
-            yield outputs.sizes, list(numbers.structure(outputs))
+        for program in self.at_position.values():
+            yield program.sizes, list(numbers.structure(program, solution.stored))
+        for program in self.with_factors.values():
+            yield program.sizes, list(numbers.structure(program))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Write the functions that kernels call; return their names. `kinds` returns the types of a function."""
@@ -228,43 +233,46 @@ class SplitFunctions:
     # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls (name, arguments) of parts, and parts that are missing; return whether all results are valid."""
-        module, holds = emit.builder.module, None
+        """Write calls of parts, pairs (name, arguments); write missing parts; return whether all results are valid."""
+        module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
             if not module.defines(name):
                 builder = module.function(name, emit.bit, [value.type for value in arguments], internal=True)
                 builder.ret(self._parts[part](emit.like(builder), *builder.arguments))
             valid = emit.builder.call(name, emit.bit, arguments)
-            holds = valid if holds is None else emit.builder.both(holds, valid)
-        assert holds is not None
-        return holds
+            all_valid = valid if all_valid is None else emit.builder.both(all_valid, valid)
+        assert all_valid is not None
+        return all_valid
 
     def _lowering(
         self, emit: Emitter, graph: Graph, arguments: Sequence[Value], places: Mapping[int, Place]
     ) -> Lowering:
-        """Return the Lowering that writes a part, whose arguments begin with three inputs and the coefficients."""
-        *given, emit.numbers = arguments[:4]
+        """Return the Lowering that writes a part; `arguments` begin with the inputs of `graph` and the coefficients."""
+        *inputs, emit.numbers = arguments[:4]
         if width_of(emit.double) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]
         lowering = Lowering(emit, self.numbers, places)
-        lowering.define_inputs(graph, given)
+        lowering.define_inputs(graph, inputs)
         return lowering
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that stores `solution.stored` in its fifth argument; return whether the conditions hold."""
-        graph, solution, kept = self.equations.graph, self.solution, arguments[4]
+        """Write the part that stores the values of `solution.stored` in argument 4; return whether they are valid."""
+        graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
-        places = {i: (kept, place) for i, place in solution.stored.items()}
+        places = {i: (stored, place) for i, place in solution.stored.items()}
         for i, place in places.items():
             if graph.operations[i] is None:  # this entry is t or a coordinate
                 emit.store(lowering.value(i), *place)
         lowering.run(graph, graph.in_order_of_use(solution.kept.forms), places)
         return lowering.holds(solution.kept, [])
 
-    def _part(self, program: Program, kept: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that fills the arrays of a program; return whether they are valid. `kept`: see `Solution`."""
-        places = {i: (arguments[4], place) for i, place in kept.items()}
+    def _part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
+        """Write the part that stores the arrays of a program; return whether they are valid.
+
+        `stored`: places, in the array that is argument 4, of the quantities that are loaded instead of computed.
+        """
+        places = {i: (arguments[4], place) for i, place in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)
         for array, values in zip(arguments[-len(results) :], results, strict=True):
@@ -276,21 +284,28 @@ class SplitFunctions:
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         """Write code that stores the accelerations at (t, q, v) in `a`; return whether they are valid."""
-        kept, r, c, lam = self._stack_arrays(emit)
-        at = [t, q, v, numbers, kept]
-        return self._call(emit, ("factors", at), ("right", [*at, r, c]), ("solution", [r, c, kept, numbers, a, lam]))
+        stored, r, c, lam = self._stack_arrays(emit)
+        inputs = [t, q, v, numbers, stored]
+        return self._call(
+            emit, ("factors", inputs), ("right", [*inputs, r, c]), ("solution", [r, c, stored, numbers, a, lam])
+        )
 
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Store q after a Newton step in `out`, and its change in `moved`; return whether these results are valid."""
-        kept, r, c, lam = self._stack_arrays(emit)
-        at = [t, q, v, numbers, kept]
-        _clear(emit, self.n, r)
-        holds = self._call(emit, ("factors", at), ("off", [*at, c]), ("solution", [r, c, kept, numbers, moved, lam]))
-        _leave_unless(emit, holds)
-        _sum(emit, self.n, q, moved, out)
-        return holds
+        """Write code that stores q after a Newton step onto the constraints in `out`, and the change of q in `moved`.
+
+        Returns whether these results are valid.
+        """
+        stored, r, c, lam = self._stack_arrays(emit)
+        inputs = [t, q, v, numbers, stored]
+        _write_zeros(emit, self.n, r)
+        is_valid = self._call(
+            emit, ("factors", inputs), ("off", [*inputs, c]), ("solution", [r, c, stored, numbers, moved, lam])
+        )
+        _write_return_unless(emit, is_valid)
+        _write_sum(emit, self.n, q, moved, out)
+        return is_valid
 
     def project(
         self,
@@ -305,35 +320,36 @@ class SplitFunctions:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """Project q and v in the metric of M, and store the results; return whether they are valid.
+        """Write code that projects q and v onto the constraints in the metric of M; return whether results are valid.
 
-        The results are the change of q, the projected q and v, and the accelerations and multipliers for the new v.
+        The code stores the change of q in `moved`, the projected q and v in `new_q` and `new_v`, and the accelerations
+        and multipliers at the new v in `a` and `lam`.
         """
-        kept, r, c, change = self._stack_arrays(emit)
-        u, at = self._stack_array(emit, self.n), [t, q, v, numbers, kept]
-        _clear(emit, self.n, r)
+        stored, r, c, change = self._stack_arrays(emit)
+        projected_v, inputs = self._stack_array(emit, self.n), [t, q, v, numbers, stored]
+        _write_zeros(emit, self.n, r)
         corrections_valid = self._call(
             emit,
-            ("factors", at),
-            *(("off", [*at, c]), ("solution", [r, c, kept, numbers, moved, lam])),
-            *(("faster", [*at, c]), ("solution", [r, c, kept, numbers, change, lam])),
+            ("factors", inputs),
+            *(("off", [*inputs, c]), ("solution", [r, c, stored, numbers, moved, lam])),
+            *(("faster", [*inputs, c]), ("solution", [r, c, stored, numbers, change, lam])),
         )
-        _sum(emit, self.n, v, change, u)
-        of_rows = c if self.redundant else lam
-        holds = self._call(
+        _write_sum(emit, self.n, v, change, projected_v)
+        independent_lam = c if self.redundant else lam
+        is_valid = self._call(
             emit,
-            ("right", [t, q, u, numbers, kept, r, c]),
-            ("solution", [r, c, kept, numbers, a, of_rows]),
-            *([("least", [c, c, kept, numbers, lam])] if self.redundant else []),
+            ("right", [t, q, projected_v, numbers, stored, r, c]),
+            ("solution", [r, c, stored, numbers, a, independent_lam]),
+            *([("least", [c, c, stored, numbers, lam])] if self.redundant else []),
         )
-        holds = emit.builder.both(corrections_valid, holds)
-        _leave_unless(emit, holds)
-        _sum(emit, self.n, q, moved, new_q)
-        _sum(emit, self.n, v, change, new_v)
-        return holds
+        is_valid = emit.builder.both(corrections_valid, is_valid)
+        _write_return_unless(emit, is_valid)
+        _write_sum(emit, self.n, q, moved, new_q)
+        _write_sum(emit, self.n, v, change, new_v)
+        return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return pointers to four arrays on the stack: for stored quantities, r, c, and one as long as a and lam."""
+        """Return pointers to four arrays on the stack: stored quantities, r, c, and one for either v or multipliers."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [self._stack_array(emit, size) for size in sizes]
 
@@ -341,18 +357,18 @@ class SplitFunctions:
         return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
-def _leave_unless(emit: Emitter, holds: Value) -> None:
-    """Write a return from the function if results are invalid, before it changes an argument; nothing in SIMD lanes."""
-    if holds.type == BIT:
-        emit.builder.leave_unless(holds)
+def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
+    """Write an early return for invalid results, so that no argument is changed; write nothing in SIMD lanes."""
+    if is_valid.type == BIT:
+        emit.builder.leave_unless(is_valid)
 
 
-def _clear(emit: Emitter, n: int, out: Value) -> None:
+def _write_zeros(emit: Emitter, n: int, out: Value) -> None:
     with emit.loop(integer(0), integer(n), []) as (j, _, _):
         emit.store(emit.constant(0.0), emit.pointer(out, j))
 
 
-def _sum(emit: Emitter, n: int, a: Value, b: Value, out: Value) -> None:
+def _write_sum(emit: Emitter, n: int, a: Value, b: Value, out: Value) -> None:
     with emit.loop(integer(0), integer(n), []) as (j, _, _):
         total = emit.add(emit.load(emit.pointer(a, j)), emit.load(emit.pointer(b, j)))
         emit.store(total, emit.pointer(out, j))
@@ -364,23 +380,23 @@ Array = NDArray[np.float64]
 def write_function(
     module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write a function of the inputs of a program and of coefficients that fills the arrays of the program.
+    """Write a function that computes the arrays of a program from its inputs and its coefficients.
 
     The function returns whether the conditions hold and the first array is finite; if not, it changes no array.
     """
 
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
-        n_given = len(program.graph.sizes)
-        given, emit.numbers, filled = arguments[:n_given], arguments[n_given], arguments[n_given + 1 :]
+        n_inputs = len(program.graph.sizes)
+        inputs, emit.numbers, pointers = arguments[:n_inputs], arguments[n_inputs], arguments[n_inputs + 1 :]
         lowering = Lowering(emit, numbers)
-        lowering.define_inputs(program.graph, given)
+        lowering.define_inputs(program.graph, inputs)
         results = program.run(lowering)
-        holds = lowering.holds(program, results[0])
-        with emit.builder.if_then(holds):
-            for place, array in zip(filled, results, strict=True):
+        is_valid = lowering.holds(program, results[0])
+        with emit.builder.if_then(is_valid):
+            for pointer, array in zip(pointers, results, strict=True):
                 for j, value in enumerate(array):
-                    emit.store(value, place, j)
-        return holds
+                    emit.store(value, pointer, j)
+        return is_valid
 
     llvm_code.write(module, name, kind, emit_all)
 
@@ -419,18 +435,18 @@ class SharedCode:
         )
 
     def _programs(self) -> dict[str, Program]:
-        """Return the programs, by names of functions, for functions that are not split."""
+        """Return the programs of the functions that are not split, by name of function."""
         equations = self.equations
-        outputs = {"own_redundant": equations.redundant_rows}
+        programs = {"own_redundant": equations.redundant_rows}
         if self.parts is None:
-            outputs |= {"own_correct_positions": equations.position_projection, "own_project": equations.projection}
-        return outputs
+            programs |= {"own_correct_positions": equations.position_projection, "own_project": equations.projection}
+        return programs
 
     def _structure(self) -> Iterable[Any]:
         equations, parts, numbers = self.equations, self.parts, self.numbers
         yield equations.system.n_q, equations.choice.rows, equations.choice.added
-        for outputs in (*self.outputs.values(), *equations.accelerations[: None if parts is None else -1]):
-            yield outputs.sizes, list(numbers.structure(outputs))
+        for program in (*self.outputs.values(), *equations.accelerations[: None if parts is None else -1]):
+            yield program.sizes, list(numbers.structure(program))
         if parts is not None:
             yield from parts.structure()
 
@@ -439,8 +455,8 @@ class SharedCode:
 
         equations = self.equations
         module = Module(divided=True)
-        for name, outputs in self.outputs.items():
-            write_function(module, name, KIT.llvm_type(name), outputs, self.numbers)
+        for name, program in self.outputs.items():
+            write_function(module, name, KIT.llvm_type(name), program, self.numbers)
         parts = [] if self.parts is None else self.parts.write(module, KIT.llvm_type)
         name = "own_accelerate"
         if name not in parts:
@@ -463,7 +479,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return whether this code can be used for a run from (t0, q0): whether the choice of pivots there is equal."""
+        """Return whether a run from (t0, q0) may use this code: whether it was generated for the PivotChoice there."""
         try:
             return PivotChoice.at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:

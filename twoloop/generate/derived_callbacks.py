@@ -91,7 +91,7 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return, by kind of missing callback (`gamma` for both), expressions by flat indices in the callback's array."""
+    """Return the derivatives by kind of missing callback ("gamma": both kinds), as expressions by flat array index."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -105,17 +105,18 @@ def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int,
 
 Array = NDArray[np.float64]
 
-MOST_ENTRIES = 50_000  # largest number of entries of C_q for which derivatives are compared with exact ones
-# displacements from the start at which derivatives are compared, relative to sizes of coordinates and FIRST_TIME_SCALE
+MAX_ENTRIES = 50_000  # largest number of entries of C_q and A for which callbacks are compared with exact derivatives
+# displacements from the start at which derivatives are compared: of q, relative to the sizes of the coordinates, and of
+# t, relative to FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Traced | None:
-    """Return the exact derivatives as traces, to be compared with the callbacks of a system for these derivatives.
+    """Return the exact derivatives C_q, C_t and Gamma as traces, to be compared with the callbacks for them.
 
     Return None if there are too many entries, callbacks cannot be traced, or `check` raises for the traces.
     """
-    if system.n_q * (system.n_c + system.n_a) > MOST_ENTRIES:
+    if system.n_q * (system.n_c + system.n_a) > MAX_ENTRIES:
         return None
     try:
         traced: Traced = derive_cached(system, "derivatives", partial(_trace_derivatives, system), check)
@@ -126,8 +127,8 @@ def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Tr
 
 def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Traced:
     equations = cache.equations(system)
-    given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
-    forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
+    callbacks = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
+    forms = {kind: equations.derived(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
     # the derivatives are those of traces, so these callbacks must agree with their traces
     forms |= {kind: equations.of(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return Traced(system, equations.graph, forms)
@@ -141,8 +142,8 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     ValueError
         If there is no callback for C_t, although C depends on time by its trace (but not near the start).
     """
-    away = generic_factors(len(q)) * sizes(q)
-    states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * away) for displacement in DISPLACEMENTS]
+    direction = generic_factors(len(q)) * sizes(q)
+    states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * direction) for displacement in DISPLACEMENTS]
 
     def check(traced: Traced) -> None:
         try:
@@ -163,15 +164,15 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return states as rows [t, q, v] with other velocities, random but not zero, about as large as the given ones."""
+    """Return rows [t, q, v] with t and q of `states`, and random nonzero v that are about as large as those given."""
     times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
-    generic = np.array([sizes(q) for q in positions]) * _factors(*positions.shape)
-    speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic).max()))
-    return np.column_stack([times, positions, speed * generic])
+    generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
+    speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))
+    return np.column_stack([times, positions, speed * generic_v])
 
 
 @cache
-def _factors(n_states: int, n_q: int) -> Array:
+def _random_factors(n_states: int, n_q: int) -> Array:
     """Return an array (n_states, n_q) of random factors, the same in every call: 0.5 to 1.5 with random signs."""
     random = np.random.default_rng(1)
     return random.uniform(0.5, 1.5, (n_states, n_q)) * random.choice((-1.0, 1.0), (n_states, n_q))

@@ -48,16 +48,18 @@ Array = NDArray[np.float64]
 SINGULAR_MASS = 1e-10  # ratio of the smallest to the largest eigenvalue of M below which rows of G are added to M
 RANK = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
 RELATIVE_BOUND = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
-# possible values of the smallest allowed pivot; with pivots below the last value, rounding errors would dominate
+# possible values of `PivotChoice.least`, the smallest allowed pivot of a row of G, relative to its pivot without the
+# other rows; with pivots below the last value, rounding errors would dominate
 LEAST = 10.0 ** np.arange(-2, -9, -1)
-BOUNDS = LEAST[:-1] / RELATIVE_BOUND  # lower bounds of the smallest pivot at the start, for the values of LEAST
+# smallest pivots at the start: LEAST[i] is chosen for pivots from BOUNDS[i] to BOUNDS[i - 1], and its last value below
+BOUNDS = LEAST[:-1] / RELATIVE_BOUND
 N_FEW = 24  # largest number of coordinates for which FEW_FROM applies
-# All rows may be added to M if the first of BOUNDS below the smallest pivot has at least this index. FEW_FROM: for up
-# to N_FEW coordinates (pivots below 1e-3). FEW_SINGULAR_FROM: the same if M is singular, as Euler parameters lose two
-# digits in sound models. MANY_FROM: for more than N_FEW coordinates, as added rows make their code much longer.
+# lowest indices in LEAST of a choice with pivots so small that all rows of G may be added to M. FEW_FROM: for up to
+# N_FEW coordinates (pivots below 1e-3). FEW_SINGULAR_FROM: replaces FEW_FROM if M is singular, as Euler parameters lose
+# two digits in sound models. MANY_FROM: for more than N_FEW coordinates, as added rows make their code much longer.
 FEW_FROM, FEW_SINGULAR_FROM, MANY_FROM = 4, 5, 6
-ADDED_SIZE = 16.0  # size of s G^T G, which is added to M, relative to the largest entry of M
-MIN_GAIN = 2  # smallest decrease of the index in BOUNDS by added rows; else rows are nearly dependent for any M
+ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
+MIN_GAIN = 2  # smallest decrease of the index in LEAST for which rows are added; else pivots are small with any M
 # number of rows of G per coordinate from which on dependent coordinates are eliminated; with fewer rows, the linear
 # system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
@@ -82,7 +84,7 @@ class PivotChoice:
         Pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which these
         rows are solved. Empty if expressing dependent coordinates saves no operations, or no pivots are suitable.
     refined : bool or None
-        Whether solutions are improved by one step of refinement. None: no, at every position with these choices.
+        Whether solutions are improved by one step of refinement. None: no, as pivots are too large for loss of digits.
     """
 
     rows: tuple[int, ...]
@@ -103,14 +105,14 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choice(mass, G)
-        # with larger pivots, unless rows are added because of them, random models kept 10 digits
+        # larger pivots are not tested: with them random models kept 10 digits; added rows set `refined` in any case
         if choice.rows and choice.least <= LEAST[-1] and choice.refined is None:
             choice = replace(choice, refined=loses_digits(mass, G, choice))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
 
 class DependentColumns:
-    """Choice of dependent coordinates at positions of a system: pivot blocks by which rows of G determine them.
+    """Choice of the dependent coordinates of a system at any position: pivot blocks that solve rows of G for them.
 
     Parameters
     ----------
@@ -138,7 +140,7 @@ class DependentColumns:
             self.arguments = kinds, np.array(rows, np.int64), len(rows), scratch, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
-        """Return `blocks` of a PivotChoice for the values of G at a position."""
+        """Return the pivot blocks (`PivotChoice.blocks`) for the values of G (n_c + n_a, n_q) at a position."""
         if self.find is None:
             return ()
         n = self.find(G, *self.arguments)
@@ -153,10 +155,10 @@ def _kinds_of_entries(system: ConstrainedSystem) -> Any:
 
     def make(equations: Callable[[], Equations]) -> Any:
         try:
-            rows = [*equations().of("jacobian").flat, *equations().of("nonholonomic").flat]
+            entries = [*equations().of("jacobian").flat, *equations().of("nonholonomic").flat]
         except (Untraceable, ArithmeticError, RecursionError):
             return None
-        return np.array([2 if form.terms else int(form.constant != 0.0) for form in rows], dtype=np.int64)
+        return np.array([2 if form.terms else int(form.constant != 0.0) for form in entries], dtype=np.int64)
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(make, partial(cache.equations, system)))
@@ -166,7 +168,7 @@ def _kinds_of_entries(system: ConstrainedSystem) -> Any:
 
 
 class PivotChooser:
-    """Function object that returns the choice for values of M and G, at any number of positions of a system."""
+    """Kernel with scratch arrays that finds the PivotChoice for values of M and G at any position of a system."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, workspace_size
@@ -180,11 +182,14 @@ class PivotChooser:
         self._key, self._last = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
 
     def choice(self, mass: Array, G: Array) -> PivotChoice:
-        """Return the choice for values of M and G; raise the same exception as `PivotChoice.at`."""
+        """Return the PivotChoice, without its blocks, for values of M (n_q, n_q) and G (n_c + n_a, n_q).
+
+        Raises Untraceable as `PivotChoice.at`.
+        """
         system, scratch, chosen = self.system, self._room, self._chosen
-        constant = system.constant_mass and system.derived.get("no weak mass", False)
+        is_definite = system.constant_mass and system.derived.get("no weak mass", False)
         scratch[0] = 0.0
-        index = self._choose(mass, G, RANK, 0.0 if constant else SINGULAR_MASS, BOUNDS, scratch, chosen)
+        index = self._choose(mass, G, RANK, 0.0 if is_definite else SINGULAR_MASS, BOUNDS, scratch, chosen)
         key = index, chosen.tobytes(), float(scratch[0])
         if key != self._key:
             self._last, self._key = self._decode(index), key
@@ -194,21 +199,21 @@ class PivotChooser:
         return self._last
 
     def _with_added_rows(self, mass: Array, G: Array, index: int) -> PivotChoice:
-        """Return the choice with M + s G^T G instead of M if its smallest pivot is much larger, else the last choice.
+        """Return the choice with M + s G^T G instead of M if its smallest pivot is much larger, else `self._last`.
 
         G: the independent rows. A body may have little inertia about its joints, as a rod with its mass in the middle.
         Then the rows are nearly dependent in the metric of M: if the smallest pivot is 10^-k, accelerations lose up to
         2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times as large as
-        M, k digits are lost, which refinement finds again. `index`: of the smallest pivot in BOUNDS.
+        M, k digits are lost, which refinement restores. `index`: index in LEAST of the choice with M.
         """
         last = self._last
         rows = G[list(last.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
         scratch, chosen = np.zeros_like(self._room), np.zeros_like(self._chosen)
-        new = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, scratch, chosen)
-        if not 0 <= new <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
+        new_index = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, scratch, chosen)
+        if not 0 <= new_index <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
             return last
-        least = float(LEAST[new])
+        least = float(LEAST[new_index])
         return replace(last, added=last.rows, scale=float(scale), least=least, refined=True)
 
     def _decode(self, index: int) -> PivotChoice:
@@ -216,7 +221,7 @@ class PivotChooser:
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
-        n_independent, n_added, *places = self._chosen.tolist()
+        n_independent, n_added, *indices = self._chosen.tolist()
         if n_independent == 0:
             return PivotChoice((), (), 1.0, 0.0)
         if index < 0:
@@ -224,13 +229,13 @@ class PivotChooser:
             raise Untraceable(f"the mass of {system.name!r} {defect}")
         if n_added == 0:
             system.derived["no weak mass"] = True
-        added = tuple(places[n_rows : n_rows + n_added])
-        return PivotChoice(tuple(places[:n_independent]), added, float(self._room[0]), float(LEAST[index]))
+        added = tuple(indices[n_rows : n_rows + n_added])
+        return PivotChoice(tuple(indices[:n_independent]), added, float(self._room[0]), float(LEAST[index]))
 
 
-MOST_ELIMINATED = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
-# cost of the program `reduced`, relative to that of `mass_first`, from which on it is not used: it is compiled in
-# addition to `mass_first`, which is needed if pivots become small. At a ratio of 0.68 (four-bar) it saves 5 % of a run.
+MAX_OPERATIONS = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
+# largest cost of the program `reduced`, relative to that of `mass_first`, at which it is used. It is compiled in
+# addition to `mass_first`, which is needed where pivots become small. At 0.68 (four-bar) it saves 5 % of a run.
 MAX_COST_RATIO = 0.75
 
 
@@ -256,8 +261,8 @@ class Elimination:
     right_sides : Program
         Program for "r" (n_q,), Q, and "c" (n_c + n_a,), the right-hand sides of the rows of G; 0 for unused rows.
     position_projection : Program
-        Program for "q" (n_q,), the position after one Newton step towards the constraints, in directions that A allows,
-        and "moved" (n_q,), the change of the position.
+        Program for "q" (n_q,), the position after one Newton step towards the constraints, and "moved" (n_q,), the
+        change of the position, x, with A x = 0.
     projection : Program
         Program for "q", "moved", "v" (n_q,), the projected velocity, and "a" (n_q,) and "lam" (n_c + n_a,) at this
         velocity. M, G and Q are evaluated at the position before the step.
@@ -290,10 +295,10 @@ class Elimination:
         self.mass = self._values_of("mass")
         rows = [self._values_of("jacobian"), self._values_of("nonholonomic")]
         rates = [self._values_of("constraint_rate"), self._values_of("nonholonomic_rate")]
-        self.all_rows, counting = np.vstack(rows), list(choice.rows)
-        self.rows, self.rates = self.all_rows[counting], np.concatenate(rates)[counting]
+        self.all_rows, independent = np.vstack(rows), list(choice.rows)
+        self.rows, self.rates = self.all_rows[independent], np.concatenate(rates)[independent]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
-        self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
+        self.conditions = [(pivot, pivot_alone.times(choice.least)) for pivot, pivot_alone in self.factors.conditions]
         self.conditions += [(pivot, self.zero) for pivot in self.factors.positive if pivot.terms]
         self.redundant_rows = self._redundant_rows(np.concatenate(rates))
         self._check_length()
@@ -303,8 +308,8 @@ class Elimination:
         self.traced = Traced(system, self.graph)
 
     def _check_length(self) -> None:
-        if len(self.graph.operations) - self._n_reduced > MOST_ELIMINATED:
-            raise Untraceable(f"its equations are more than {MOST_ELIMINATED} operations")
+        if len(self.graph.operations) - self._n_reduced > MAX_OPERATIONS:
+            raise Untraceable(f"its equations are more than {MAX_OPERATIONS} operations")
 
     def _values_of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
         return elementwise(Affine.value, [self.equations.of(kind, v)])
@@ -313,12 +318,12 @@ class Elimination:
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
         violations = self._values_of("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
-        size, speed = (sum((x * x for x in state), unit) for state in (self.q, self.v))
+        scale_q, scale_v = (sum((x * x for x in state), unit) for state in (self.q, self.v))
         for k in redundant:
             row, rate = self.all_rows[k], rates[k]
             velocity_residual = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
             allowed = sum((entry * entry for entry in row), self.zero).times(MAX_VIOLATION**2)
-            for residual, scale in ((violations[k], size), (velocity_residual, speed)):
+            for residual, scale in ((violations[k], scale_q), (velocity_residual, scale_v)):
                 conditions.append((allowed * scale, residual * residual))
         return Program(self.graph, {"": []}, conditions)
 
@@ -345,7 +350,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> list[Affine]:
-        """Return a and the multipliers of the independent rows for M a + G^T lam = r, G a = c, with all rows of G."""
+        """Solve M a + G^T lam = r, G a = c for a and lam of the independent rows; `c`: one entry for each row of G."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -357,27 +362,27 @@ class Elimination:
 
     @cached_property
     def mass_first(self) -> Program:
-        """Return the program `mass_first` (see the class)."""
+        """Return the program for the accelerations by an elimination that begins with M."""
         solution = self._accelerations(self.v)
         self._check_length()
         return Program(self.graph, {"a": solution[: self.system.n_q]}, self.conditions)
 
     @cached_property
     def reduced(self) -> Program | None:
-        """Return the program `reduced` (see the class)."""
+        """Return the program for the accelerations by dependent coordinates; None if it costs too much."""
         blocks = self.choice.blocks
         if not blocks:
             return None
-        most, before = int(MAX_COST_RATIO * self.mass_first.cost()), len(self.graph.operations)
+        max_cost, n_before = int(MAX_COST_RATIO * self.mass_first.cost()), len(self.graph.operations)
         force, gamma = self._right_sides(self.v)
         try:
-            dependent = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, most)
+            dependent = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, max_cost)
             a, conditions = reduced_accelerations(self.mass, force, dependent)
             reduced = Program(self.graph, {"a": a}, [*dependent.conditions, *conditions])
         except NotReduced:
             reduced = None
-        self._n_reduced += len(self.graph.operations) - before
-        return reduced if reduced is not None and reduced.cost() < most else None
+        self._n_reduced += len(self.graph.operations) - n_before
+        return reduced if reduced is not None and reduced.cost() < max_cost else None
 
     @property
     def accelerations(self) -> list[Program]:
@@ -386,7 +391,7 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program `right_sides` (see the class)."""
+        """Return the program for "r", Q, and "c", the right-hand sides of the rows of G."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added}
         return Program(
@@ -399,20 +404,20 @@ class Elimination:
 
     def _on_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
         """Return a list with one value for each row of G: those of `independent`, and 0 for dependent rows."""
-        numbers = [self.zero] * len(self.all_rows)
-        for k, number in zip(self.choice.rows, independent, strict=True):
-            numbers[k] = number
-        return numbers
+        values = [self.zero] * len(self.all_rows)
+        for k, value in zip(self.choice.rows, independent, strict=True):
+            values[k] = value
+        return values
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program `position_errors` (see the class)."""
+        """Return the program for "c", the right-hand sides -C of position corrections; 0 for dependent rows and A."""
         errors = [*(-each for each in self._values_of("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._on_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program `velocity_errors` (see the class)."""
+        """Return the program for "c", the right-hand sides -G v - G_t of velocity corrections; 0 for dependent rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -423,14 +428,14 @@ class Elimination:
 
     @cached_property
     def position_projection(self) -> Program:
-        """Return the program `position_projection` (see the class)."""
+        """Return the program for "q", the position after one Newton step towards the constraints, and its change."""
         moved = self._correction(self.position_errors)
         position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
         return Program(self.graph, position, self.conditions)
 
     @cached_property
     def projection(self) -> Program:
-        """Return the program `projection` (see the class)."""
+        """Return the program for projected q and v, and for a and the multipliers of least norm at this velocity."""
         arrays = self.basic_projection.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
         lam = multipliers_of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
@@ -439,7 +444,7 @@ class Elimination:
 
     @cached_property
     def basic_projection(self) -> Program:
-        """Return the program `basic_projection` (see the class)."""
+        """Return the program for projected q and v, and for a and multipliers, which are 0 for dependent rows."""
         n, position = self.system.n_q, self.position_projection.arrays
         v = [(u + change).value() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
         solution = self._accelerations(v)
@@ -467,27 +472,27 @@ def multipliers_of_least_norm(
     factors of [M G^T; G 0]. Dependent row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of G^T
     is spanned by e_i - sum_k Z_ik e_k. The component of lam in this space is subtracted.
     """
-    nothing = Affine(graph, 0.0, {})
-    lam = [nothing] * len(all_rows)
+    zero = Affine(graph, 0.0, {})
+    lam = [zero] * len(all_rows)
     for k, value in zip(rows, independent, strict=True):
         lam[k] = value
     dependent = [k for k in range(len(lam)) if k not in rows]
-    Z = [solve([*all_rows[k], *([nothing] * len(rows))])[len(all_rows[k]) :] for k in dependent]
+    Z = [solve([*all_rows[k], *([zero] * len(rows))])[len(all_rows[k]) :] for k in dependent]
     gram = {
         (i, j): sum((x * y for x, y in zip(z, w, strict=True)), Affine(graph, float(i == j), {}))
         for i, z in enumerate(Z)
         for j, w in enumerate(Z)
     }
-    parts = [sum((-(x * y) for x, y in zip(z, independent, strict=True)), nothing) for z in Z]
-    for row, z, part in zip(dependent, Z, Factors(gram, len(Z), len(Z)).solve(parts), strict=True):
-        lam[row] = lam[row] - part
+    components = [sum((-(x * y) for x, y in zip(z, independent, strict=True)), zero) for z in Z]
+    for row, z, component in zip(dependent, Z, Factors(gram, len(Z), len(Z)).solve(components), strict=True):
+        lam[row] = lam[row] - component
         for k, x in zip(rows, z, strict=True):
-            lam[k] = lam[k] + part * x
+            lam[k] = lam[k] + component * x
     return lam
 
 
 class Solution:
-    """Programs that solve M a + G^T lam = r with G a = c in two parts: factors, stored in an array, and solution.
+    """Programs that solve M a + G^T lam = r, G a = c in two steps: factors, stored in an array, and solution with them.
 
     Parameters
     ----------
@@ -518,28 +523,28 @@ class Solution:
         forms = [form for k in used for form in equations.all_rows[k]] + [*(mass.flat if refined else ())]
         forms += [form for block in factors.blocks for row in block.inverse for form in row]
         forms += [form for block in factors.blocks for _, row in block.below for form in row]
-        factors_kept = sorted({i for form in forms for i in form.terms})
-        shared = _shared_quantities(equations.graph, factors_kept, more)
-        self.stored = {i: k for k, i in enumerate([*factors_kept, *shared])}
-        kept = [equations.graph.quantity(i) for i in self.stored]
-        self.kept = Program(equations.graph, {"kept": kept}, equations.conditions)
+        factor_quantities = sorted({i for form in forms for i in form.terms})
+        shared = _shared_quantities(equations.graph, factor_quantities, more)
+        self.stored = {i: k for k, i in enumerate([*factor_quantities, *shared])}
+        stored = [equations.graph.quantity(i) for i in self.stored]
+        self.kept = Program(equations.graph, {"kept": stored}, equations.conditions)
         self.graph = Graph()
         self._r, self._c = self.graph.inputs(self._n, False), self.graph.inputs(n_rows, False)
-        places = [only_quantity(form) for form in self.graph.inputs(len(factors_kept), False)]
+        inputs = [only_quantity(form) for form in self.graph.inputs(len(factor_quantities), False)]
 
-        def here(form: Affine) -> Affine:
-            return Affine(self.graph, form.constant, {places[self.stored[i]]: x for i, x in form.terms.items()})
+        def in_new_graph(form: Affine) -> Affine:
+            return Affine(self.graph, form.constant, {inputs[self.stored[i]]: x for i, x in form.terms.items()})
 
         self._blocks = [
             Block(
                 block.places,
-                [[here(x) for x in row] for row in block.inverse],
-                [(j, [here(x) for x in row]) for j, row in block.below],
+                [[in_new_graph(x) for x in row] for row in block.inverse],
+                [(j, [in_new_graph(x) for x in row]) for j, row in block.below],
             )
             for block in factors.blocks
         ]
-        self._rows = {k: [here(x) for x in equations.all_rows[k]] for k in used}
-        self._mass = [[here(x) for x in row] for row in mass] if refined else []
+        self._rows = {k: [in_new_graph(x) for x in equations.all_rows[k]] for k in used}
+        self._mass = [[in_new_graph(x) for x in row] for row in mass] if refined else []
         self._nothing = Affine(self.graph, 0.0, {})
         self.solved = self._solution_program()
 
@@ -563,7 +568,7 @@ class Solution:
 
     @cached_property
     def least(self) -> Program:
-        """Return the program `least` (see the class)."""
+        """Return the program for "lam", the multipliers of least norm."""
         rows = [self._rows.get(k, []) for k in range(len(self._c))]
         return Program(
             self.graph,
@@ -571,13 +576,13 @@ class Solution:
         )
 
 
-def _shared_quantities(graph: Graph, kept: Sequence[int], more: Sequence[Program]) -> list[int]:
-    """Return the quantities on which `kept` depend, except `kept`, and which the programs `more` use, too."""
-    computed = set(graph.needed_by(map(graph.quantity, kept)))
-    used = {i for outputs in more for form in outputs.forms for i in form.terms}
-    for outputs in more:
-        for j in outputs.quantities(computed):
+def _shared_quantities(graph: Graph, factors: Sequence[int], more: Sequence[Program]) -> list[int]:
+    """Return the quantities on which `factors` depend and which the programs `more` use, too, without `factors`."""
+    computed = set(graph.needed_by(map(graph.quantity, factors)))
+    used = {i for program in more for form in program.forms for i in form.terms}
+    for program in more:
+        for j in program.quantities(computed):
             operation = graph.operations[j]
             assert operation is not None
             used |= {i for form in operation[1:] if isinstance(form, Affine) for i in form.terms}
-    return sorted(used & computed - set(kept))
+    return sorted(used & computed - set(factors))

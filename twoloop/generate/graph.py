@@ -26,16 +26,17 @@ from twoloop.kernels.evaluation import operations as op
 
 # largest number of operations of a derived program or a series: tracing more would take longer than most runs
 MOST_OPERATIONS = 20_000
-# Constant factors are taken out of a product unless they might underflow or overflow: unless their product is below
-# LEAST_FACTOR or above its inverse, or the product is part of a power with an exponent above HIGH_POWER.
-LEAST_FACTOR, HIGH_POWER = 1e-100, 8
+# Constant factors are taken out of a product unless they might underflow or overflow: the product of the factors must
+# be between MIN_FACTOR and its inverse, and a power of which the product is part has an exponent of at most HIGH_POWER.
+MIN_FACTOR, HIGH_POWER = 1e-100, 8
+# reasons for refusing a callback: a comparison or conversion of an expression, and a conversion by float()
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 # functions of `math` that also accept Parameters
 SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
 _equal = float.__eq__  # comparison of the current values of floats or Parameters, which refuse ==
-_size = float.__abs__  # absolute value as a plain float, also for a Parameter
+_magnitude = float.__abs__  # absolute value as a plain float, also for a Parameter
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
 
@@ -116,7 +117,7 @@ class Graph(Symbolic):
         return self.quantity(quantity)
 
     def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the quantities needed for expressions, arguments first, except inputs and `available` quantities."""
+        """Return the indices of quantities needed for `forms`, arguments first, without inputs and `available` ones."""
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms]
         while stack:
@@ -138,7 +139,7 @@ class Graph(Symbolic):
         return [form for form in (self.operations[i] or ())[1:] if isinstance(form, Affine)]
 
     def in_order_of_use(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the quantities of `needed_by` in another order: each just before its first use."""
+        """Return the indices of the quantities of `needed_by`, each just before its first use."""
         order: list[int] = []
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms][::-1]
@@ -154,14 +155,14 @@ class Graph(Symbolic):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a b as a multiple of a recorded product of normalized factors, which other multiples share."""
+        """Return a b as a multiple of the product of normalized factors, which is recorded once for all multiples."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
             return a.times(b.constant)
-        (scale, first), (scale_too, second) = a.normalised(), b.normalised()
-        factor = scale * scale_too
-        if not LEAST_FACTOR < _size(factor) < 1.0 / LEAST_FACTOR:
+        (scale_a, first), (scale_b, second) = a.normalised(), b.normalised()
+        factor = scale_a * scale_b
+        if not MIN_FACTOR < _magnitude(factor) < 1.0 / MIN_FACTOR:
             first, second, factor = a, b, 1.0
         return self._product(first, second).times(factor)
 
@@ -173,7 +174,7 @@ class Graph(Symbolic):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, form: "Affine", high: bool) -> "Affine":
-        """Return the square of an expression; `high`: as part of a power with an exponent above HIGH_POWER."""
+        """Return the square of an expression; `high`: it is part of a power with an exponent above HIGH_POWER."""
         return self._product(form, form) if high and form.terms else self.product(form, form)
 
 
@@ -219,7 +220,7 @@ class Affine:
         return any(self.graph.late[i] for i in self.terms)
 
     def times(self, factor: float) -> "Affine":
-        """Return the expression times a factor."""
+        """Return the expression multiplied by a number."""
         if type(factor) is float and factor == 1.0:
             return self
         if _equal(factor, 0.0):
@@ -240,6 +241,7 @@ class Affine:
         return factor, Affine(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
     def _lifted(self, other: Any) -> "Affine":
+        """Return an operand, a number or an expression, as an expression; refuse expressions of other graphs."""
         if type(other) is not Affine:
             return Affine(self.graph, number(other), {})
         if other.graph is not self.graph:
@@ -254,14 +256,16 @@ class Affine:
         terms = dict(self.terms)
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
-            if _size(total) <= CANCELLED * _size(c):
+            if _magnitude(total) <= CANCELLED * _magnitude(c):
                 terms.pop(i, None)  # the term may be absent: c may have underflowed to zero
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
             return Affine(self.graph, self.constant, terms)
         constant = self.constant + other.constant
-        return Affine(self.graph, 0.0 if _size(constant) <= CANCELLED * _size(other.constant) else constant, terms)
+        return Affine(
+            self.graph, 0.0 if _magnitude(constant) <= CANCELLED * _magnitude(other.constant) else constant, terms
+        )
 
     __radd__ = __add__
 
@@ -368,6 +372,7 @@ class Affine:
         return self.graph.operation(op.ARCTANGENT, self, self * self + 1.0)
 
     def _branching(self, *_: Any) -> Any:
+        """Refuse an operation that needs a definite value: comparison, conversion, rounding, hash or pickling."""
         self.graph.refuse(BRANCHES)
 
     def __float__(self) -> float:
@@ -469,14 +474,14 @@ class Derivative:
         while i not in self._derivatives:
             operation = self.graph.operations[stack[-1]]
             forms = () if operation is None else [form for form in operation[1:] if isinstance(form, Affine)]
-            unknown = [
+            missing = [
                 k
                 for form in forms
                 for k in form.terms
                 if k not in self._derivatives and self.graph.inputs_of[k] & self._changing
             ]
-            if unknown:
-                stack += unknown
+            if missing:
+                stack += missing
                 continue
             k = stack.pop()
             if k not in self._derivatives:

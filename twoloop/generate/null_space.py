@@ -4,11 +4,11 @@ With G = [G_d G_i], a_d = g + B a_i for B = -G_d^-1 G_i and g = G_d^-1 gamma. Th
 a_i = T^T (Q - M g) with T = [B; 1]. This takes about half the operations of an elimination that begins with M, and M
 may be singular in directions that the constraints exclude.
 
-Pivots are chosen once. If a pivot becomes small during a run, a condition of the generated code fails, and a is
-computed by the elimination that begins with M.
+Pivots are chosen once. If a pivot becomes small during a run, a condition of the generated code fails, and the
+accelerations are computed by the elimination that begins with M.
 
-Bodies of little inertia beside heavy ones make pivots of very different size, whatever rows are added to M. There, one
-step of refinement solves for the residual of the solution, and restores the digits that elimination loses.
+Bodies of little inertia beside heavy ones make pivots of very different size, whatever rows are added to M. In this
+case, one step of refinement solves for the residual of the solution, and restores the digits that elimination loses.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,8 +22,9 @@ from twoloop.generate.graph import Affine, is_zero
 
 Array = NDArray[np.float64]
 
-# relative: largest change of accelerations or multipliers by a step of refinement that counts as rounding. Along a run
-# the loss grew by up to 300 in random models. That of the governor, 6e-11, is 4e-12 along its run.
+# largest change of accelerations or multipliers by a step of refinement, relative to the largest of them, that counts
+# as rounding. In random models the change grew by a factor of up to 300 during a run; for the governor, which needs no
+# refinement, it is 6e-11 at the start and 4e-12 during the run.
 ROUNDING_OF_SOLUTION = 1e-10
 
 
@@ -76,8 +77,11 @@ class Factors:
             self.blocks.append(Block(places, inverse, below))
 
     def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a block of pivots; add its conditions. `alone`: pivots of G without other rows of G."""
-        diagonal = [None if each is None else each.value() for each in alone]
+        """Return the inverse of a 1x1 or 2x2 block of pivots; append to `conditions` or `positive`.
+
+        `alone`: for a row of G, its pivot without the other rows of G; None for a row of M.
+        """
+        diagonal = [None if pivot is None else pivot.value() for pivot in alone]
         a = pivots[0][0]
         if diagonal[0] is None:
             self.positive.append(a)
@@ -182,7 +186,7 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
 
 
 def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
-    """Eliminate rows from the graph of entries: connect the neighbours of the rows, and return these neighbours."""
+    """Eliminate rows from the elimination graph: connect their neighbours to each other, and return these."""
     new_neighbours = set().union(*(neighbours[i] for i in places)) - set(places)
     for j in new_neighbours:
         neighbours[j] = (neighbours[j] | new_neighbours) - {*places, j}
@@ -212,7 +216,7 @@ class DependentCoordinates:
     gamma : sequence of Affine
     blocks : sequence of (rows, columns)
         Rows and columns of the pivots, in the order of elimination.
-    most : int
+    max_added : int
         Largest number of operations that may be added to the graph.
 
     Attributes
@@ -229,12 +233,12 @@ class DependentCoordinates:
     Raises
     ------
     NotReduced
-        If a pivot is always zero, or if the elimination takes more than `most` operations.
+        If a pivot is always zero, or if the elimination takes more than `max_added` operations.
     """
 
-    def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, most: int):
+    def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, max_added: int):
         self._n, graph = len(rows[0]), rows[0][0].graph
-        self._graph, self._most = graph, len(graph.operations) + most
+        self._graph, self._most = graph, len(graph.operations) + max_added
         self._zero, self._one = Affine(graph, 0.0, {}), Affine(graph, 1.0, {})
         self._rows: list[Terms] = [
             {j: entry for j, entry in enumerate([*row, right]) if not is_zero(entry)}
@@ -248,42 +252,42 @@ class DependentCoordinates:
         self.independent = sorted(self._free)
         self.T: list[Terms] = [{j: self._one} if j in self._free else {} for j in range(self._n)]
         self.g = [self._zero] * self._n
-        for places, columns in reversed(blocks):
-            for i, j in zip(places, columns, strict=True):
+        for block_rows, columns in reversed(blocks):
+            for i, j in zip(block_rows, columns, strict=True):
                 self._substitute(j, self._rows[i])
 
-    def _eliminate(self, places: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve one or two rows (`places`) for as many coordinates (`columns`); eliminate these from the other rows."""
+    def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
+        """Solve one or two rows of [G gamma] for as many coordinates, `columns`; eliminate them from the other rows."""
         self.check()
-        block = [[self._rows[i].get(j, self._zero) for j in columns] for i in places]
+        block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)
-        other_columns = sorted({j for i in places for j in self._rows[i]} - set(columns))
-        entries = {j: [self._rows[i].get(j, self._zero) for i in places] for j in other_columns}
+        other_columns = sorted({j for i in rows for j in self._rows[i]} - set(columns))
+        entries = {j: [self._rows[i].get(j, self._zero) for i in rows] for j in other_columns}
         solved = [
-            _nonzero({j: _add_products(self._zero, zip(row, known, strict=True)) for j, known in entries.items()})
+            _nonzero({j: _add_products(self._zero, zip(row, column, strict=True)) for j, column in entries.items()})
             for row in inverse
         ]
-        self._left -= set(places)
+        self._left -= set(rows)
         self._free -= set(columns)
         for k in sorted(self._left):
             row = self._rows[k]
             factors = [row.pop(j, None) for j in columns]
-            for factor, others in zip(factors, solved, strict=True):
-                for j, entry in {} if factor is None else others.items():
+            for factor, solved_row in zip(factors, solved, strict=True):
+                for j, entry in {} if factor is None else solved_row.items():
                     row[j] = row.get(j, self._zero) - factor * entry
             self._rows[k] = _nonzero(row)
-        for i, row in zip(places, solved, strict=True):
+        for i, row in zip(rows, solved, strict=True):
             self._rows[i] = row
         if pivot.terms:
             self._add_conditions(block, columns, pivot, solved)
 
     def check(self, more: int = 0) -> None:
-        """Raise `NotReduced` if the elimination takes more than `most` operations, including `more` later ones."""
+        """Raise `NotReduced` if more than `max_added` operations are added, including `more` that will follow."""
         if len(self._graph.operations) + more > self._most:
             raise NotReduced
 
     def _inverse(self, block: list[list[Affine]]) -> tuple[Affine, list[list[Affine]]]:
-        """Return the determinant of a block and its inverse."""
+        """Return the determinant and the inverse of a 1x1 or 2x2 block; raise NotReduced if it is always singular."""
         if len(block) == 1:
             ((determinant,),) = block
         else:
@@ -360,11 +364,11 @@ def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -
     """Yield pairs of a pivot of the reduced mass matrix `matrix` and its lower bound, relative to a diagonal entry."""
     pivots = iter(factors.positive)
     for places, _, _ in factors.blocks:
-        alone: Affine | None = None
+        first_pivot: Affine | None = None
         for place in places:
             pivot = next(pivots)
-            scale = matrix[place, place] if alone is None else alone * matrix[place, place]
-            alone = pivot
+            scale = matrix[place, place] if first_pivot is None else first_pivot * matrix[place, place]
+            first_pivot = pivot
             if pivot.terms:
                 yield pivot, scale.times(0.0 if pivot.key == scale.key else MIN_PIVOT_SQUARE)
 
@@ -381,13 +385,14 @@ def _nonzero(entries: Terms) -> Terms:
 
 
 def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
-    """Return whether the elimination loses more digits at a position than rounding: then solutions are refined.
+    """Return whether the elimination with a PivotChoice loses so many digits at a position that refinement is needed.
 
-    The loss is the change of a solution by one step of refinement, for forces, and for motion that the rows prescribe.
+    The loss is the change of a solution by one step of refinement: one solution for forces (gamma = 0), and one for
+    motion that the rows prescribe (Q = 0). `mass` (n_q, n_q) and G (n_c + n_a, n_q) are values at the position.
     """
     rows, added, n = G[list(choice.rows)], G[list(choice.added)], len(mass)
-    more = mass + choice.scale * added.T @ added
-    factors = np.block([[more, rows.T], [rows, np.zeros((len(rows), len(rows)))]])
+    mass_with_rows = mass + choice.scale * added.T @ added
+    factors = np.block([[mass_with_rows, rows.T], [rows, np.zeros((len(rows), len(rows)))]])
     for k in range(len(factors)):
         if not 0.0 < abs(factors[k, k]) < np.inf:
             return True
@@ -395,16 +400,16 @@ def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
         factors[k + 1 :, k + 1 :] -= np.outer(factors[k + 1 :, k], factors[k, k + 1 :])
 
     def solve(right: Array) -> Array:
-        halfway = solve_triangular(factors, right, lower=True, unit_diagonal=True, check_finite=False)
-        return np.asarray(solve_triangular(factors, halfway, check_finite=False))
+        intermediate = solve_triangular(factors, right, lower=True, unit_diagonal=True, check_finite=False)
+        return np.asarray(solve_triangular(factors, intermediate, check_finite=False))
 
     a, b = np.random.default_rng(1).choice((-1.0, 1.0), (2, n))
     force, gamma = np.column_stack([mass @ a, np.zeros(n)]), np.outer(rows @ b, (0.0, 1.0))
     solution = solve(np.vstack([force + choice.scale * added.T @ np.outer(added @ b, (0.0, 1.0)), gamma]))
     r, c = force - mass @ solution[:n] - rows.T @ solution[n:], np.outer(added @ b, (0.0, 1.0)) - added @ solution[:n]
     change = solve(np.vstack([r + choice.scale * added.T @ c, gamma - rows @ solution[:n]]))
-    (moved, turned), (largest, forces) = ((abs(x[:n]).max(), abs(x[n:]).max(axis=0)) for x in (change, solution))
-    return not (moved <= ROUNDING_OF_SOLUTION * largest and (turned <= ROUNDING_OF_SOLUTION * forces).all())
+    (change_a, change_lam), (max_a, max_lam) = ((abs(x[:n]).max(), abs(x[n:]).max(axis=0)) for x in (change, solution))
+    return not (change_a <= ROUNDING_OF_SOLUTION * max_a and (change_lam <= ROUNDING_OF_SOLUTION * max_lam).all())
 
 
 def solve_refined(
@@ -415,30 +420,31 @@ def solve_refined(
     r: Sequence[Affine],
     c: Sequence[Affine],
 ) -> list[Affine]:
-    """Return a and the multipliers of the independent rows for M a + G^T lam = r, G a = c, refined if `choice` says so.
+    """Solve M a + G^T lam = r, G a = c for a and lam of the independent rows, with refinement if `choice.refined`.
 
-    `solve` uses factors with rows added to M, as by `choice`; `mass` and `rows` are M and G without them.
+    `solve`: solution of a linear system with the factors of [M + s g^T g, G^T; G 0], where rows g are added to M as in
+    PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.
     """
 
-    def once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:
+    def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:
         right = list(r)
         for k in choice.added:
             for i, entry in enumerate(rows[k]):
                 right[i] = right[i] + (entry * c[k]).times(choice.scale)
         return solve([*right, *(c[k] for k in choice.rows)])
 
-    def minus(total: Affine, products: Iterable[tuple[Affine, Affine]]) -> Affine:
+    def subtract_products(total: Affine, products: Iterable[tuple[Affine, Affine]]) -> Affine:
         for x, y in products:
             total = total if is_zero(x) else total - x * y
         return total.value()
 
-    solution, n = once(r, c), len(r)
+    solution, n = solve_once(r, c), len(r)
     if not choice.refined:
         return solution
     a, lam = solution[:n], dict(zip(choice.rows, solution[n:], strict=True))
-    left = [
-        minus(force, [*zip(row, a, strict=True), *((rows[k][i], x) for k, x in lam.items())])
+    residual_r = [
+        subtract_products(force, [*zip(row, a, strict=True), *((rows[k][i], x) for k, x in lam.items())])
         for i, (force, row) in enumerate(zip(r, mass, strict=True))
     ]
-    off = {k: minus(c[k], zip(rows[k], a, strict=True)) for k in {*choice.rows, *choice.added}}
-    return [x + change for x, change in zip(solution, once(left, off), strict=True)]
+    residual_c = {k: subtract_products(c[k], zip(rows[k], a, strict=True)) for k in {*choice.rows, *choice.added}}
+    return [x + change for x, change in zip(solution, solve_once(residual_r, residual_c), strict=True)]
