@@ -19,13 +19,13 @@ Array = NDArray[np.float64]
 # product of powers of atoms, as pairs of the index of an atom and an exponent; the empty tuple is the number 1
 Powers = tuple[tuple[int, float], ...]
 
-MOST_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
+MAX_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
-CANCELLED = 8.0 * 2.0**-52  # largest sum of two terms, relative to a term, that counts as a rounding error of zero
+CANCELLED = 8.0 * 2.0**-52  # largest sum of two terms, relative to one of them, that counts as zero: rounding error
 NUMBERS = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # functions with operators of Python, by the names of NumPy's functions
+OPERATORS: dict[str, Callable[..., Any]] = {  # functions that use only operators of Python, by the names in NumPy
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,
@@ -38,6 +38,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {  # functions with operators of Pyth
     "reciprocal": lambda x: 1.0 / x,
     "hypot": lambda x, y: (x * x + y * y) ** 0.5,
 }
+# names in FUNCTIONS and OPERATORS of functions that have other names in `math` or NumPy
 NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power", "true_divide": "divide"}
 
 
@@ -97,12 +98,12 @@ class ParameterTape(Symbolic):
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
         self.atoms: list[Any] = [None] * len(values)
-        self.merged: dict[tuple[Powers, Powers], Powers] = {}  # cache of products of two products
+        self.merged: dict[tuple[Powers, Powers], Powers] = {}  # cache: product of two Powers, by the pair of factors
         self._places: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
-        for place in varying:
-            self.parameters[place] = Parameter(float(values[place]), self, 1.0, ((place, 1.0),))
+        for i in varying:
+            self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
         """Return the atom with a definition (sum or function) as Powers; add it unless an equal one exists."""
@@ -112,7 +113,7 @@ class ParameterTape(Symbolic):
         return ((self._places[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """Return a number as a sum: a dict of the coefficients of its terms by their Powers."""
+        """Return a number as a sum of terms: a dict from the Powers of each term to its coefficient."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (place, exponent), *further = number.powers
@@ -122,7 +123,7 @@ class ParameterTape(Symbolic):
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def on(self, parameters: Array) -> Callable[[float], Any]:
-        """Return a function that evaluates a number for other parameters; its result is an array as in `products`."""
+        """Return a function that evaluates a float or Parameter for other parameters, with results as in `products`."""
         product = self.products(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
@@ -189,7 +190,7 @@ class Parameter(float):
             self._refuse_decision(f"it calls numpy.{ufunc.__name__} on its parameters")
             plain = (float(each) if type(each) is Parameter else each for each in inputs)
             return getattr(ufunc, method)(*plain, **options)
-        return elementwise(lambda *given: apply_function(name, *given), inputs, out)
+        return elementwise(lambda *arguments: apply_function(name, *arguments), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
         """Refuse an operation whose result depends on the current value, unless a module of `generate` called it."""
@@ -198,7 +199,7 @@ class Parameter(float):
             self.tape.refuse(reason)
 
     def to(self, exponent: float) -> "Parameter":
-        """Return this number to the power of `exponent`, a whole number other than 0."""
+        """Return this number raised to a nonzero whole number."""
         powers = tuple([(place, exponent * power) for place, power in self.powers])
         return Parameter(_as_float(self) ** exponent, self.tape, self.scale**exponent, powers)
 
@@ -230,8 +231,8 @@ def _sum(a: float, b: float) -> float:
             terms.pop(powers, None)
         else:
             terms[powers] = total
-    if len(terms) > MOST_TERMS:
-        tape.refuse(f"it adds up more than {MOST_TERMS} terms of its parameters")
+    if len(terms) > MAX_TERMS:
+        tape.refuse(f"it adds up more than {MAX_TERMS} terms of its parameters")
     if len(terms) < 2:
         ((powers, c),) = terms.items() or (((), 0.0),)
         return Parameter(value, tape, c, powers) if powers else c
@@ -280,7 +281,7 @@ def _tape_of(*numbers: float) -> ParameterTape:
 
 
 def apply_function(name: str, *arguments: Any) -> Any:
-    """Return the value of a function of NumPy or `math`, given its name; a Parameter if an argument is one."""
+    """Return the value of a function of NumPy or `math`, by its name; a Parameter if an argument is a Parameter."""
     name = NAMES.get(name, name)
     if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol has its own operators
         return OPERATORS[name](*arguments)
@@ -349,7 +350,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _operand(value: Any) -> Any:
-    """Return an array, a number or a symbol as an array of objects; symbols refuse isinstance()."""
+    """Return an array, a number or a symbol as an array of objects; not by isinstance(), which symbols refuse."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)
@@ -369,6 +370,6 @@ def number(value: Any) -> float:
 
 
 def function_of_number(name: str) -> Callable[[float], float]:
-    """Return a function of a float or Parameter, given its name in `math`; its result is of the same type."""
+    """Return the function with a name in `math`, extended to Parameters, for which it returns a Parameter."""
     function = getattr(math, name)
     return lambda x: apply_function(name, x) if type(x) is Parameter else function(x)

@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a traced function of the user is compared with calls of the function
-TIME_SPACING = 0.37  # time between two of these states, s: no usual period of a force
-MAX_TRACE_DIFFERENCE = 1e-10  # largest relative difference between a trace and a call, for rounding errors
+TIME_SPACING = 0.37  # time between successive compared states, s: unlikely to be a period of a force
+MAX_TRACE_DIFFERENCE = 1e-10  # largest relative difference between trace and call that counts as a rounding error
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
@@ -40,7 +40,7 @@ class Algebra(Generic[T]):
     functions : mapping
         By kinds of operations with one argument: functions from value to value.
     values : dict
-        Values of the quantities that were defined, by the indices of the quantities.
+        Values of the quantities defined so far, by index of the quantity.
     """
 
     functions: Mapping[int, Callable[[T], T]]
@@ -57,7 +57,7 @@ class Algebra(Generic[T]):
         raise NotImplementedError
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> T:
-        """Return the result of an operation; operations other than products ignore their second argument."""
+        """Return the result of an operation; only products use the second argument."""
         argument = self.affine(first)
         if kind == op.PRODUCT:
             assert second is not None
@@ -69,17 +69,14 @@ class Algebra(Generic[T]):
         self.values[quantity] = value
 
     def run(self, graph: Graph, quantities: Iterable[int]) -> None:
-        """Compute and define quantities, in the given order."""
+        """Compute the quantities with these indices, in this order, and store their values."""
         for i in quantities:
             operation = graph.operations[i]
             assert operation is not None
             self.define(i, self.operation(*operation))
 
     def outputs(self, program: "Program") -> list[list[T]]:
-        """Return the arrays of a program, computed from its inputs, which must be defined.
-
-        The quantities of its conditions are computed, too.
-        """
+        """Return the arrays of a program with defined inputs; compute the quantities of its conditions, too."""
         self.run(program.graph, program.quantities())
         return [[self.affine(form) for form in forms] for forms in program.arrays.values()]
 
@@ -102,13 +99,13 @@ class Program:
     conditions: list[tuple[Affine, Affine]] = field(default_factory=list)
 
     def run(self, algebra: Algebra[T], inputs: Sequence[T] = ()) -> list[list[T]]:
-        """Return the arrays of the program in an algebra; `inputs`: values of its inputs, unless they are defined."""
+        """Return the arrays of the program in an algebra; `inputs`: values of its inputs that are not defined yet."""
         for quantity, value in enumerate(inputs):
             algebra.define(quantity, value)
         return algebra.outputs(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return the quantities that must be computed for arrays and conditions, see `Graph.needed_by`."""
+        """Return the indices of the quantities needed for arrays and conditions, see `Graph.needed_by`."""
         return self.graph.needed_by(self.forms, available)
 
     def cost(self) -> int:
@@ -195,16 +192,16 @@ class OperationTable(NamedTuple):
         needed = graph.needed_by(results.values())
         node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
-        operations += [(RESULT, form, None, place) for place, form in results.items()]
+        operations += [(RESULT, form, None, index) for index, form in results.items()]
         terms: list[tuple[int, float]] = []
         rows, constants = [], []
-        for kind, first, second, place in operations:
+        for kind, first, second, index in operations:
             begin = len(terms)
             terms += [(node[i], c) for i, c in first.terms.items()]
             middle = len(terms)
             if second is not None:
                 terms += [(node[i], c) for i, c in second.terms.items()]
-            rows.append((kind, place, begin, middle, len(terms)))
+            rows.append((kind, index, begin, middle, len(terms)))
             constants += [first.constant, 0.0 if second is None else second.constant]
         return cls(
             np.array(rows, dtype=np.int64).reshape(-1, N_COLUMNS),
@@ -240,13 +237,13 @@ class OperationTable(NamedTuple):
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
 LITERALS = (0.0, 1.0, -1.0)  # values of coefficients that are literals in the code, as they need no multiplication
-ROUNDING = 8.0 * 2.0**-52  # relative difference from one of LITERALS up to which a coefficient equals it (rounding)
+ROUNDING = 8.0 * 2.0**-52  # largest difference from 1 or -1 at which a coefficient becomes this literal: rounding error
 
 
 class Coefficient(float):
-    """Coefficient that the code reads from an array, at index `place`; it equals only itself, even if values are equal.
+    """Coefficient that generated code reads from an array, at index `place`; it equals only itself, not its value.
 
-    `varies`: whether it is in the array of those coefficients that vary with parameters.
+    `varies`: whether the array is the one of the coefficients that vary with parameters.
     """
 
     __slots__ = ("place", "varies")
@@ -272,8 +269,8 @@ class Coefficient(float):
 class Coefficients:
     """Assignment of array indices to the coefficients of expressions, in the order of their first use.
 
-    Equal expressions have the same indices. `apart`: coefficients that vary with parameters are numbered separately,
-    for an array of their own, because their values differ between SIMD lanes.
+    Equal expressions have the same indices. `apart`: whether coefficients that vary with parameters have an array, and
+    indices, of their own, because their values differ between SIMD lanes.
     """
 
     def __init__(self, apart: bool = False) -> None:
@@ -311,16 +308,16 @@ class Coefficients:
             numbers = self._of_forms[form.key] = self.of(tuple(form.terms.items()), form.constant)
         return numbers
 
-    def structure(self, program: Program, given: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
+    def structure(self, program: Program, stored: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
         """Yield everything that the code for a program depends on, except the values of coefficients.
 
-        `given`: indices in memory of the quantities that are loaded instead of computed.
+        `stored`: indices in memory of the quantities that are loaded instead of computed.
         """
         graph, forms = program.graph, program.forms
-        needed = graph.needed_by(forms, given)
+        needed = graph.needed_by(forms, stored)
         name: dict[int, Any] = {i: f"input {i}" for i, each in enumerate(graph.operations) if each is None}
         name |= {i: k for k, i in enumerate(needed)}
-        name |= {i: f"kept {place}" for i, place in given.items()}
+        name |= {i: f"kept {place}" for i, place in stored.items()}
 
         def described_form(form: Affine) -> Any:
             terms, constant = self.of_form(form)
@@ -336,9 +333,9 @@ class Coefficients:
         """Return the number of coefficients that vary with parameters."""
         return len(self._varying)
 
-    def for_parameters(self, record: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    def for_parameters(self, tape: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the values (n_runs, n_varying) of the coefficients that vary, for parameters (n_runs, n_p)."""
-        return record.evaluate(list(self._varying.values()), parameters)
+        return tape.evaluate(list(self._varying.values()), parameters)
 
     def _number(self, value: float) -> float:
         if type(value) is Parameter:  # no literal, even if its current value is 0 or 1

@@ -24,9 +24,10 @@ Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
 # largest number of entries of M and [C_q; A] for which a series is traced, unless the user chooses the Taylor method
-MOST_ENTRIES = 200_000
+MAX_ENTRIES = 200_000
 
-READ = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
+# callbacks from which a series is derived
+USED_CALLBACKS = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
 
 
 class Sums(NamedTuple):
@@ -74,7 +75,8 @@ class SeriesProgram:
     rows, row_places : Sums, ndarray
         G v + G_t without the terms that are a constant times v_i: the rows that are then not zero, and their indices.
     balance, balance_places : Sums, ndarray
-        Q - G^T lam - M a without the terms that are a constant times lam_i or a_i: as for `rows`.
+        Q - G^T lam - M a without the terms that are a constant times lam_i or a_i: the entries that are then not zero,
+        and their indices.
     traced : Traced or None
         Traces of the callbacks.
     """
@@ -97,12 +99,12 @@ class SeriesProgram:
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
         """Return a copy of the program with coefficients for the parameters of one system."""
 
-        def sums(given: Sums) -> Sums:
-            coefficient, constant = evaluate(given.coefficient), evaluate(given.constant)
-            more_coefficient = evaluate(given.more_coefficient)
-            return given._replace(coefficient=coefficient, constant=constant, more_coefficient=more_coefficient)
+        def sums(expressions: Sums) -> Sums:
+            coefficient, constant = evaluate(expressions.coefficient), evaluate(expressions.constant)
+            more_coefficient = evaluate(expressions.more_coefficient)
+            return expressions._replace(coefficient=coefficient, constant=constant, more_coefficient=more_coefficient)
 
-        early, late = (Table(each.groups, sums(each.first), sums(each.second)) for each in (self.early, self.late))
+        early, late = (Table(table.groups, sums(table.first), sums(table.second)) for table in (self.early, self.late))
         rows, balance = sums(self.rows), sums(self.balance)
         assert self.traced is not None
         traced = self.traced.of(system, evaluate)
@@ -120,8 +122,8 @@ class SeriesProgram:
 
 
 def is_quick(system: ConstrainedSystem) -> bool:
-    """Return whether tracing a series takes about a second at most: all entries of matrices are traced."""
-    return system.n_q * (system.n_q + system.n_c + system.n_a) <= MOST_ENTRIES
+    """Return whether M, C_q and A have so few entries, zeros among them, that tracing a series takes about a second."""
+    return system.n_q * (system.n_q + system.n_c + system.n_a) <= MAX_ENTRIES
 
 
 def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesProgram:
@@ -156,20 +158,20 @@ def series_program(
     n, n_rows = system.n_q, system.n_c + system.n_a
     graph, v = equations.graph, equations.v
     a, lam = graph.inputs(n, True), graph.inputs(n_rows, True)
-    mass, force, jacobian, nonholonomic, rate, nonholonomic_rate = map(equations.of, READ)
+    mass, force, jacobian, nonholonomic, rate, nonholonomic_rate = map(equations.of, USED_CALLBACKS)
     sums = _sums_of(graph)
     arrays = np.vstack([jacobian, nonholonomic]), mass, np.append(rate, nonholonomic_rate), force
     G, mass, rates, force = (elementwise(partial(_without_sums, sums), [each]) for each in arrays)
     row_products: dict[Any, Any] = {}
     zero = Affine(graph, 0.0, {})
-    kept = [i for i in range(n_rows) if independent is None or i in independent]
+    used_rows = [i for i in range(n_rows) if independent is None or i in independent]
     rows = [zero] * n_rows
-    for i in kept:
+    for i in used_rows:
         rows[i] = _sum_of_products(graph, G[i], v, rates[i], row_products, of_rates=True)
     reaction_products: dict[Any, Any] = {}
     balance = []
     for i in range(n):
-        factors, multipliers = [-G[k, i] for k in kept], [lam[k] for k in kept]
+        factors, multipliers = [-G[k, i] for k in used_rows], [lam[k] for k in used_rows]
         factors += [-each for each in mass[i]]
         total = _sum_of_products(graph, factors, [*multipliers, *a], force[i], reaction_products, of_rates=False)
         balance.append(total)
@@ -179,7 +181,7 @@ def series_program(
 
 
 def _sums_of(graph: Graph) -> dict[int, Affine]:
-    """Return a dict from quantities that are sums to their expressions, which replace them: sums need no recurrence."""
+    """Return the expressions of quantities that are sums, by quantity; they replace it, as sums need no recurrence."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -189,11 +191,11 @@ def _sums_of(graph: Graph) -> dict[int, Affine]:
 
 def _without_sums(sums: dict[int, Affine], form: Affine) -> Affine:
     """Return an expression in which quantities that are sums are replaced by their terms."""
-    named = [i for i in form.terms if i in sums]
-    if not named:
+    summed = [i for i in form.terms if i in sums]
+    if not summed:
         return form
-    total = _without(form, named)
-    for i in named:
+    total = _without(form, summed)
+    for i in summed:
         total = total + sums[i].times(form.terms[i])
     return total
 
@@ -278,39 +280,39 @@ def _assemble(
         ]
         for operations, products in ((early, row_products), (late, reaction_products))
     ]
-    place = {i: k for k, i in enumerate(inputs)}
+    nodes = {i: k for k, i in enumerate(inputs)}
     for groups in tables:
         for _, members in groups:
-            for node, *_ in members:
-                place[node] = len(place)
+            for quantity, *_ in members:
+                nodes[quantity] = len(nodes)
     v_and_a, lam_and_a = set(inputs[1 + n : 1 + 3 * n]), set(inputs[1 + 2 * n :])
     return SeriesProgram(
         n,
         n_rows,
-        _table(tables[0], place),
-        _table(tables[1], place),
-        *_nonzero_sums([_without(form, v_and_a) for form in rows], place),
-        *_nonzero_sums([_without(form, lam_and_a) for form in balance], place),
+        _table(tables[0], nodes),
+        _table(tables[1], nodes),
+        *_nonzero_sums([_without(form, v_and_a) for form in rows], nodes),
+        *_nonzero_sums([_without(form, lam_and_a) for form in balance], nodes),
     )
 
 
 def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
-    """Return quantities and operations that expressions need; with the sine of an angle, the cosine is needed, too."""
+    """Return the operations that `forms` need, as (quantity, operation); a sine needs the cosine and vice versa."""
     needed = set(graph.needed_by(forms))
-    pairs = (SINE, COSINE)
-    angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in pairs}
+    trigonometric = (SINE, COSINE)
+    angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trigonometric}
     return [
         (i, each)
         for i, each in enumerate(graph.operations)
-        if each is not None and (i in needed or (each[0] in pairs and each[1].key in angles))
+        if each is not None and (i in needed or (each[0] in trigonometric and each[1].key in angles))
     ]
 
 
-def _nonzero_sums(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return those of some expressions that are not zero, as Sums, and their indices; `place`: index by quantity."""
-    kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
-    sums = _sums([forms[k] for k in kept], place)
-    places = np.array(kept, dtype=np.int64)
+def _nonzero_sums(forms: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
+    """Return the nonzero ones of `forms` as Sums, and their indices in `forms`; `nodes`: node of each quantity."""
+    indices = [k for k, form in enumerate(forms) if form.terms or form.constant]
+    sums = _sums([forms[k] for k in indices], nodes)
+    places = np.array(indices, dtype=np.int64)
     return sums._replace(row=places[sums.row]), places
 
 
@@ -331,12 +333,12 @@ def _groups(operations: list[Any]) -> list[tuple[int, list[Any]]]:
             second = Affine(first.graph, 0.0, {})
         groups.setdefault((level[node], kind), []).append((node, first, second))
     ordered = []
-    for (number, kind), members in sorted(groups.items()):
+    for (depth, kind), members in sorted(groups.items()):
         if kind == COSINE:
             continue
         members.sort(key=_term_counts)  # operations of equal length become neighbours
         if kind == SINE:
-            cosines = {first.key: node for node, first, _ in groups[number, COSINE]}
+            cosines = {first.key: node for node, first, _ in groups[depth, COSINE]}
             members += [(cosines[first.key], first, second) for _, first, second in members]
         ordered.append((kind, members))
     return ordered
@@ -347,9 +349,9 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
     return len(first.terms), len(second.terms)
 
 
-def _table(groups: list[tuple[int, list[Any]]], place: dict[int, int]) -> Table:
+def _table(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> Table:
     members = [each for _, group in groups for each in group]
-    sums = [_sums([each[k] for each in members], place) for k in (1, 2)]
+    sums = [_sums([each[k] for each in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
     for kind, group in groups:
         end = begin + len(group)
@@ -359,8 +361,8 @@ def _table(groups: list[tuple[int, list[Any]]], place: dict[int, int]) -> Table:
     return Table(np.array(rows, dtype=np.int64), *sums)
 
 
-def _sums(forms: list[Affine], place: dict[int, int]) -> Sums:
-    terms = [[(place[i], c) for i, c in form.terms.items()] or [(0, 0.0)] for form in forms]
+def _sums(forms: list[Affine], nodes: dict[int, int]) -> Sums:
+    terms = [[(nodes[i], c) for i, c in form.terms.items()] or [(0, 0.0)] for form in forms]
     more = [(k, *term) for k, each in enumerate(terms) for term in each[1:]]
     return Sums(
         np.array([each[0][0] for each in terms], dtype=np.int64),

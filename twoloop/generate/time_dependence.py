@@ -26,7 +26,7 @@ from twoloop.problem.system import ConstrainedSystem
 BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
 # callbacks whose dependence on the state is analysed
 BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")
-SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations whose results have no short pulses up to MAX_DEGREE
+SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations whose results have no short pulses if degrees are at most MAX_DEGREE
 # largest degree of polynomials in time, or in sines and cosines, without short pulses; cos(t)**100 has pulses
 MAX_DEGREE = 8
 MAX_DEGREE_OF_STATE = 32  # largest degree of polynomials in q and v, and of their roots, without short pulses
@@ -61,7 +61,7 @@ class Dependence(NamedTuple):
 
 
 def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
-    """Return whether forces, C_t or b may have short pulses; True for callbacks that cannot be traced.
+    """Return whether forces, C_t or b may have short pulses in time, and in q and v; true if they cannot be traced.
 
     Functions called in Python may store their arguments: they are traced only if the force was (`force_was_traced`).
     """
@@ -75,7 +75,7 @@ def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
     """Return whether forces may act for a short time, or vary much over a distance shorter than a step.
 
     Quotients and roots may vary in this way: the stages of a long step may evaluate 1 / (1 + (x / w)**2) on its flanks,
-    but not at its peak. They may also evaluate a fast vibration at nearly equal phases.
+    but not at its peak; they may also evaluate a fast vibration at nearly equal phases.
     """
     if any(may_be_short(system, force_was_traced)):
         return True
@@ -103,7 +103,9 @@ def _analyse(system: ConstrainedSystem) -> Any:
 
         graph = equations.graph
         by_state = needed(BY_STATE)
-        short = ShortForces(_is_short_in_time(graph, needed(BY_TIME)), _is_short_in_state(graph, by_state, system.n_q))
+        short = ShortForces(
+            _has_pulses_in_time(graph, needed(BY_TIME)), _has_pulses_in_state(graph, by_state, system.n_q)
+        )
         steep = _is_steep(graph, sorted({*by_state, *needed(BY_TIME)}))
         return Dependence(short, steep, frozenset(graph.traced))
 
@@ -183,27 +185,27 @@ class Rates(Degrees):
         )
 
 
-def _is_short_in_time(graph: Graph, needed: list[int]) -> bool:
-    depending = [i for i in needed if graph.inputs_of[i] & TIME]
+def _has_pulses_in_time(graph: Graph, needed: list[int]) -> bool:
+    dependent = [i for i in needed if graph.inputs_of[i] & TIME]
     degrees = Degrees([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
-    degrees.run(graph, depending)
-    return any(graph.kind(i) not in SMOOTH or degrees.values[i] > MAX_DEGREE for i in depending)
+    degrees.run(graph, dependent)
+    return any(graph.kind(i) not in SMOOTH or degrees.values[i] > MAX_DEGREE for i in dependent)
 
 
-def _is_short_in_state(graph: Graph, needed: list[int], n_q: int) -> bool:
-    depending = [i for i in needed if graph.inputs_of[i] & ~TIME]
+def _has_pulses_in_state(graph: Graph, needed: list[int], n_q: int) -> bool:
+    dependent = [i for i in needed if graph.inputs_of[i] & ~TIME]
     inputs = range(1, 2 * n_q + 1)
     degrees, vibrations, growth = Degrees(inputs), Vibrations(), Growth(inputs)
     divisors = Divisors(degrees)
     for algebra in (degrees, vibrations, growth, divisors):
-        algebra.run(graph, depending)
+        algebra.run(graph, dependent)
     return any(
         graph.kind(i) == EXPONENTIAL
         or degrees.values[i] > MAX_DEGREE_OF_STATE
         or divisors.values[i] > MAX_DEGREE_OF_DIVISOR
         or growth.values[i] < FASTEST_DECAY
         or vibrations.values[i] > MAX_DEGREE
-        for i in depending
+        for i in dependent
     )
 
 

@@ -152,10 +152,10 @@ def _has_parameters(value: Any) -> bool:
     return any(map(_has_parameters, value)) if isinstance(value, list | tuple) else type(value) is Parameter
 
 
-def _refuse_symbols(value: Any, does: str) -> None:
+def _refuse_symbols(value: Any, verb: str) -> None:
     symbol = _symbol_in(value)
     if symbol is not None:
-        symbol.graph.refuse(f"it {does} what depends on t, q or v")
+        symbol.graph.refuse(f"it {verb} what depends on t, q or v")
 
 
 def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]:
@@ -169,16 +169,16 @@ def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]
     return function
 
 
-def _number_or_symbol(of_numbers: Any, of_symbols: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that calls `of_symbols` if an argument is or contains a symbol, else `of_numbers`."""
+def _number_or_symbol(numeric: Any, symbolic: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that calls `symbolic` if an argument is or contains a symbol, else `numeric`."""
 
     def function(*arguments: Any) -> Any:
         if _symbol_in(arguments) is None:
             has_parameters = any(type(x) is Parameter for x in arguments)
-            return apply_function(of_numbers.__name__, *arguments) if has_parameters else of_numbers(*arguments)
+            return apply_function(numeric.__name__, *arguments) if has_parameters else numeric(*arguments)
         if any(isinstance(x, np.ndarray) for x in arguments if type(x) is not Affine):
             return elementwise(function, arguments)
-        return of_symbols(*arguments)
+        return symbolic(*arguments)
 
     return function
 
@@ -294,7 +294,7 @@ class Equations:
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._forms: dict[str, Any] = {}
-        self._copied: dict[str, Any] = {}  # results that were traced in the original of this graph
+        self._copied: dict[str, Any] = {}  # results of callbacks that were traced before this graph was copied
 
     def trace_all(self) -> "Equations":
         """Trace the callbacks of the system that can be traced, so that copies share the results; return self."""
@@ -316,7 +316,7 @@ class Equations:
         return equations
 
     def of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the result of a callback as an array of expressions; if it is missing, derivatives or zeros.
+        """Return the result of a callback as an array of expressions; of a missing callback, derivatives or zeros.
 
         `v`: expressions to be used as velocities, instead of the inputs `self.v`.
 
@@ -332,7 +332,7 @@ class Equations:
         return self._forms[kind].copy()
 
     def derived(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return C_q, C_t or gamma by differentiation, as an array of expressions, even if it has a callback."""
+        """Return C_q, C_t or gamma by differentiation, as an array of expressions, whether it has a callback or not."""
         if kind == "jacobian":
             return self._jacobian()
         return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
@@ -359,8 +359,8 @@ class Equations:
                     if not system.called_in_python:
                         trace(getattr(system.functions, kind), self.t, *arrays, p, out)
                     elif kind in system.python_functions:
-                        function, more = system.python_functions[kind], (p,) if system.takes_parameters(kind) else ()
-                        out = np.array(trace(function, self.t, *arrays, *more), dtype=object)
+                        function, extra = system.python_functions[kind], (p,) if system.takes_parameters(kind) else ()
+                        out = np.array(trace(function, self.t, *arrays, *extra), dtype=object)
                     out = convert_to_expressions(graph, out)
                     if out.shape != shape:
                         raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
@@ -404,11 +404,11 @@ def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bo
     equations = Equations(system, parameters)
     state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
     arrays = [symbols(state[name]) for name in KINDS[kind].state]
-    filled = [array.astype(object) for array in system.arrays_of(kind)]
+    outputs = [array.astype(object) for array in system.arrays_of(kind)]
     try:
         with equations.watched():
-            trace(getattr(system.functions, kind), equations.t, *arrays, equations.parameters.copy(), *filled)
-            for array in filled:
+            trace(getattr(system.functions, kind), equations.t, *arrays, equations.parameters.copy(), *outputs)
+            for array in outputs:
                 convert_to_expressions(equations.graph, array)
     except (Untraceable, ArithmeticError, RecursionError):
         return False
@@ -480,7 +480,7 @@ class TraceCache:
         return traced.copy()
 
     def numbers(self, parameters: Array) -> Array:
-        """Return the magnitude of each class, an array by class - 1, given the parameters of a system."""
+        """Return the magnitude of each class of parameters (entry class - 1) for `parameters` (n_p,) of a system."""
         return np.abs(parameters[self._first])
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
@@ -488,7 +488,7 @@ class TraceCache:
         return self._tape.products(self.numbers(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions (not to be changed) for the parameters of a system."""
+        """Return a function that evaluates arrays of expressions for `parameters` (n_p,); do not change these arrays."""
         product = self.products(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -530,11 +530,11 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, what: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return the result of `make` for a trace cache, converted for one system by the method `of` of the result.
+    """Return the result of `make` for a trace cache, converted for one system by the result's method `of`.
 
-    The trace cache is shared with other systems. If callbacks cannot be traced with variable parameters, or
-    `check` raises Untraceable (a callback may treat variable parameters differently from numbers), it is a cache for
-    this system alone. Results are cached by the key `what`.
+    The trace cache is shared with other systems. If callbacks cannot be traced with variable parameters, or `check`
+    raises Untraceable (a callback may treat variable parameters differently from numbers), it is a cache for this
+    system alone. Results are cached by the key `what`.
 
     Raises
     ------

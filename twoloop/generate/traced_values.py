@@ -32,10 +32,10 @@ KINDS = (
 N_NEARBY = 8  # number of random states near the start at which calls and traces are compared, besides the start
 TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
-# approximate largest number of compared states: in a chunk of a run, in a run, in a run with callbacks called in Python
+# approximate largest number of compared states: in a chunk of steps, in a run, in a run with callbacks called in Python
 MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of entries compared at all states of a run: large systems have fewer
-# largest difference between call and trace that is a rounding error, relative to the largest term of any entry
+# largest difference between call and trace that counts as a rounding error, relative to the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 CLEAR_DIFFERENCE = 1e-6  # smallest relative difference that proves a wrong trace without a test of neighbouring states
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
@@ -171,14 +171,14 @@ class Traced:
 
 
 class Sample:
-    """Sample of the states [t, q, v] of a run up to now; in long runs chunks and states are left out evenly."""
+    """Sample of the states [t, q, v] of a run so far, evenly thinned out in long runs; `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._parts = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add some states of a chunk (times `t`, rows that begin with [q, v]), and its last state, `state` at `end`."""
+        """Add states of a chunk of steps, `rows` [q, v, ...] at times `t`, and its last one, `state` at time `end`."""
         stride = 1 + len(t) // MAX_OF_CHUNK
         times = t[::stride]
         part = np.empty((len(times) + 1, 1 + self._n))
@@ -250,12 +250,12 @@ def extreme_states(t: Array, rows: Array) -> Array:
 
 
 class CheckedRegion:
-    """Region in which callbacks agreed with their traces: a box of states [t, q, v], and a box of parameters.
+    """Region in which callbacks agreed with their traces: ranges of the states [t, q, v], and of the parameters.
 
     Attributes
     ----------
     bounds : ndarray (2, 1 + 2 n_q) or (2, 0)
-        Smallest and largest t, q and v of the box and its margin: no comparison is needed at states within them.
+        Smallest and largest t, q and v, with a margin: no comparison is needed at states within them.
     """
 
     def __init__(self) -> None:
@@ -265,7 +265,7 @@ class CheckedRegion:
         self.bounds = self._box
 
     def is_comparison_due(self) -> bool:
-        """Return whether the next run has the number 1, 2, 4, 8, ...: it compares callbacks at all sampled states."""
+        """Return whether the next run has to compare callbacks at all sampled states, as the runs 1, 2, 4, 8, ... do."""
         return (self._runs + 1) & self._runs == 0
 
     def count(self) -> None:
@@ -273,7 +273,7 @@ class CheckedRegion:
         self._runs += 1
 
     def states_outside(self, states: Array) -> Array:
-        """Return those of the states (rows [t, q, v]) that are outside the box of states and its margin."""
+        """Return those of `states` (rows [t, q, v]) that are outside `bounds`; all of them if there are no bounds."""
         if not self._box.size:
             return states
         least, largest = self.bounds
@@ -281,7 +281,7 @@ class CheckedRegion:
         return states[outside.any(axis=1)] if outside.any() else states[:0]
 
     def contains_parameters(self, parameters: Array) -> bool:
-        """Return whether parameters are inside the box of parameters or its margin."""
+        """Return whether all parameters are within the ranges of parameters or the margin of these."""
         if self._parameters is None:
             return False
         least, largest = self._parameters
@@ -289,12 +289,12 @@ class CheckedRegion:
         return bool((least - margin <= parameters).all() and (parameters <= largest + margin).all())
 
     def add_parameters(self, parameters: Array) -> None:
-        """Extend the box of parameters by those of a run in which calls and traces agreed."""
+        """Extend the ranges of parameters to those of a run in which calls and traces agreed."""
         least, largest = self._parameters or (parameters, parameters)
         self._parameters = np.minimum(least, parameters), np.maximum(largest, parameters)
 
     def add(self, states: Array) -> None:
-        """Extend the box of states by states at which calls and traces agreed."""
+        """Extend the ranges of states, and `bounds`, to states at which calls and traces agreed."""
         if len(states) == 0:
             return
         checked = np.concatenate([states, self._box]) if self._box.size else states
