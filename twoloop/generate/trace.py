@@ -488,7 +488,7 @@ class TraceCache:
         return self._tape.products(self.numbers(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions for `parameters` (n_p,); do not change these arrays."""
+        """Return a function that evaluates arrays of expressions, to be left unchanged, for `parameters` (n_p,)."""
         product = self.products(parameters)
 
         def evaluate(array: Any) -> Array:

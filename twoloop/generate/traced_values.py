@@ -265,7 +265,7 @@ class CheckedRegion:
         self.bounds = self._box
 
     def is_comparison_due(self) -> bool:
-        """Return whether the next run has to compare callbacks at all sampled states, as the runs 1, 2, 4, 8, ... do."""
+        """Return whether the next run has to compare callbacks at all sampled states, as runs 1, 2, 4, 8, ... do."""
         return (self._runs + 1) & self._runs == 0
 
     def count(self) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 
-# stability limits of h times the frequency of a vibration (which grows by 1 % a step), and of h times a rate of decay,
-# for orders 1 to 12; for decay from order 6 on that of order 6, because the order falls when decay limits the steps
+# stability limits for orders 1 to 12: largest h times the frequency of a vibration, at which its amplitude grows by 1 %
+# per step, and largest h times a rate of decay. Orders above 6 have the limit of order 6 for decay, because the order
+# falls when decay limits the steps
 STABLE_TO = tuple(
     zip(
         (2.01, 2.01, 0.92, 0.97, 1.09, 1.23, 1.28, 1.13, 1.00, 0.89, 0.79, 0.71),
@@ -21,12 +22,12 @@ STABLE_TO = tuple(
 class Adams:
     """Adams methods of orders 1 to 12, predict-evaluate-correct-evaluate, for smooth motion that is not stiff.
 
-    Two evaluations a step: the cheapest method here wherever steps follow the motion rather than a stiff force. All
-    coordinates are integrated alike from their accelerations, by the second-order form: positions by the double
-    integral of the polynomial through the last accelerations, velocities by the single one. The end of every step is
-    moved to the nearest state on the constraints, in the metric of M; with nonholonomic rows, to that with the same
-    independent coordinates. The method thus departs from the paper, whose outer loop has only independent coordinates,
-    and a new partition does not interrupt it.
+    With two evaluations per step, it is the cheapest method here if the motion, not a stiff force, determines the step
+    size. All coordinates are integrated alike from their accelerations: positions by the double integral of the
+    polynomial through the last accelerations, velocities by the single integral. The end of every step is moved to the
+    nearest state on the constraints, in the metric of M; with nonholonomic rows, to the state with the same independent
+    coordinates. The method thus departs from the paper, whose outer loop has only independent coordinates, and a new
+    partition does not interrupt it.
 
     It starts by itself, with order 1 and a short step. After a run of many steps, a test at a few states shows whether
     stability rather than accuracy limited the steps. If so, `result.message` says so and names other methods.
@@ -35,10 +36,10 @@ class Adams:
     -----
     Modified divided differences: F. T. Krogh, Changing stepsize in the integration of differential equations using
     modified divided differences, Lecture Notes in Mathematics 362 (1974), 22-71. The rules for the order are those of
-    STEP: L. F. Shampine and M. K. Gordon, Computer Solution of Ordinary Differential Equations (1975). The step is not
-    halved or doubled as there: it is multiplied by 0.8 e^(-1/(k+1)), e the estimated error over the tolerance, but at
-    most by 1.2 (2 while the order still rises with every step) and, when it is refused, at least by 0.5. The integrals
-    of the polynomials are found by Gauss quadrature with eight nodes, which is exact for them.
+    STEP: L. F. Shampine and M. K. Gordon, Computer Solution of Ordinary Differential Equations (1975). But the step
+    size is not halved or doubled: it is multiplied by 0.8 e^(-1/(k+1)), where e is the estimated error divided by the
+    tolerance, at most by 1.2 (2 while the order still rises with every step), and after a rejected step at least by
+    0.5. The integrals of the polynomials are computed by Gauss quadrature with eight nodes, which is exact for them.
 
     Examples
     --------
@@ -56,7 +57,7 @@ class Adams:
         return "Adams"
 
     def takes_code(self, fixed: bool) -> bool:
-        """Return whether its steps may run with generated code."""
+        """Return whether the steps of this method can run with generated code."""
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:

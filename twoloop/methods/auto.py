@@ -13,47 +13,51 @@ from twoloop.methods.plan import Method, Plan, cached_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
-MANY = 16  # number of coordinates from which on evaluations cost more than the algebra of Adams' method ...
-# ... if the constraints are at most this share of the coordinates (otherwise projections cost more) ...
+MANY = 16  # number of coordinates from which on an evaluation may cost more than the algebra of a step of Adams
+# largest number of constraints per coordinate at which Adams replaces DOP853 for MANY coordinates: with more
+# constraints, projections cost more than evaluations
 CONSTRAINED = 0.25
-TIGHT_MANY = 1e-10  # ... or if the tolerance is below this ...
-VERY_MANY = 64  # ... or from this number of coordinates on, in any case
+TIGHT_MANY = 1e-10  # tolerance below which Adams replaces DOP853 for MANY coordinates with any number of constraints
+VERY_MANY = 64  # number of coordinates from which on Adams replaces DOP853 in any case, except with sparse matrices
 HUGE = 1000  # number of coordinates above which Newton's method, whose matrices are full, is not tried
-LONG_STEPS = 1e-9  # the rule for this tolerance also applies to looser ones, if runs have few steps
-SERIES = 1e-6  # tolerance below which a Taylor series costs less than DOP853 ...
-SOME_OPERATIONS = 12  # ... with up to this number of operations per coordinate ...
-# ... or up to this number with fewer than FEW coordinates, and with MANY coordinates at any looser tolerance
+LONG_STEPS = 1e-9  # a series that pays at this tolerance begins runs at looser ones, too, if other steps must be short
+SERIES = 1e-6  # tolerance below which a Taylor series may cost less than DOP853
+SOME_OPERATIONS = 12  # largest number of operations per coordinate at which a Taylor series costs less than DOP853
+# replaces SOME_OPERATIONS with fewer than FEW coordinates, and for MANY coordinates at tolerances of at least SERIES
 FEW_OPERATIONS = 8
-FEW = 5
-SERIES_OF_MANY = 1e-8  # as SERIES, for MANY coordinates with generated code
+FEW = 5  # number of coordinates below which FEW_OPERATIONS replaces SOME_OPERATIONS
+SERIES_OF_MANY = 1e-8  # replaces SERIES for MANY coordinates with generated code
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated by the method for few digits
 TIGHTEST = 9e-7  # tolerance below which stiff motion is integrated by the method for many digits
-LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
-LIMIT_FEW_OF_MANY = 2.0  # h rho from which on stiffness may limit DOP853 with MANY coordinates
-# number of successive estimates above the limit, because accuracy may allow long steps for a while (not with Adams)
+# h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams. h: step size, rho: largest rate of motion
+LIMIT_FEW, LIMIT_MANY = 4.0, 0.25
+LIMIT_FEW_OF_MANY = 2.0  # replaces LIMIT_FEW for MANY coordinates, whose evaluations cost more than a trial
+# number of successive estimates of h rho above the limit before a trial, as accuracy may allow a few long steps; for
+# Adams, and with LIMIT_FEW_OF_MANY, one estimate is enough
 ESTIMATES_FEW = 2
-# times the order: h rho from which on stiffness may limit a series, stable to 0.42 (decay) or 0.6 times its order
+# h rho / order from which on stiffness may limit a series, which is stable to 0.42 (decay) or 0.6 (vibration)
 LIMIT_SERIES = 0.3
-COST_RATIO = 4.0  # cost of an evaluation without generated code, in evaluations with it, estimated ...
-# ... and from MANY_OPERATIONS of callbacks per coordinate on, because these cost the same with and without code
+COST_RATIO = 4.0  # estimated cost of an evaluation without generated code, in evaluations with generated code
+# COST_RATIO_HEAVY replaces COST_RATIO if callbacks take at least MANY_OPERATIONS per coordinate: these operations cost
+# the same with and without generated code
 COST_RATIO_HEAVY, MANY_OPERATIONS = 2.0, 17
-MATRIX_COST = 3.0  # cost of a Newton matrix for few coordinates, in evaluations; plus one for every eight coordinates
+MATRIX_COST = 3.0  # cost of a Newton matrix in evaluations, to which an eighth of the number of coordinates is added
 
 
 def switching(first: Plan, second: Plan, limit: float, n_q: int, estimates: int = 1, cost_ratio: float = 1.0) -> Plan:
     """Return the plan that switches from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
 
-    `limit`: value of h rho (rho: largest rate of the motion) from which on `second` is tried, if this number of
-    `estimates` in a row exceeds it. `cost_ratio`: cost of an evaluation of `second`, in evaluations of `first`.
+    `limit`: value of h rho (rho: largest rate of the motion) that `estimates` successive estimates must exceed before
+    `second` is tried. `cost_ratio`: cost of an evaluation of `second`, in evaluations of `first`.
     """
     from twoloop.kernels.control import stiffness as kernels
 
     plans = (first, second)
-    each = [[*plan.rule, plan.reuse] for plan in plans]
+    rules = [[*plan.rule, plan.reuse] for plan in plans]
     return first.changed(
         step=kernels.SWITCHING,
         options=kernels.switching_options(
-            limit, estimates, MATRIX_COST + n_q / 8.0, cost_ratio, each, first.options, second.options
+            limit, estimates, MATRIX_COST + n_q / 8.0, cost_ratio, rules, first.options, second.options
         ),
         memory=kernels.switching_memory(n_q, first.memory, second.memory),
         first=first.step,
@@ -65,7 +69,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, estimates: int 
 
 
 def with_matrix_cost(plan: Plan, cost: float) -> Plan:
-    """Return a copy of a plan of `switching` with another cost of a Newton matrix, in evaluations."""
+    """Return a copy of a plan of `switching` with the cost of a Newton matrix set to `cost`, in evaluations."""
     from twoloop.kernels.control import stiffness as kernels
 
     options = plan.options.copy()
@@ -77,48 +81,52 @@ def with_matrix_cost(plan: Plan, cost: float) -> Plan:
 class Auto:
     """Default method: explicit steps, and Newton's method where stiffness is measured; a run may switch both ways.
 
-    A run begins with `series` if the operations of the callbacks can be traced and are few: at most 12 for each
-    coordinate (8 with fewer than five coordinates) at tolerances below 1e-6; at looser ones at most 8, with 16
-    coordinates or more. Otherwise it begins with `few`, or with `many`: from 64 coordinates on, and from 16 on if there
-    are at most a quarter as many constraints or the tolerance is below 1e-10. With generated code (`compiled=True` of
-    `solve_dae`, or its default for small mechanisms) it begins with `lanes`. If this cannot continue, or the equations
-    are too long for it, the run continues with a series at tolerances below 1e-6 (from 16 coordinates on: below 1e-8),
-    else with `few`, or from 64 coordinates on with `many`.
+    A run begins with one of these methods:
 
-    Systems that give the values of entries begin with `few` from 64 coordinates on, too, unless tolerances are below
-    1e-10 or there are at most a quarter as many constraints: their projections, one a step, cost as much as
-    evaluations.
+    - `lanes` with generated code (`compiled=True` of `solve_dae`, or its default for small mechanisms). If this method
+      cannot continue, or the equations are too long for it, the run uses `series` at tolerances below 1e-6 (from 16
+      coordinates on: below 1e-8), else `few`, or `many` from 64 coordinates on.
+    - `series` if the operations of the callbacks can be traced and are few: at most 12 per coordinate (8 with fewer
+      than five coordinates) at tolerances below 1e-6; at looser ones at most 8, with 16 coordinates or more.
+    - `many` from 64 coordinates on, and from 16 on if there are at most a quarter as many constraints or the tolerance
+      is below 1e-10. Systems that give the entries of sparse matrices need one of the last two conditions, because
+      their projections, one per step, cost as much as evaluations.
+    - `few` otherwise.
 
-    At looser tolerances than these a run also begins with `series` if the other methods may take no steps longer than a
-    hundredth of the run. Within 10 steps it continues without the series if the next step would be no longer than that.
-    Steps of `few` may be longer if forces and constraints have no quotients, roots or fast vibrations. A run also
-    continues without the series if the series is not finite and the functions are.
+    At looser tolerances a run also begins with `series` if the other methods may take no steps longer than a hundredth
+    of the run. Within 10 steps it continues without the series if the next step would be no longer than that. Steps of
+    `few` may be longer if forces and constraints have no quotients, roots or fast vibrations. A run also continues
+    without the series if the series is not finite and the functions are.
 
     The largest rate of the motion is estimated from the derivatives of the accelerations, after 100 evaluations and
-    then after every 600 (two to four times as many with generated code). The implicit method is tried for 15 steps if
-    the steps have come near the limit of stability that this rate sets (at two estimates in a row; at one with `many`,
-    and with `few` from 16 coordinates on), or are above 5 % of it and the rate is more than thirty times that of the
-    motion itself, or all that could move at this rate is within ten tolerances of velocities. Unless the steps are far
-    beyond that limit, the trial waits until the run has cost three trials, and 64 evaluations for each independent
-    coordinate if tangents have to be differenced, or until three tenths of the cost of the whole run, extrapolated from
-    its present cost, are as much. If the run is to cost a thousand trials, one is made whatever the rates. The implicit
-    method is kept if a second of motion costs it less, counted in evaluations and Newton matrices: `loose` at
-    tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. The run returns to the explicit method if the steps
-    come below that limit, or if a second of motion costs more than with the explicit method. Counts decide, not times:
-    a run can be repeated.
+    then after every 600 (two to four times as many with generated code). This rate sets the limit of stability of the
+    explicit steps. The implicit method is tried for 15 steps if
+
+    - steps have come near the limit, at two successive estimates (at one with `many`, and with `few` from 16
+      coordinates on);
+    - steps are above 5 % of the limit, and the rate is more than thirty times that of the motion itself, or velocities
+      that could change at this rate are within ten tolerances;
+    - the whole run is expected to cost a thousand trials.
+
+    Unless steps are far above the limit, the trial waits until the run has cost three trials, and 64 evaluations for
+    each independent coordinate if tangents have to be computed by differences. Three tenths of the expected cost of the
+    whole run count as spent. The implicit method (`loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else
+    `tight`) is kept if a second of motion costs less with it, counted in evaluations and Newton matrices. The run
+    returns to the explicit method if the steps come below the limit, or if that method costs less. Counts decide, not
+    times, so that a run can be repeated.
 
     Above 1000 coordinates no implicit method is tried, as its matrices are full. No series is tried if M and C_q have
-    more than 200,000 entries together, zeros among them, as it takes seconds to find (method="Taylor" does it).
+    more than 200,000 entries, zeros among them, as tracing takes seconds (method="Taylor" does it).
 
     While the implicit method runs, errors of positions are within the tolerances; velocities are tested for the errors
-    that they will cause in the positions before they turn back or decay. With fixed steps, `fixed` makes the whole run.
+    that they will cause in the positions before they turn back or decay. Fixed steps are taken by `fixed`.
 
     Parameters
     ----------
     few, many : method object
         Explicit methods, for few and for many coordinates.
     series : Taylor or None
-        None: only `few` and `many`; `for_system` sets None if callbacks are not made of operations that it knows.
+        None: only `few` and `many`. `for_system` sets None if callbacks cannot be traced.
     loose, tight, tightest : method object
         Implicit methods, for loose, tight and the tightest tolerances.
     fixed : method object
@@ -143,11 +151,11 @@ class Auto:
     fixed: Method
     lanes: Lobatto16 | None = None
     n_rows: int = 0  # number of constraints; solve_dae sets it
-    # cost of an evaluation without generated code, in evaluations with it; None: there is no code
+    # cost of an evaluation without generated code, in evaluations with generated code; None: there is no code
     cost_ratio: float | None = None
-    # whether the system gives its matrices by entries: an evaluation then costs no more than a projection
+    # whether the system gives the entries of sparse matrices: an evaluation then costs no more than a projection
     sparse: bool = False
-    # whether forces may change much over a short distance, so that every method must limit its steps
+    # whether forces may change much over a distance shorter than a step, so that every method must limit its steps
     narrow: bool = True
 
     @property
@@ -163,15 +171,15 @@ class Auto:
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
     ) -> "Auto":
-        """Return the method for a system; without `series` if its operations are unknown or unreliable."""
+        """Return the method for a system; without `series` if callbacks cannot be traced or `check` refuses traces."""
         sparse = len(system.entries) == 2 and system.n_a == 0
         chosen = replace(self, n_rows=system.n_c + system.n_a, series=None, lanes=None, sparse=sparse)
         if code is not None:
             lanes = self.lanes if compiles_quickly(code.shared) else None
             lanes = None if lanes is None else lanes.for_system(system, code)
             chosen = replace(chosen, lanes=lanes, cost_ratio=_cost_ratio(system))
-        plain = code is None and (system.called_in_python or not is_quick(system))
-        if self.series is None or plain:
+        untraced = code is None and (system.called_in_python or not is_quick(system))
+        if self.series is None or untraced:
             return chosen
         try:
             series = self.series.for_system(system, code, check)
@@ -180,18 +188,18 @@ class Auto:
         return replace(chosen, series=series, narrow=may_be_steep(system, force_was_traced=True))
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
-        """Return whether a step of the series costs less than the steps that it replaces."""
+        """Return whether a step of the series costs less than the steps of the explicit method that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
-        if self.cost_ratio is not None:  # the series takes over only near singular positions: it is more exact
+        if self.cost_ratio is not None:  # generated code: the series runs only near singular positions, more exactly
             return tolerance < (SERIES if n_q < MANY else SERIES_OF_MANY)
         if tolerance < SERIES:
             return operations <= (SOME_OPERATIONS if n_q >= FEW else FEW_OPERATIONS)
         return operations <= FEW_OPERATIONS and n_q >= MANY
 
     def takes_code(self, fixed: bool) -> bool:
-        """Return whether its steps may run with generated code."""
-        return not fixed  # fixed steps are implicit
+        """Return whether the steps of this method can run with generated code: not fixed steps, which are implicit."""
+        return not fixed
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the plan of the method for a run of n_q coordinates."""
@@ -205,7 +213,7 @@ class Auto:
         return plan.changed(substitute=fallback, traced=traced, within_newton=fallback.within_newton)
 
     def _without_lanes(self, n_q: int, rtol: float, atol: float) -> Plan:
-        """Return the plan without collocation in lanes: one evaluation at a time."""
+        """Return the plan without `lanes`, that is without collocation in SIMD lanes."""
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = cached_plan(implicit, n_q, rtol, atol)
@@ -223,7 +231,7 @@ class Auto:
         return chosen.changed(substitute=explicit, provisional=not pays)
 
     def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, cost_ratio: float) -> Plan:
-        """Return the plan of the explicit method and its switch to Newton's method, without a series."""
+        """Return the plan of the explicit method, `few` or `many`, with its switch to Newton's method, `second`."""
         many = n_q >= VERY_MANY and not self.sparse
         if n_q >= MANY and self.cost_ratio is None:
             many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
@@ -236,7 +244,7 @@ class Auto:
 
 
 def _cost_ratio(system: ConstrainedSystem) -> float:
-    """Return the cost of an evaluation of the implicit method, in evaluations of generated code."""
+    """Return the estimated cost of an evaluation without generated code, in evaluations with generated code."""
     try:
         return COST_RATIO_HEAVY if series_for(system).n_operations >= MANY_OPERATIONS * system.n_q else COST_RATIO
     except Untraceable:

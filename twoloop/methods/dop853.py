@@ -12,7 +12,7 @@ import numpy as np
 
 from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_choices, check_tolerances, least_tolerance
 
-_BELOW_THE_DIAGONAL = """
+_LOWER_TRIANGLE = """
 0.05260015195876773
 0.0197250569845379 0.0591751709536137
 0.02958758547680685 0 0.08876275643042054
@@ -36,7 +36,7 @@ def _numbers(text: str) -> list[float]:
 
 
 A = np.zeros((12, 12))
-A[np.tril_indices(12, -1)] = _numbers(_BELOW_THE_DIAGONAL)
+A[np.tril_indices(12, -1)] = _numbers(_LOWER_TRIANGLE)
 B = np.array(
     _numbers("""
 0.054293734116568765 0 0 0 0 4.450312892752409 1.8915178993145003 -5.801203960010585 0.3111643669578199
@@ -63,24 +63,25 @@ E5 = np.array(
 )
 
 
-COARSE_SHARE = 0.1  # weight of the estimate of order 3 beside that of order 5
-# relative to the tolerance: while a stage's position differs by less from that of a Jacobian, its velocity may use it
+COARSE_SHARE = 0.1  # factor on the error estimate of order 3 in the combined estimate e5^2 / sqrt(e5^2 + 0.01 e3^2)
+# largest change of a position, relative to the tolerance, for which the velocity of a stage uses an earlier Jacobian
 REUSE = 1e-4
-# relative to the tolerance: smaller errors count as this in the trend; half the step has less than 1/100 of the error
+# lower limit of the error, relative to the tolerance, in the trend that the step size follows (`Plan.least_error`); it
+# is low because halving the step divides the error by more than 100
 LEAST_ERROR = 1e-6
 EVALUATED_NODES = C[(B != 0.0) | (E5 != 0.0) | (E3 != 0.0)]  # nodes of the stages with nonzero weights
 # longest part of a step between two of these nodes, relative to the step: 4/15
 LONGEST_GAP = float(np.diff([*np.sort(EVALUATED_NODES), 1.0]).max())
 STABLE_TO = (5.96, 6.39)  # limits of stability: h times the frequency of a vibration, and h times a rate of decay
-SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it costs about a tenth more
+SAFETY = 0.8  # safety factor of the step size: 0.9 doubles the rejected steps, and costs a tenth more at equal error
 
 
 @dataclass(frozen=True)
 class DOP853:
-    """An explicit Runge-Kutta method, Dormand and Prince's, of order 8, with 12 stages.
+    """Explicit Runge-Kutta method of Dormand and Prince, order 8 with 12 stages, for smooth motion that is not stiff.
 
-    It is for smooth motion that is not stiff. There is no outer loop. Every stage is one evaluation, so a step costs 12
-    evaluations, and a rejected one 11. Accepted states are on the constraints.
+    There is no outer loop. Every stage is one evaluation, so a step costs 12 evaluations, and a rejected one 11.
+    Accepted states are on the constraints.
 
     If parts of the system could vibrate or decay faster than it moves, stability, not accuracy, limits the step h:
     h w_max to 5.96 for undamped vibrations, and h times the largest rate of decay to 6.39. Vibrations that such steps
@@ -96,8 +97,8 @@ class DOP853:
         "free": all coordinates are integrated alike, stages are off the constraints by the error of the formula, and
         the end of the step is moved to the nearest state on them, in the metric of M. This departs from the paper.
         "restored": the paper's procedure with this tableau. The independent coordinates are integrated, and the inner
-        loop restores the dependent ones at every stage. Rows of nonholonomic constraints are always treated so at the
-        end of a step.
+        loop restores the dependent ones at every stage. With nonholonomic constraints, the state at the end of a step
+        is always restored in this way.
     inner_tol : float, optional
         With "restored", Newton on the positions stops when its largest correction, just made, is at most this (unit of
         q). None: 1e-8.
@@ -111,10 +112,10 @@ class DOP853:
     -----
     Tableau and error estimate, e5^2 / sqrt(e5^2 + 0.01 e3^2) of embedded estimates of orders 5 and 3: Hairer, Norsett
     and Wanner, Solving ODEs I (1993), II.5 and II.10; e5 and e3 are largest components here, not root mean squares.
-    From where a run has come near a singular position, the square root of e5 / sqrt(e5^2 + 0.01 e3^2) takes the place
-    of this quotient, as terms of high order are not small there, and errors have to be within a tenth of tolerances
-    from 1e-10 on. The numbers are those of SciPy's `DOP853`. The stability limits are those of the method's polynomial
-    R(z): |R| <= 1 on the imaginary axis up to 5.96 i, on the real one down to -6.39.
+    After a run has come near a singular position, the quotient e5 / sqrt(e5^2 + 0.01 e3^2) in this estimate is replaced
+    by its square root, as terms of high order are not small there, and errors have to be within a tenth of the
+    tolerances, if these are at least 1e-10. The numbers are those of SciPy's `DOP853`. The stability limits are those
+    of the method's polynomial R(z): |R| <= 1 on the imaginary axis up to 5.96 i, on the real one down to -6.39.
 
     Examples
     --------
@@ -139,7 +140,7 @@ class DOP853:
         return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
 
     def takes_code(self, fixed: bool) -> bool:
-        """Return whether its steps may run with generated code."""
+        """Return whether the steps of this method can run with generated code."""
         return self.stages == "free"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:

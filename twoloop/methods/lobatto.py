@@ -14,18 +14,18 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
-PARTS = 6  # number of parts into which a step is divided, and computed again, for the solution between its ends
-# longest part of a step between two nodes, relative to the step
+PARTS = 6  # number of steps into which a step is divided, and computed again, for the solution between its ends
+# largest distance between neighbouring nodes, relative to the step
 LONGEST_GAP = float(np.diff([0.0, *tables().nodes]).max())
 
 
 @dataclass(frozen=True)
 class Lobatto16:
-    """Take steps of order 16 by collocation at nine Lobatto nodes; fixed-point iteration finds the stages.
+    """Implicit steps of order 16 by collocation at nine Lobatto nodes, whose stages are found by fixed-point iteration.
 
-    It is the outer loop of the paper's procedure with another tableau, and for all coordinates: no Jacobian, and a
-    prediction by the polynomial of the step before. Generated code evaluates the eight unknown stages at once, one in
-    each SIMD lane; a step takes four to eight such sweeps. Accepted states are on the constraints.
+    It is the outer loop of the paper's procedure with another tableau, and for all coordinates. It needs no Jacobian;
+    stages are predicted by the polynomial of the previous step. Generated code evaluates the eight unknown stages at
+    once, one in each SIMD lane; a step takes four to eight such sweeps. Accepted states are on the constraints.
 
     It is for smooth motion that is not stiff. If the iteration converges too slowly, as in stiff motion, the run
     continues with "DOP853". It also does so after a singular position at tolerances below 1e-8; the position itself is
@@ -55,7 +55,7 @@ class Lobatto16:
     needs_code: ClassVar[bool] = True
     name: ClassVar[str] = "Lobatto16"
     code: GeneratedCode | None = None  # generated for one system; solve_dae sets it
-    narrow: bool = True  # whether forces may change much over a short distance
+    narrow: bool = True  # whether forces may change much over a distance shorter than a step
 
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
@@ -75,7 +75,7 @@ class Lobatto16:
         return replace(self, code=code, narrow=may_be_steep(system, force_was_traced=True))
 
     def takes_code(self, fixed: bool) -> bool:
-        """Return whether its steps may call generated code."""
+        """Return whether the steps of this method can run with generated code."""
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
@@ -84,12 +84,12 @@ class Lobatto16:
 
         if self.code is None:
             raise ValueError("Lobatto16() knows no system yet: take for_system(system, code), as solve_dae does")
-        made = compiled_collocation(self.code)
+        collocation = compiled_collocation(self.code)
         options = np.zeros(kernels.N_OPTIONS)
         options[kernels.THETA] = LARGEST_MOVE
-        options[kernels.N_ITERATED], options[kernels.N_ROWS] = len(made.code.iterated), made.code.n_rows
+        options[kernels.N_ITERATED], options[kernels.N_ROWS] = len(collocation.code.iterated), collocation.code.n_rows
         options[kernels.FREE] = 1.0 if self.narrow else 1.0 / LONGEST_GAP
-        sizes = n_q, len(made.code.iterated), made.code.n_rows
+        sizes = n_q, len(collocation.code.iterated), collocation.code.n_rows
         plan = Plan(
             kernels.LOBATTO,
             options,
@@ -101,8 +101,8 @@ class Lobatto16:
             unseen=LONGEST_GAP,
             parts=PARTS,
             apart=True,
-            own=(made.functions,),
-            own_numbers=made.numbers,
+            own=(collocation.functions,),
+            own_numbers=collocation.numbers,
         )
         plan = plan.changed(interior=plan.changed(memory=plan.memory.copy()))
         if fixed:

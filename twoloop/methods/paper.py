@@ -9,9 +9,9 @@ from twoloop.methods.plan import INNER_TOL, Plan, check_tolerances, outer_tolera
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
-NO_ESTIMATE = 0.02  # smallest |beta - 1/6| for Newmark's error estimate, which vanishes with it
+MIN_DISTANCE = 0.02  # smallest |beta - 1/6|, the factor of Newmark's error estimate, at which it is used
 # ratio of the outer tolerance to err_out; the iterations converge so fast that a small ratio costs next to nothing
-OUTER_SHARE_OF_ERROR = 1e-3
+OUTER_TO_ERROR_TOL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -21,15 +21,15 @@ class Newmark:
     Parameters
     ----------
     beta, gamma : float
-        Parameters of (12), in which beta = 1/4 is the average-acceleration method. Fixed steps only: gamma other than
-        1/2, and beta near 1/6, where the error estimate vanishes.
+        Parameters of (12), in which beta = 1/4 is the average-acceleration method. Fixed steps are required if gamma is
+        not 1/2, or if beta is near 1/6, where the error estimate vanishes.
     error_tol : float, optional
         err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this, and the
-        error of a run goes with error_tol^(2/3); steps are shortened to end at output times. None: when the largest
-        component of e / h, the error per unit step, is at most r atol + rtol |v|, so that the error of a run is
-        proportional to the tolerance. 1 / r is the time in which the largest velocity, or acceleration, so far would
-        change a coordinate by the largest value so far. r is not in the paper; it does not become zero, whatever the
-        origin of the coordinates.
+        error of a run is proportional to error_tol^(2/3); steps are shortened to end at output times. None: a step is
+        accepted when the largest component of e / h, the error per unit step, is at most r atol + rtol |v|, so that the
+        error of a run is proportional to the tolerance. 1 / r is the time in which the largest velocity, or
+        acceleration, so far would change a coordinate by the largest value so far. r is not in the paper; it does not
+        become zero, whatever the origin of the coordinates.
     inner_tol : float, optional
         Newton on the positions stops when its largest correction, just made, is at most this. None: 1e-8.
     outer_tol : float, optional
@@ -74,16 +74,16 @@ class Newmark:
         """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.paper import newmark_step as kernels
 
-        if not fixed and (abs(self.beta - 1.0 / 6.0) < NO_ESTIMATE or self.gamma != 0.5):
+        if not fixed and (abs(self.beta - 1.0 / 6.0) < MIN_DISTANCE or self.gamma != 0.5):
             raise ValueError(
                 f"Newmark with beta = {self.beta:g}, gamma = {self.gamma:g} has no error estimate: |beta - 1/6| h^2 "
-                f"|da| needs gamma = 1/2 and |beta - 1/6| >= {NO_ESTIMATE:g}. Give step_size for fixed steps, or take "
+                f"|da| needs gamma = 1/2 and |beta - 1/6| >= {MIN_DISTANCE:g}. Give step_size for fixed steps, or take "
                 "beta = 1/4, gamma = 1/2"
             )
         if self.outer_tol is not None:
             outer_tol = self.outer_tol
         elif self.error_tol is not None and not fixed:
-            outer_tol = OUTER_SHARE_OF_ERROR * self.error_tol
+            outer_tol = OUTER_TO_ERROR_TOL * self.error_tol
         else:
             outer_tol = outer_tolerance(rtol, atol, fixed)
         options = np.zeros(kernels.N_OPTIONS)
@@ -109,7 +109,7 @@ BDF_HIGHEST = 5  # highest order of BDF; the formula of order 6 is almost unstab
 
 @dataclass(frozen=True)
 class BDF:
-    """Two-loop procedure with backward differentiation formulas of variable step and order (the paper's outlook).
+    """Two-loop procedure with backward differentiation formulas of variable step and order, as the paper proposes.
 
     For y' = f(y), y = [q_i, v_i], each step solves y = p + c (f(y) - p'). Here p extrapolates the last k + 1 points,
     and c = h / (1 + 1/2 + ... + 1/k). The outer loop is a fixed-point iteration on the independent accelerations; every
@@ -117,14 +117,14 @@ class BDF:
     those of `RungeKutta`: compare at equal error. The method is meant for few digits.
 
     With step-size control a run begins with order 1 and a small step. A step is accepted when the largest component of
-    the estimated local error of q and v, dependents too, is within the tolerance. Fixed steps have the order
-    max_order from the first on; 3-stage Gauss steps make the history that it needs.
+    the estimated local error of q and v, including the dependent ones, is within the tolerance. Fixed steps have the
+    order max_order from the beginning; 3-stage Gauss steps compute the past points that it needs.
 
-    What to expect of undamped motion: small oscillations lose energy with orders 1, 2 and 5 and gain it with 3 and 4,
-    at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
-    the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
+    In undamped motion, small oscillations lose energy with orders 1, 2 and 5 and gain it with orders 3 and 4, at the
+    rate of the truncation error; large oscillations may do either from order 3 on. The fixed-point iteration limits h
+    to about the reciprocal of the largest frequency or rate of decay, so that stiff problems need small steps.
 
-    Large systems use sparse matrices. There all coordinates are integrated, and the end of each step is moved onto the
+    For large systems with sparse matrices, all coordinates are integrated, and the end of each step is moved onto the
     constraints.
 
     Parameters
@@ -144,12 +144,12 @@ class BDF:
 
     Notes
     -----
-    Sect. 5 of the paper proposes BDF as further work and leaves its form open; all of it is chosen here. Modified
-    divided differences with fixed leading coefficient, and their error estimate: Brenan, Campbell and Petzold,
+    Sect. 5 of the paper proposes BDF as further work and leaves its form open, so that the details are chosen here.
+    Modified divided differences with fixed leading coefficient, and their error estimate: Brenan, Campbell and Petzold,
     Numerical Solution of Initial-Value Problems in DAEs (1996), on DASSL. Unlike the backward differences on an
-    equidistant history of Shampine and Reichelt (1997) they need no interpolation when the step size changes. The order
-    is that of the largest next step, as in VODE. Stability and error constants: Hairer, Norsett and Wanner, Solving
-    ODEs I (1993), chapter III.
+    equidistant history of Shampine and Reichelt (1997) they need no interpolation when the step size changes. The next
+    order is the one that allows the largest step, as in VODE. Stability and error constants: Hairer, Norsett and
+    Wanner, Solving ODEs I (1993), chapter III.
 
     Examples
     --------
@@ -196,10 +196,10 @@ class BDF:
 def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     """Return the paper's procedure with Sun's 3-stage Radau IIB; run it with rtol = atol = 1e-5 to follow Sect. 4.1.
 
-    As printed: coordinate partitioning by LU; eqs. (14), (15) for the dependents at every stage; explicit Euler
-    prediction; the outer loop ends by (32), is given up by (33); the error is (26), (27), the difference of one step
-    and two half steps undivided; the next step by (31), (34) with fac = 0.9, facmax = 5, facmin = 0.5 and h_max = 1 s
-    at the beginning of each step; after (33) h_max = h and the step is halved.
+    As printed: coordinate partitioning by LU; eqs. (14), (15) for the dependent coordinates at every stage; explicit
+    Euler prediction; the outer loop ends by (32) and is given up by (33); the error is (26), (27), the undivided
+    difference between one step and two half steps; the next step size by (31), (34) with fac = 0.9, facmax = 5,
+    facmin = 0.5 and h_max = 1 s at the beginning of each step; after (33) h_max = h and the step is halved.
 
     Where this differs from the printed text, and why:
 
@@ -220,8 +220,8 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     - "Once in a time step or several time steps": the partition is checked after every step. It is chosen anew when
       max|C_qd^-1 C_qi| has grown to three times its first value, or when a step failed in the inner loop.
     - Steps are shortened to end at output times and at the end of the run.
-    - A step is also rejected if the force jumps between its start and the first stage: the step and its halves do not
-      see such a jump, and were off by 1e5 tolerances.
+    - A step is also rejected if the force jumps between its start and the first stage: neither the step nor its halves
+      evaluate the force before the jump, and errors of 1e5 tolerances were not noticed.
 
     Parameters
     ----------
@@ -242,18 +242,18 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
 
 
 def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float = 0.5) -> Newmark:
-    """Return the two-loop procedure with Newmark's method that the paper compares with; beta = 1/2 as printed.
+    """Return the two-loop procedure with Newmark's method, with which the paper compares; beta = 1/2 as printed.
 
     As printed: (12) with beta = gamma = 1/2; the outer loop by (11) and (12) with the inner loop between them.
 
     Where this differs from the printed text, and why:
 
-    - beta = 1/2 is not the average-acceleration method in the form (12), 1/4 is: the leading error is four times
-      larger. Both can be chosen; the printed one is the default.
+    - beta = 1/2 is not the average-acceleration method in the form (12), which has beta = 1/4: the leading error is
+      four times larger. Both can be chosen; the printed one is the default.
     - The paper refers to Hussein and Shabana for error control and convergence. err_out is taken as the tolerance
       of the local error |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 (Zienkiewicz and Xie 1991), with the step factor
-      0.9 (err_out / error)^(1/3) between 0.5 and 5 and h_max = 1 s: only so does the cost grow as in Table 3. After a
-      step that did not converge h is halved, and h_max is 0.7 h for ten steps.
+      0.9 (err_out / error)^(1/3) between 0.5 and 5 and h_max = 1 s: with other choices the cost does not grow as in
+      Table 3. After a step that did not converge h is halved, and h_max is 0.7 h for ten steps.
     - The outer loop stops when y_i would change by less than err_out / 1000, relative to max(|y_i|, 1); it is given
       up when the differences grow.
     - Newton starts from the Taylor polynomial of the dependents, not from the last position.

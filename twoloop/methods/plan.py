@@ -12,15 +12,17 @@ from twoloop.kernels.compile.caches import BoundedCache
 
 Array = NDArray[np.float64]
 
-# Newton's method in the inner loop converges quadratically and tests its last correction: the error is about its square
+# largest last correction of the inner loop, unit of q: as Newton's method converges quadratically, the error that
+# remains is about the square of this correction
 INNER_TOL = 1e-8
-LEAST_ERROR = 0.01  # `least_error` of the plans of most methods
-ROUGH = 10.0  # `rough` of the plans of most methods, measured
-# largest correction of a position after which a projection is not repeated: the error of velocities is then as small
+LEAST_ERROR = 0.01  # lower limit of the error, relative to the tolerance, in the trend that the step size follows
+ROUGH = 10.0  # measured largest ratio of error to estimate of a step in which a force jumps, for most methods
+# largest correction of a position, unit of q, after which a projection is not repeated: the error of velocities is then
+# as small
 LARGEST_MOVE = 1e-14
-OUTER_SHARE = 0.01  # tolerance of the outer loop, relative to that of the step
-OUTER_TOL_FIXED = 1e-14  # fixed steps have no tolerance: iterate to rounding
-LEAST_TOLERANCE = 1e-14  # lower limit of the tolerance that a loop has to reach
+OUTER_TOL_RATIO = 0.01  # tolerance of the outer loop, relative to that of the step
+OUTER_TOL_FIXED = 1e-14  # tolerance of the outer loop in fixed steps, which are iterated to rounding
+LEAST_TOLERANCE = 1e-14  # lower limit of rtol and atol in rules that derive other values from them
 
 
 @dataclass(frozen=True)
@@ -36,13 +38,13 @@ class Plan:
     safety: float = 0.9
     factor_min: float = 0.2
     factor_max: float = 5.0
-    limit_start: float = np.inf
-    limit_factor: float = 0.7
-    limit_memory: int = 10
-    symmetric: bool = False
+    limit_start: float = np.inf  # largest step size, s, unless a step has failed recently
+    limit_factor: float = 0.7  # largest step size after a failed step, relative to this step
+    limit_memory: int = 10  # number of accepted steps after a failed step for which `limit_factor` applies
+    symmetric: bool = False  # whether each step uses the partition chosen at its midpoint
     least_error: float = 0.0  # lower limit of the error in the trend that the step size follows; 0: no trend
     rough: float = 1.0  # largest ratio of error to estimate of a step in which a force jumps
-    reuse: float = 0.0  # correction of a position, within a step, up to which the previous Jacobian is used again
+    reuse: float = 0.0  # largest correction of a position, within a step, with which the previous Jacobian is used
     watchful: bool = False  # whether short steps trigger a check for a singular position nearby
     # whether steps evaluate accelerations without a projection, and call the projection separately
     projects: bool = False
@@ -52,17 +54,17 @@ class Plan:
     stable_to: Any = None
     inner: Any = None  # inner loop that calls generated code; None: the general one
     own: tuple[Any, ...] = ()  # generated functions, see kernels/data/common.py
-    numbers: Any = None  # data of the generated functions of the inner loop ...
-    own_numbers: Any = None  # ... and of those of collocation
+    numbers: Any = None  # coefficients of the generated functions of the inner loop
+    own_numbers: Any = None  # data of the generated functions of collocation
     matrices: int = 0  # number of (n_q, n_q) matrices of Newton's method in the workspace
-    parts: int = 1  # number of equal steps into which a step is divided to get the solution between its ends ...
-    interior: "Plan | None" = None  # ... and the plan of these steps; None: the method itself
+    parts: int = 1  # number of equal steps into which a step is divided for the solution between its ends
+    interior: "Plan | None" = None  # plan of these `parts` of a step; None: the plan of the method with fixed steps
     # whether steps evaluate the equations between their ends; if not, their length is limited
     looks_within: bool = False
-    unseen: float = 1.0  # longest part of such a step without an evaluation, relative to the step
+    unseen: float = 1.0  # longest part of a step without an evaluation of the equations, relative to the step
     substitute: "Plan | None" = None  # plan that continues the run if values of this one are not finite
     provisional: bool = False  # whether the substitute also takes over if steps are not longer than it could take
-    traced: tuple[Any, ...] = ()  # traces of the callbacks, for steps that rely on them: see traced_values.py
+    traced: tuple[Any, ...] = ()  # traces of the callbacks on which steps rely, see traced_values.py
     # plan of the `parts` of Newton steps, for the solution between their ends; None: these steps are not divided
     within_newton: "Plan | None" = None
 
@@ -82,13 +84,13 @@ class Plan:
 
     def changed(self, **changes: Any) -> "Plan":
         """Return a copy of the plan with other values of some fields."""
-        other = object.__new__(Plan)  # `dataclasses.replace` takes ten times as long
-        vars(other).update(vars(self), **changes)
-        return other
+        plan = object.__new__(Plan)  # `dataclasses.replace` takes ten times as long
+        vars(plan).update(vars(self), **changes)
+        return plan
 
 
 def takes_code(method: Any, fixed: bool) -> bool:
-    """Return whether steps of a method only call functions of the inner loop that generated code provides."""
+    """Return whether the steps of a method can run with generated code."""
     takes = getattr(method, "takes_code", None)
     return takes is not None and bool(takes(fixed))
 
@@ -99,13 +101,13 @@ def needs_code(method: Any) -> bool:
 
 
 def least_tolerance(rtol: float, atol: float) -> float:
-    """Return the smaller tolerance, but not less than LEAST_TOLERANCE."""
+    """Return the smaller one of rtol and atol, but not less than LEAST_TOLERANCE."""
     return max(min(rtol, atol), LEAST_TOLERANCE)
 
 
 def outer_tolerance(rtol: float, atol: float, fixed: bool) -> float:
-    """Return the tolerance of the outer loop, for methods without their own rule."""
-    return OUTER_TOL_FIXED if fixed else OUTER_SHARE * least_tolerance(rtol, atol)
+    """Return the tolerance of the outer loop, relative to max(|value|, 1), of methods without their own rule."""
+    return OUTER_TOL_FIXED if fixed else OUTER_TOL_RATIO * least_tolerance(rtol, atol)
 
 
 class Method(Protocol):
@@ -139,17 +141,17 @@ _PLANS = BoundedCache()  # plans of methods that do not depend on the system
 
 
 def cached_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:
-    """Return the cached plan of a method that does not depend on the system; other plans contain it."""
+    """Return the cached plan, without fixed steps, of a method that does not depend on the system."""
     key = (id(method), n_q, rtol, atol)
-    known: tuple[Method, Plan] | None = _PLANS.get(key)
-    if known is None:
+    entry: tuple[Method, Plan] | None = _PLANS.get(key)
+    if entry is None:
         # store the method, too, so that no other object gets its id
-        _PLANS[key] = known = method, method.plan(n_q, rtol, atol, False)
-    return known[1]
+        _PLANS[key] = entry = method, method.plan(n_q, rtol, atol, False)
+    return entry[1]
 
 
 def crossing_plan(n_q: int) -> Plan:
-    """Make the plan of steps across a singular position."""
+    """Return the plan of steps across a singular position."""
     from twoloop.kernels.steps import crossing_step as kernels
 
     return Plan(kernels.CROSSING, _crossing_options(), np.zeros(kernels.memory_size(n_q)), exponent=1.0 / kernels.ORDER)
@@ -157,7 +159,7 @@ def crossing_plan(n_q: int) -> Plan:
 
 @cache
 def _crossing_options() -> Array:
-    """Compute the options of steps across, once: the tableau takes longer than most of these steps."""
+    """Return the options of steps across a singular position, cached: their tableau costs more than most such steps."""
     from twoloop.kernels.steps import crossing_step as kernels
     from twoloop.methods.tableaux import gauss
 

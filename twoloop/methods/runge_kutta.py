@@ -20,15 +20,18 @@ from twoloop.methods.plan import (
 )
 from twoloop.methods.tableaux import Tableau
 
-NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps by Newton's method, because stiff forces magnify rounding
-# h rho above which the fixed-point iteration converges slowly, so that Newton's method is tried
+# outer tolerance of fixed steps by Newton's method; a smaller one may be unreachable, as stiff forces magnify rounding
+NEWTON_TOL_FIXED = 1e-12
+# h rho from which on fixed-point iteration converges so slowly that Newton's method is tried; rho: largest rate
 LIMIT_OF_FIXED_POINT = 1.5
 # largest condition number of the eigenvectors of A that count as a basis; its inverse: smallest nonzero eigenvalue
 ILL_CONDITIONED = 1e8
 # number of parts of a step for the solution within it, by the highest order for which the number suffices: with fewer
 # parts the error is more than a few times that at the ends (four-bar linkage, tolerances of 1e-4 to 1e-12)
 PARTS = {5: 1, 6: 2, 8: 3, 10: 4, np.inf: 6}
-UNDIVIDED = 6  # highest order for which Newton steps are not divided (accelerations cannot be used for interpolation)
+# highest order for which Newton steps are not divided for the solution within them; at higher orders interpolation is
+# not accurate enough, as it cannot use the accelerations of these steps
+MAX_ORDER_UNDIVIDED = 6
 
 
 @dataclass(frozen=True)
@@ -40,14 +43,15 @@ class RungeKutta:
     tableau : Tableau
         Any tableau of `twoloop.methods.tableaux`.
     outer : {"auto", "fixed-point", "newton", "paper"}
-        "fixed-point": iteration on the stage accelerations, predicted from the previous step, with a growth test.
-        "newton": simplified Newton on the stage accelerations, its linear algebra in the eigenvectors of the tableau's
-        A, with derivatives from the tangents that the system gives, else by differences of the two-loop right-hand
-        side, kept while it converges fast. For stiff problems, where fixed-point iteration needs h w_max below a
-        constant. Its error estimate is an embedded one of order s, filtered (Hairer & Wanner II, IV.8); `error` has no
-        effect.
-        "auto": "fixed-point" until steps come near the limit of its convergence and a trial of Newton's method costs
-        less for a second of motion; and back again, see `Auto`.
+        "fixed-point": iteration on the stage accelerations, predicted from the previous step; it is given up when its
+        corrections grow.
+        "newton": simplified Newton's method on the stage accelerations, in the eigenvectors of the tableau's A. The
+        Jacobian comes from the tangents that the system gives, else from differences of the two-loop right-hand side,
+        and is kept while the iteration converges fast. For stiff problems, where fixed-point iteration needs h w_max
+        below a constant. Its error estimate is an embedded one of order s, filtered (Hairer & Wanner II, IV.8); `error`
+        has no effect.
+        "auto": "fixed-point", and Newton's method where steps come near the limit of convergence of "fixed-point" and a
+        trial shows that a second of motion costs less; the run can switch back, see `Auto`.
         "paper": fixed-point iteration on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
         The step size follows the error and, except with "paper", its trend (Gustafsson 1994).
     error : {"richardson", "richardson-paper"}
@@ -64,11 +68,11 @@ class RungeKutta:
         The outer loop stops when no independent velocity or position changes by more than this, relative to
         max(|value|, 1). None: 0.01 min(rtol, atol); with fixed steps 1e-14.
     partition : {"lasting", "symmetric"}
-        "lasting": a partition stays until its pivots have become too small. "symmetric": each step has the partition
-        that full pivoting finds in the middle of the step, the same forwards and backwards, so that fixed steps with a
-        symmetric tableau (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. On conservative
-        mechanisms that swing back the way they came, `RungeKutta(gauss(3), partition="symmetric")` with fixed steps
-        then shows no drift of the energy. Step-size control spoils this.
+        "lasting": a partition is used until its pivots have become too small. "symmetric": each step uses the partition
+        that full pivoting finds in the middle of the step, which is the same forwards and backwards, so that fixed
+        steps with a symmetric tableau (Gauss, Lobatto IIIE) are time-reversible where the partition changes. Energy
+        does not drift if a conservative mechanism that swings back the way it came is integrated by
+        `RungeKutta(gauss(3), partition="symmetric")` with fixed steps; with step-size control it may.
     tested : {"all", "positions"}
         Quantities that the error estimate of outer="newton" counts: positions and velocities, or positions and the
         effect of velocities on them before these turn back or decay. Stiff vibrations that do not matter show in the
@@ -178,19 +182,19 @@ class RungeKutta:
         from twoloop.kernels.steps.stages import LazyStep
 
         tableau = self.tableau
-        extra = stages.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
-        n_systems = int(extra[stages.N_REAL] + extra[stages.N_PAIRS])
-        made = plan.changed(
+        newton_options = stages.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
+        n_systems = int(newton_options[stages.N_REAL] + newton_options[stages.N_PAIRS])
+        newton = plan.changed(
             step=LazyStep("steps.newton_step", "NEWTON"),
-            options=np.concatenate([plan.options, extra]),
+            options=np.concatenate([plan.options, newton_options]),
             memory=np.zeros(stages.memory_size(n_systems, tableau.stages, n_q)),
             matrices=stages.n_matrices(n_systems),
             projects=True,
             exponent=1.0 / (tableau.stages + 1),
         )
-        if tableau.order <= UNDIVIDED:
-            return made
-        return made.changed(within_newton=made.changed(memory=made.memory.copy(), parts=tableau.stages - 1))
+        if tableau.order <= MAX_ORDER_UNDIVIDED:
+            return newton
+        return newton.changed(within_newton=newton.changed(memory=newton.memory.copy(), parts=tableau.stages - 1))
 
     def _parts(self) -> int:
         """Return the number of parts of a step that makes the solution within it as accurate as that at its ends."""
@@ -201,12 +205,15 @@ class RungeKutta:
 
 Array = NDArray[np.float64]
 
-# ratio of the correction to the tolerance at which iteration stops: it is applied first, and convergence is quadratic
-STAGE_SHARE = 3.0
-LOOSEST_OUTER = 3e-3  # relative: larger corrections solve stiff problems so inaccurately that steps become short
-FEW_STEPS = 1e-3  # below it the share decreases with the number of steps, over which corrections add up
-STAGE_TOL_FIXED = 1e-12  # relative, for fixed steps, because stiff forces magnify rounding
-STAGE_SAFETY = 0.8  # with 0.9 one attempt in seven is rejected if the motion is not smooth, as for the stiff beam
+# largest last correction of a stage, relative to the tolerance of the run; the error that remains is much smaller, as
+# the correction is applied and convergence is quadratic
+STAGE_TOL_RATIO = 3.0
+# largest last correction of a stage, relative to max(|q|, 1): larger ones make stiff problems so inaccurate that steps
+# become short
+LOOSEST_OUTER = 3e-3
+FEW_STEPS = 1e-3  # tolerance of a run below which last corrections are smaller, because they add up over more steps
+STAGE_TOL_FIXED = 1e-12  # last correction of a stage in fixed steps, relative: stiff forces magnify rounding
+STAGE_SAFETY = 0.8  # safety factor of the step size: 0.9 rejects one attempt in seven for the stiff beam
 
 
 def _trbdf2() -> tuple[Array, Array]:
@@ -229,47 +236,49 @@ def _esdirk4() -> tuple[Array, Array]:
     return A, np.array([*embedded, -3700637 / 11593932, 61727 / 225920])
 
 
-FORMULAS = {"TRBDF2": (_trbdf2, 2), "ESDIRK4": (_esdirk4, 4)}  # with their orders
+FORMULAS = {"TRBDF2": (_trbdf2, 2), "ESDIRK4": (_esdirk4, 4)}  # function that returns the coefficients, and order
 
 
 def _jump_weights(c: Array) -> Array:
-    """Return weights of ESDIRK4's stages, exact for quadratic accelerations, that detect a jump at any place in a step.
+    """Return weights (s,) of ESDIRK4's stage accelerations whose weighted sum shows a jump anywhere in a step.
 
-    The sum of the weights of the stages after a jump is about half of the largest error of the step.
+    The sum is zero for quadratic accelerations. For a jump it is the sum of the weights of the later stages, which is
+    about half of the largest error of the step.
     """
     order = np.argsort(c)
-    at = c[order]
-    behind = np.array([0.1392, 0.0, -0.16, -0.16, 0.0])  # exactness below determines the second and the last weight
-    moments = np.array([np.diff(at), np.diff(at**2)])
-    behind[[1, 4]] = np.linalg.solve(moments[:, [1, 4]], -moments @ behind)
+    nodes = c[order]
+    # sums of the weights of all stages after each gap between nodes; the second and the last one are computed below
+    sums_after = np.array([0.1392, 0.0, -0.16, -0.16, 0.0])
+    moments = np.array([np.diff(nodes), np.diff(nodes**2)])
+    sums_after[[1, 4]] = np.linalg.solve(moments[:, [1, 4]], -moments @ sums_after)
     weights = np.zeros(len(c))
-    weights[order] = np.diff(-np.concatenate([[0.0], behind, [0.0]]))
+    weights[order] = np.diff(-np.concatenate([[0.0], sums_after, [0.0]]))
     return weights
 
 
-LOWER = {"TRBDF2": np.zeros(3), "ESDIRK4": _jump_weights(_esdirk4()[0].sum(axis=1))}
-# `rough` of their plans: the weights of ESDIRK4 differ from the embedded ones by 0.04 at most, so that the estimate is
-# 1/300 of the error if a force jumps in the first half of a step
+JUMP_WEIGHTS = {"TRBDF2": np.zeros(3), "ESDIRK4": _jump_weights(_esdirk4()[0].sum(axis=1))}
+# `Plan.rough` of the formulas: the weights of ESDIRK4 differ from the embedded ones by 0.04 at most, so that the first
+# estimate is 1/300 of the error if a force jumps in the first half of a step
 ROUGH_OF_FORMULAS = {"TRBDF2": 1.0, "ESDIRK4": 300.0}
 
 
 @dataclass(frozen=True)
 class ESDIRK:
-    """Two-loop procedure with diagonally implicit stages, each by Newton's method: few digits of stiff problems.
+    """Two-loop procedure with diagonally implicit stages, for few digits of stiff problems.
 
-    The stages are solved one after another, each with derivatives at its own iterates where the system gives tangents.
-    Without them they are differenced, and kept while Newton's method contracts fast and the error estimate finds them
-    right. A matrix of an earlier state stops contracting once stiff directions have turned;
-    `RungeKutta(..., outer="newton")`, whose stages share one matrix, is held to short steps by that at loose
-    tolerances, and is the better one at tight tolerances.
+    The stages are solved by Newton's method, one after another. If the system gives tangents, each iteration has its
+    own Jacobian. Otherwise Jacobians are computed by differences, and kept while the iteration converges fast and the
+    error estimate confirms them. An earlier Jacobian no longer leads to convergence once stiff directions have turned;
+    therefore `RungeKutta(..., outer="newton")`, whose stages share one Jacobian, is limited to short steps at loose
+    tolerances, but it is the better method at tight ones.
 
-    Both formulas are L-stable and end with their last stage. With step-size control "TRBDF2" goes on from its embedded
-    formula, of order 3: the difference, filtered for stiff components three times, is L-stable, too. A step is accepted
-    when the estimated error of the positions, from the embedded formula and filtered, is within the tolerance, and so
-    is the error that the velocities will add to them before it turns back or decays (ten times that if it does so no
-    faster than the motion changes), and what is left of it some steps later, over the time in which the motion changes.
-    ESDIRK4 has a second embedded formula for forces that jump within a step, which the first hardly shows.
-    Vibrations that the steps pass over are damped. Velocities themselves are tested with `tested="all"`.
+    Both formulas are L-stable and end with their last stage. With step-size control "TRBDF2" continues from its
+    embedded formula, of order 3: the difference, filtered for stiff components three times, is L-stable, too. A step is
+    accepted when these errors are within the tolerance: the error of the positions, estimated by the embedded formula
+    and filtered; the error that the velocities will add to the positions before it turns back or decays (ten times that
+    if it does so no faster than the motion changes); and the part of it that remains some steps later, over the time in
+    which the motion changes. ESDIRK4 has a second embedded formula for forces that jump within a step, which the first
+    hardly shows. Vibrations that are faster than the steps are damped. `tested="all"` tests velocities as well.
 
     Parameters
     ----------
@@ -279,9 +288,9 @@ class ESDIRK:
         Newton on the dependent positions stops when its largest correction, just made, is at most this (unit of q).
         None: 1e-8.
     outer_tol : float, optional
-        The outer loop stops when the correction just made changes no independent position by more than this, relative
-        to max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3, and below tolerances of 1e-3 less by the number of
-        steps over which such corrections add up; with fixed steps 1e-12.
+        The outer loop stops when the last correction changes no independent position by more than this, relative to
+        max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3; below tolerances of 1e-3 less, in proportion to the
+        number of steps over which such corrections add up; with fixed steps 1e-12.
     tested : {"all", "positions"}
         Quantities that the error estimate counts: positions and velocities, or positions and the effect of velocities
         on them. Stiff vibrations that do not matter show in the velocities; "positions" ignores them.
@@ -326,13 +335,13 @@ class ESDIRK:
         """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.steps.stages import LazyStep, diagonal_memory, diagonal_options, n_matrices
 
-        make, order = FORMULAS[self.formula]
-        A, embedded = make()
+        coefficients, order = FORMULAS[self.formula]
+        A, embedded = coefficients()
         exponent = 1.0 / (3.0 if order == 2 else 4.0)
         outer_tol = STAGE_TOL_FIXED if self.outer_tol is None else self.outer_tol
         if self.outer_tol is None and not fixed:
             tolerance = least_tolerance(rtol, atol)
-            outer_tol = min(STAGE_SHARE * tolerance, LOOSEST_OUTER) * min(1.0, (tolerance / FEW_STEPS) ** exponent)
+            outer_tol = min(STAGE_TOL_RATIO * tolerance, LOOSEST_OUTER) * min(1.0, (tolerance / FEW_STEPS) ** exponent)
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         return Plan(
             LazyStep("steps.diagonal_step", "DIAGONAL"),
@@ -340,7 +349,7 @@ class ESDIRK:
                 A,
                 A.sum(axis=1),
                 A[-1] - embedded,
-                LOWER[self.formula],
+                JUMP_WEIGHTS[self.formula],
                 inner_tol,
                 outer_tol,
                 self.tested == "all",

@@ -15,8 +15,8 @@ from twoloop.checks.arguments import check_real, check_size, check_text, check_v
 
 Array = NDArray[np.float64]
 
-CONSISTENT = 1e-12  # relative to the sum of magnitudes of coefficients: rounding error of their sum
-MOST_STAGES = 100  # largest number of stages: no motion is smooth for as long as steps with more stages would be
+ROUNDING_OF_SUM = 1e-12  # largest rounding error of a sum of coefficients, relative to the sum of their magnitudes
+MAX_STAGES = 100  # largest number of stages: no motion is smooth for as long as steps with more stages would be
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +66,11 @@ class Tableau:
         check_vector("b", b, s)
         c = check_vector("c", self.c, s)
         check_size("order", self.order, 1)
-        if abs(b.sum() - 1.0) > CONSISTENT * np.abs(b).sum():
+        if abs(b.sum() - 1.0) > ROUNDING_OF_SUM * np.abs(b).sum():
             raise ValueError(f"b must sum to 1; the sum of {b.tolist()} is {float(b.sum())!r}")
-        off = np.abs(A.sum(axis=1) - c)
-        if (off > CONSISTENT * np.maximum(np.abs(A).sum(axis=1), 1.0)).any():
-            i = int(off.argmax())
+        errors = np.abs(A.sum(axis=1) - c)
+        if (errors > ROUNDING_OF_SUM * np.maximum(np.abs(A).sum(axis=1), 1.0)).any():
+            i = int(errors.argmax())
             raise ValueError(
                 f"c must be the row sums of A, so that time is integrated as the state is; row {i} of A sums to "
                 f"{float(A[i].sum())!r}, and c[{i}] is {float(c[i])!r}"
@@ -80,7 +80,7 @@ class Tableau:
 
     @property
     def content(self) -> tuple[object, ...]:
-        """Return the present coefficients as a key for comparisons."""
+        """Return name, order and coefficients as a key by which tableaux are compared."""
         return self.name, self.order, self.A.tobytes(), self.b.tobytes(), self.c.tobytes()
 
     @property
@@ -96,16 +96,16 @@ class Tableau:
 
 
 def _nodes(polynomial: Legendre) -> Array:
-    """Return the roots of a Legendre series on [0, 1], polished by Newton's method."""
+    """Return the roots (s,) of a Legendre series, mapped to [0, 1] and improved by Newton's method."""
     x = np.sort(np.real(polynomial.roots()))
-    slope = polynomial.deriv()
+    derivative = polynomial.deriv()
     for _ in range(3):
-        x = x - polynomial(x) / slope(x)
+        x = x - polynomial(x) / derivative(x)
     return np.asarray((1.0 + x) / 2.0)
 
 
 def _collocation(c: Array) -> tuple[Array, Array]:
-    """Return A and b of the collocation method at the nodes c, by the Legendre basis (well conditioned)."""
+    """Return A (s, s) and b (s,) of the collocation method at the nodes c, in the well-conditioned Legendre basis."""
     s = len(c)
     x = 2.0 * c - 1.0
     basis = [Legendre.basis(k) for k in range(s)]
@@ -120,13 +120,13 @@ def _symplectic_average(A: Array, b: Array) -> Array:
     return 0.5 * (A + b[None, :] * (1.0 - A.T / b[:, None]))
 
 
-def _check_stages(s: int, least: int, family: str) -> None:
+def _check_stages(s: int, minimum: int, family: str) -> None:
     if isinstance(s, bool) or not isinstance(s, (int, np.integer)):
         raise TypeError(f"s must be an int, the number of stages of {family}; given {s!r} of type {type(s).__name__}")
-    if s < least:
-        raise ValueError(f"s must be at least {least} for {family}; given {s}")
-    if s > MOST_STAGES:
-        raise ValueError(f"s must be at most {MOST_STAGES} for {family}; given {shown(s)}")
+    if s < minimum:
+        raise ValueError(f"s must be at least {minimum} for {family}; given {s}")
+    if s > MAX_STAGES:
+        raise ValueError(f"s must be at most {MAX_STAGES} for {family}; given {shown(s)}")
 
 
 def gauss(s: int) -> Tableau:

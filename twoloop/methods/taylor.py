@@ -18,10 +18,12 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 LOWEST, HIGHEST = 4, 40  # limits of the option `order`
-PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the benchmark mechanisms
-PER_DIGIT_IN_LANES, LEAST_IN_LANES = 1.25, 3.5  # the same for code in SIMD lanes
+# order of the series: LEAST plus PER_DIGIT for each digit of the tolerance, about the cheapest for benchmark mechanisms
+PER_DIGIT, LEAST = 1.15, 5.0
+PER_DIGIT_IN_LANES, LEAST_IN_LANES = 1.25, 3.5  # PER_DIGIT and LEAST for series in SIMD lanes
 FIXED = 19  # order of fixed steps
-# limits of the number of parts of a step for the solution within it: states of the step's series, projected
+# limits of the number of parts into which a step is divided for the solution within it; the states between parts are
+# values of the series of the step, projected onto the constraints
 MIN_PARTS, MAX_PARTS = 3, 6
 PADDING = 8  # a table is padded to a multiple of this number of operations
 
@@ -39,15 +41,15 @@ def _order(rtol: float, atol: float, least: float, per_digit: float) -> int:
 class Taylor:
     """Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
 
-    The cheapest method here at tight tolerances. The callbacks run once in Python on symbols; this takes milliseconds
-    and compiles nothing. The coefficients of q, v, a and lam follow from their operations, order by order. Each order
-    takes one linear solution with the matrix of the accelerations, and no derivative of the constraints beyond C_q.
-    gamma and kinematics are not used. A step is as long as the series allows. Its end is moved to the nearest state on
-    the constraints, in the metric of M. The method thus departs from the paper, whose outer loop has only independent
-    coordinates.
+    It is the cheapest method here at tight tolerances. The callbacks run once in Python on symbols; this takes
+    milliseconds and compiles nothing. The coefficients of q, v, a and lam follow from the recorded operations, order by
+    order. Each order takes one linear solution with the matrix of the accelerations, and no derivative of the
+    constraints beyond C_q. gamma and kinematics are not used. A step is as long as the series allows. Its end is moved
+    to the nearest state on the constraints, in the metric of M. The method thus departs from the paper, whose outer
+    loop has only independent coordinates.
 
-    It needs callbacks that give C_q and do not branch on t, q or v, made of + - * /, powers, sin, cos, tan, sqrt,
-    hypot, exp, log, atan, sinh, cosh and tanh. If they are not, `solve_dae` raises ValueError and names the callback.
+    Callbacks must not branch on t, q or v, and must consist of + - * /, powers, sin, cos, tan, sqrt, hypot, exp, log,
+    atan, sinh, cosh and tanh. Otherwise `solve_dae` raises ValueError and names the callback.
 
     Parameters
     ----------
@@ -62,10 +64,10 @@ class Taylor:
 
     Notes
     -----
-    Number of derivatives of each equation: J. D. Pryce, A simple structural analysis method for
-    DAEs, BIT 41 (2001), 364-394. The step: the length at which each of the last two terms is within the tolerance, A.
-    Jorba and M. Zou, A software package for the numerical integration of ODEs by means of high-order Taylor methods,
-    Experimental Mathematics 14 (2005), 99-117. In the statistics every coefficient counts as an evaluation.
+    Number of derivatives of each equation: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001),
+    364-394. The step size, at which each of the last two terms is within the tolerance: A. Jorba and M. Zou, A software
+    package for the numerical integration of ODEs by means of high-order Taylor methods, Experimental Mathematics 14
+    (2005), 99-117. In the statistics every order counts as an evaluation.
 
     Examples
     --------
@@ -92,12 +94,12 @@ class Taylor:
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
     ) -> "Taylor":
-        """Return the method with the operations of this system; it does not use generated code for them.
+        """Return the method with the series program of a system; `code` is not used.
 
         Raises
         ------
         ValueError
-            If its callbacks do not run on symbols, or `check` finds that their traces differ from calls.
+            If callbacks do not run on symbols, or `check` finds that their traces differ from calls.
         """
         try:
             program = series_for(system, check)
@@ -108,7 +110,7 @@ class Taylor:
         return replace(self, program=program)
 
     def takes_code(self, fixed: bool) -> bool:
-        """Return whether its steps may run with generated code."""
+        """Return whether the steps of this method can run with generated code."""
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
@@ -138,13 +140,13 @@ class Taylor:
             parts=min(max(highest // 3, MIN_PARTS), MAX_PARTS),
             traced=(program.traced,),
         )
-        kept = plan.options.copy()
-        kept[kernels.KEEP] = 1.0
-        return plan.changed(interior=plan.changed(options=kept, memory=plan.memory.copy()))
+        interior_options = plan.options.copy()
+        interior_options[kernels.KEEP] = 1.0
+        return plan.changed(interior=plan.changed(options=interior_options, memory=plan.memory.copy()))
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
-    """Return the options that the step reads as one array; integers are stored by their bits."""
+    """Return the options of a step as one array of floats, in which integers are stored by their bits."""
     from twoloop.kernels.steps import taylor_step as kernels
 
     tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]
