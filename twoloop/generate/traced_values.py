@@ -120,7 +120,7 @@ class Traced:
         with np.errstate(all="ignore"):
             largest = np.abs(np.where(finite, called, 0.0)).max(axis=0)
             differences = np.abs(called - traced)
-            agree = differences <= kernels.SAME * largest + kernels.ROUNDED * bounds
+            agree = differences <= kernels.MAX_DIFFERENCE * largest + kernels.ROUNDING_FACTOR * bounds
         if everywhere:
             agree |= ~finite & ~np.isfinite(traced)
         else:

@@ -1,11 +1,11 @@
-"""Compiled parts of the checks of a start: evaluation of all callbacks, checks of the rows, and units of coordinates.
+"""Check the start of a run in compiled code: evaluate all callbacks, check C_q and A, and choose units of coordinates.
 
 If the evaluation finds nothing wrong, no other check needs to run. Units of rows and of coordinates are chosen so that
-the entries of C_q in these units have similar sizes. The linear range of a row is the distance over which coordinates
-can move before the row changes much (checks/scales.py).
+the entries of C_q in these units have similar sizes. The linear range of a row of C_q is the distance over which the
+coordinates can move before the row changes much (checks/scales.py).
 
-Callbacks are also compared with their traces, see generate/traced_values.py. A bound of the rounding error is computed
-for each traced number, in units of EPS: at least the sum of the absolute values of its terms.
+Callbacks are also compared with their traces, see generate/traced_values.py. For each traced number, a bound on its
+rounding error is computed, in units of EPS: at least the sum of the absolute values of its terms.
 """
 
 import math
@@ -26,9 +26,9 @@ from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.operations import operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
-NO_ENTRY = 1e-12  # largest entry of C_q that counts as a rounding error of zero, relative to the largest in its row
+NO_ENTRY = 1e-12  # an entry of C_q up to this, relative to the largest in its row, is a rounding error of zero
 MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares in column_units
-NEGLIGIBLE = 1e-6  # largest coordinate that counts as zero in linear_ranges, relative to the largest coordinate
+NEGLIGIBLE = 1e-6  # a coordinate up to this, relative to the largest one, counts as zero in linear_ranges
 
 
 @exact
@@ -42,58 +42,58 @@ def _sort(values):
 
 
 @exact
-def _fit_columns(rows, columns, counts, logs):
-    """Store in `columns` the logarithms of units that best fit those in `rows`; return whether none has changed."""
+def _fit_columns(rows, columns, mask, logs):
+    """Store in `columns` the logs of the columns' units that best fit the rows' units; return whether none changed."""
     unchanged = True
     for j in range(columns.size):
         total, n = 0.0, 0
         for i in range(rows.size):
-            if counts[i, j] != 0.0:
+            if mask[i, j] != 0.0:
                 total += rows[i] - logs[i, j]
                 n += 1
-        new = total / n if n > 0 else 0.0
-        unchanged = unchanged and new == columns[j]
-        columns[j] = new
+        mean = total / n if n > 0 else 0.0
+        unchanged = unchanged and mean == columns[j]
+        columns[j] = mean
     return unchanged
 
 
 @exact
-def _fit_rows(columns, rows, counts, logs):
-    """Store in `rows` the logarithms of units that best fit those in `columns`, see `_fit_columns`."""
+def _fit_rows(columns, rows, mask, logs):
+    """Store in `rows` the logs of the rows' units that best fit the columns' units, see `_fit_columns`."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
-            if counts[i, j] != 0.0:
+            if mask[i, j] != 0.0:
                 total += logs[i, j] + columns[j]
                 n += 1
         rows[i] = total / n if n > 0 else 0.0
 
 
 @kernel(types.void(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR))
-def column_units(matrix, typical, columns, counts, logs, rows, scratch):
-    """Store in `columns` units of the coordinates, estimated from a constraint Jacobian, to compare angles and lengths.
+def column_units(matrix, typical, columns, mask, logs, rows, scratch):
+    """Store in `columns` (n_q) the units of the coordinates in which the entries of C_q (`matrix`) have similar sizes.
 
-    |entry (i, j)| is about unit of row i / unit of coordinate j: the sum of squares of log|entry| + log(unit of j) -
-    log(unit of i) is minimal. A common factor is free, and is such that the median ratio of the units to `typical` is
-    1. Coordinates without entries get their typical units. The last four arrays are scratch.
+    The units minimize the sum over all entries of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2. Their
+    common factor is chosen so that the median ratio of the units to `typical` is 1. Coordinates without entries get
+    their typical units. The last four arguments are scratch.
     """
     n_used, log_factor = 0, 0.0
     for i in range(rows.size):
         largest = largest_of(matrix[i])
         for j in range(columns.size):
-            counts[i, j] = 1.0 if abs(matrix[i, j]) > NO_ENTRY * largest else 0.0
-            logs[i, j] = math.log(abs(matrix[i, j])) if counts[i, j] != 0.0 else 0.0
+            mask[i, j] = 1.0 if abs(matrix[i, j]) > NO_ENTRY * largest else 0.0
+            logs[i, j] = math.log(abs(matrix[i, j])) if mask[i, j] != 0.0 else 0.0
     for j in range(columns.size):
         columns[j] = 0.0
     for _ in range(MAX_SWEEPS):
-        _fit_rows(columns, rows, counts, logs)
-        if _fit_columns(rows, columns, counts, logs):
+        _fit_rows(columns, rows, mask, logs)
+        if _fit_columns(rows, columns, mask, logs):
             break
     for j in range(columns.size):
-        used = False
+        has_entry = False
         for i in range(rows.size):
-            used = used or counts[i, j] != 0.0
-        if used:
+            has_entry = has_entry or mask[i, j] != 0.0
+        if has_entry:
             scratch[n_used] = math.log(typical[j]) - columns[j]
             n_used += 1
         else:
@@ -107,11 +107,12 @@ def column_units(matrix, typical, columns, counts, logs, rows, scratch):
 
 @kernel(types.void(MATRIX, VECTOR, f8, VECTOR, VECTOR))
 def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
-    """Store in `ranges` the linear range of each row: 1, its radius, or the median of its coordinates.
+    """Store in `ranges` the distance over which each row of C_q changes little, in units of the coordinates.
 
-    The range is the radius, if this is at most 1 or at most the largest coordinate of the row; otherwise, the lower
-    median of the coordinates that are not NEGLIGIBLE, or 1 if none exceeds `negligible`. `coordinates_in_units`: the
-    coordinates in each row, 0 where the row is 0; `radius`: norm of each row over its change for a unit displacement.
+    The distance is the row's radius, if this is at most 1 or at most the largest coordinate in the row. Otherwise it is
+    the lower median of the row's coordinates that are not NEGLIGIBLE, or 1 if none exceeds `negligible`. Row i of
+    `coordinates_in_units` has the coordinates with an entry in row i, else 0; `radius` has the norms of the rows,
+    divided by their change per unit displacement.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -130,10 +131,10 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 
 
 # flags that evaluate_start returns. IN_ORDER: all values are finite, M is symmetric, no row is empty. CONSISTENT: the
-# state satisfies the constraints up to rounding. DEFINITE, INDEFINITE: M varies, and is positive definite, or not
-# positive definite, by a margin
+# state satisfies the constraints up to rounding. DEFINITE: M varies and is positive definite by a margin. INDEFINITE: M
+# varies and is not positive definite by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # distance from a stored position, relative to the sizes stored with it, up to which these apply
+NEAR_SHARE = 0.5  # largest distance from a stored position, relative to the stored sizes, at which these sizes apply
 ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
 EIGENVALUE_MARGIN = 2.0  # factor by which eigenvalues must differ from their limit, so that rounding does not decide
 
@@ -144,7 +145,7 @@ def results_size(n: int, n_c: int, n_a: int) -> int:
 
 
 @exact
-def _clear(A):
+def _set_to_zero(A):
     for i in range(len(A)):
         for j in range(A.shape[1]):
             A[i, j] = 0.0
@@ -162,11 +163,11 @@ def _has_empty_row(rows):
 @exact
 def _is_symmetric(mass, allowed):
     """Return whether M is symmetric, up to differences of `allowed` times its largest entry."""
-    largest, asymmetry, same = 0.0, 0.0, True
+    largest, asymmetry, is_exactly_symmetric = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
-            same = same and mass[i, j] == mass[j, i]
-    if same:
+            is_exactly_symmetric = is_exactly_symmetric and mass[i, j] == mass[j, i]
+    if is_exactly_symmetric:
         return True
     for i in range(len(mass)):
         for j in range(len(mass)):
@@ -176,44 +177,44 @@ def _is_symmetric(mass, allowed):
 
 @exact
 def _is_rounding(value, row, state, sizes, least, rate, allowed):
-    """Return whether the sum `value` is a rounding error: at most `allowed` times the sum of the sizes of its terms.
+    """Return whether a sum, `value`, is a rounding error: at most `allowed` times the sum of the |terms|.
 
-    The terms are `rate` and the products of row[j] and state[j]; |state[j]| counts as at least sizes[j] and `least`.
+    The terms are `rate` and row[j] state[j] for all j; |state[j]| counts as at least sizes[j] and at least `least`.
     """
-    size = abs(rate)
+    sum_of_terms = abs(rate)
     for j in range(state.size):
-        size += abs(row[j]) * max(abs(state[j]), sizes[j], least)
-    return abs(value) <= allowed * size
+        sum_of_terms += abs(row[j]) * max(abs(state[j]), sizes[j], least)
+    return abs(value) <= allowed * sum_of_terms
 
 
 @exact
 def _is_near(q, sizes, stored_q):
     """Return whether q is so near `stored_q` that the `sizes` of the coordinates at stored_q apply to q, too."""
-    near = True
+    is_near = True
     for j in range(q.size):
-        near = near and abs(q[j] - stored_q[j]) <= NEAR_SHARE * sizes[j]
-    return near
+        is_near = is_near and abs(q[j] - stored_q[j]) <= NEAR_SHARE * sizes[j]
+    return is_near
 
 
 @exact
-def _has_entries(rows, entries):
-    """Return whether `rows` is nonzero exactly where `entries` (row by row) is; otherwise stored sizes do not apply."""
-    same, n = True, rows.shape[1]
+def _has_same_entries(rows, entries):
+    """Return whether `rows` is nonzero exactly where `entries`, stored row by row, is: then stored sizes may apply."""
+    is_same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])
         for j in range(n):
-            same = same and (abs(rows[i, j]) > NO_ENTRY * largest) == (entries[i * n + j] != 0.0)
-    return same
+            is_same = is_same and (abs(rows[i, j]) > NO_ENTRY * largest) == (entries[i * n + j] != 0.0)
+    return is_same
 
 
 @exact
-def _find_known_sizes(q, rows, n_c, sizes):
-    """Return the first index in `sizes` of the data of a stored position near q (its sizes come first); -1: none."""
+def _find_stored_sizes(q, rows, n_c, sizes):
+    """Return the index in `sizes` at which the data of a stored position near q begin; -1 if there is none."""
     n = q.size
-    n_numbers = 2 * n + n_c * n
-    for k in range(0, sizes.size, n_numbers):
-        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has_entries(
-            rows, sizes[k + 2 * n : k + n_numbers]
+    stride = 2 * n + n_c * n
+    for k in range(0, sizes.size, stride):
+        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has_same_entries(
+            rows, sizes[k + 2 * n : k + stride]
         ):
             return k
     return -1
@@ -224,19 +225,19 @@ def _is_consistent(C, rate, rows, q, v, sizes, allowed):
     """Return whether (q, v) satisfies the constraints, with values C, `rows` and `rate`, up to rounding.
 
     The size of a coordinate counts as at least its stored size, and at least the rounding error of the largest
-    coordinate: if the coordinates of a constraint are zero but for rounding, as out of the plane of a motion, the value
-    of the constraint is not small relative to its terms.
+    coordinate: if the coordinates of a constraint are zero but for rounding, as those out of the plane of a planar
+    motion, the value of the constraint is not small relative to its terms.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
-    begin = _find_known_sizes(q, rows, C.size, sizes)
-    known_sizes = q if begin < 0 else sizes[begin : begin + q.size]
+    begin = _find_stored_sizes(q, rows, C.size, sizes)
+    stored_sizes = q if begin < 0 else sizes[begin : begin + q.size]
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
         if not _is_rounding(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _is_rounding(C[i], rows[i], q, known_sizes, rounding, 0.0, allowed):
+        if i < C.size and not _is_rounding(C[i], rows[i], q, stored_sizes, rounding, 0.0, allowed):
             return False
     return True
 
@@ -245,13 +246,13 @@ def _is_consistent(C, rate, rows, q, v, sizes, allowed):
 def _record_entries(rows, pattern):
     for i in range(len(rows)):
         for j in range(rows.shape[1]):
-            # an unconditional store, so that LLVM vectorizes the loop
+            # the store is unconditional, so that LLVM vectorizes the loop
             pattern[i, j] = 1.0 if rows[i, j] != 0.0 else pattern[i, j]
 
 
 @exact
 def _record_entries_near(f, t, q, shifts, position, rows, n_c, pattern):
-    """Set `pattern` to 1 also where rows are nonzero at q plus the size of q times a row of `shifts`.
+    """Set `pattern` to 1 also where C_q or A is nonzero at a position q + max|q| shifts[k].
 
     `position` and `rows` are scratch.
     """
@@ -259,7 +260,7 @@ def _record_entries_near(f, t, q, shifts, position, rows, n_c, pattern):
     for k in range(len(shifts)):
         for j in range(q.size):
             position[j] = q[j] + max(abs(q[j]), largest) * shifts[k, j]
-        _clear(rows)
+        _set_to_zero(rows)
         f.jacobian(t, position, f.p, rows[:n_c])
         f.nonholonomic(t, position, f.p, rows[n_c:])
         _record_entries(rows, pattern)
@@ -280,14 +281,14 @@ def _is_definite(mass, min_eigenvalue, factors):
 
 @kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern, roundings):
-    """Evaluate all callbacks at (t, q, v), and store their results; return the flags IN_ORDER to INDEFINITE.
+    """Evaluate all callbacks at (t, q, v), and store their results; return the sum of the flags above that hold.
 
     Arguments:
 
     - roundings: allowed relative rounding errors of constraints, of the symmetry of M, and of its eigenvalues
-    - sizes: stored positions and the sizes of their coordinates (`keep` of checks/scales.py), which are lower bounds of
+    - sizes: stored positions and the sizes of their coordinates (`keep` of checks/scales.py), which are lower bounds on
       the sizes near these positions
-    - shifts: displacements of q, relative to its size, at which nonzero entries of rows are also recorded
+    - shifts: displacements of q, relative to max|q|, at which nonzero entries of C_q and A are also recorded
     - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
     - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results, and scratch
     """
@@ -319,12 +320,12 @@ def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern,
         if not finite(scratch):
             return 0
     if flags[FORCE_BY_V_GIVEN] == 1:
-        _clear(scratch)
+        _set_to_zero(scratch)
         f.force_by_v(t, q, v, f.p, scratch)
         if not finite(scratch):
             return 0
     if flags[REACTION_BY_Q_GIVEN] == 1:
-        _clear(scratch)
+        _set_to_zero(scratch)
         f.reaction_by_q(t, q, lam, f.p, scratch)
         if not finite(scratch):
             return 0
@@ -346,7 +347,7 @@ def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern,
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at(f, t, positions, n_c, rows):
-    """Store C_q (n_c rows) and A at one position after the other in `rows`, which contains zeros on entry."""
+    """Store in `rows`, zero on entry, C_q (n_c rows) and A at each of the `positions`, one position after another."""
     n_rows = len(rows) // len(positions)
     for k in range(len(positions)):
         begin = k * n_rows
@@ -370,10 +371,10 @@ def _agrees(fused, separate, allowed, rounding_errors):
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
 def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, allowed, rounding):
-    """Return whether results of the fused and the separate callbacks differ by at most `allowed` times the largest.
+    """Return whether results of the fused and the separate callbacks differ by at most `allowed` times the largest one.
 
-    Constraints may also differ by `rounding` times the sizes of their terms. `fused` and `separate`, (3 + n_q, n_c),
-    are zero on entry, and C, C_t, gamma and C_q on return; `rounding_errors` (n_c), zero on entry, is scratch.
+    Values of C may also differ by `rounding` times the sum of their |terms|. `fused` and `separate`, (3 + n_q, n_c),
+    are zero on entry, and contain C, C_t, gamma and C_q on return; `rounding_errors` (n_c), zero on entry, is scratch.
     """
     n, n_c = q.size, rounding_errors.size
     fused_rows, separate_rows = fused[3:].reshape((n_c, n)), separate[3:].reshape((n_c, n))
@@ -396,13 +397,14 @@ def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, allowed, roun
 VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors
 
 EPS = 2.0**-52
-SAME = 1e-9  # largest difference of a callback and its trace, relative to the largest number, apart from rounding
-ROUNDED = 200.0 * EPS  # largest rounding error of a traced number, relative to its bound in `bounds`
+# largest difference between a callback and its trace, apart from rounding, relative to the callback's largest value
+MAX_DIFFERENCE = 1e-9
+ROUNDING_FACTOR = 200.0 * EPS  # largest rounding error of a traced number, relative to its entry in `bounds`
 
 
 @exact
-def _sum(columns, coefficients, constant, nodes, begin, end):
-    """Return `constant` plus the sum of coefficient times node over the terms begin to end - 1, and its error bound."""
+def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
+    """Return constant + sum of coefficient * node over the terms begin to end - 1, and the error bound of this sum."""
     total, bound = constant, abs(constant)
     for k in range(begin, end):
         term = coefficients[k] * nodes[VALUE, columns[k]]
@@ -412,8 +414,8 @@ def _sum(columns, coefficients, constant, nodes, begin, end):
 
 
 @exact
-def _operation(kind, x, dx, y, dy):
-    """Return the result of an operation on x and y, and its error bound; dx and dy are the bounds of x and y."""
+def _operation_with_bound(kind, x, dx, y, dy):
+    """Return the result of an operation on x and y, and its error bound; dx and dy are the error bounds of x and y."""
     z = operation(kind, x, y)
     if kind == op.PRODUCT:
         dz = abs(x) * dy + abs(y) * dx
@@ -438,18 +440,18 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
     """Store results of a traced program in `values`, their error bounds in `bounds`; `nodes` begins with the inputs."""
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
-        x, dx = _sum(columns, coefficients, constants[i, 0], nodes, first, second)
+        x, dx = _sum_with_bound(columns, coefficients, constants[i, 0], nodes, first, second)
         if program[i, op.KIND] == op.RESULT:
             values[program[i, op.NODE]], bounds[program[i, op.NODE]] = x, dx
         else:
-            y, dy = _sum(columns, coefficients, constants[i, 1], nodes, second, end)
-            z, dz = _operation(program[i, op.KIND], x, dx, y, dy)
+            y, dy = _sum_with_bound(columns, coefficients, constants[i, 1], nodes, second, end)
+            z, dz = _operation_with_bound(program[i, op.KIND], x, dx, y, dy)
             nodes[VALUE, program[i, op.NODE]], nodes[BOUND, program[i, op.NODE]] = z, dz
 
 
 @exact
 def _count_differences(called, traced, bounds):
-    """Return the number of entries that differ by more than SAME and ROUNDED allow, or are not finite."""
+    """Return the number of entries of `called` that are not finite, or differ from `traced`, see `compare_traces`."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0
@@ -457,7 +459,7 @@ def _count_differences(called, traced, bounds):
             if math.isfinite(called[k, i]):
                 largest = max(largest, abs(called[k, i]))
         for k in range(len(called)):
-            if not abs(called[k, i] - traced[k, i]) <= SAME * largest + ROUNDED * bounds[k, i]:
+            if not abs(called[k, i] - traced[k, i]) <= MAX_DIFFERENCE * largest + ROUNDING_FACTOR * bounds[k, i]:
                 count += 1
     return count
 
@@ -470,10 +472,10 @@ def compare_traces(
 ):
     """Compare callbacks with their traces at `states`, which has rows [t, q, v]; return how many numbers differ.
 
-    Two numbers differ if their difference exceeds SAME times the largest value at these states, plus ROUNDED times the
-    error bound of the traced number. `sizes`: n_q, n_c and n_a; `is_compared`: 1 for each of KINDS in traced_values.py
-    that has to be compared. Stores the values of the callbacks in `called`, which must be zero on entry, those of the
-    traces in `traced`, and their error bounds in `bounds`; `nodes` is scratch.
+    Two numbers differ if their difference exceeds MAX_DIFFERENCE times the largest value at these states, plus
+    ROUNDING_FACTOR times the error bound of the traced number. `sizes`: n_q, n_c and n_a; `is_compared`: 1 for each of
+    KINDS in traced_values.py that has to be compared. Stores the values of the callbacks in `called`, which must be
+    zero on entry, those of the traces in `traced`, and their error bounds in `bounds`; `nodes` is scratch.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

@@ -1,9 +1,9 @@
-"""Evaluate the rows of the constraints on velocities, their rates, and their right-hand side Gamma by differences.
+"""Evaluate the rows G of the constraints, their rates C_t and b, and by finite differences the right-hand side Gamma.
 
-The first rows are C_q of C(t, q) = 0, the others A of A(t, q) v + b(t, q) = 0.
+The first rows of G are C_q, from C(t, q) = 0; the other rows are A, from A(t, q) v + b(t, q) = 0.
 
-Gamma, in G a = Gamma, is computed by differences along the motion: two central differences, with the steps e and 2 e
-(s), give the derivative to order 4. The disagreement of the two differences estimates the error, by which e is chosen.
+Gamma, the right-hand side of G a = Gamma, is a derivative along the motion: two central differences, with the steps e
+and 2 e (s), give it to order 4. Their disagreement estimates the error, and the step e is chosen by this estimate.
 """
 
 import numpy as np
@@ -77,7 +77,7 @@ def constraint_rates(f, w, t, q, rate):
 
 @merged
 def kinematics(f, w, t, q, v):
-    """Store C, C_q and A, C_t and b, and Gamma of the rows of C, at (t, q, v), in `w`, by the fused callback."""
+    """Store C, C_q with A, C_t with b, and Gamma of the rows of C_q at (t, q, v) in w, by the fused callback."""
     n_c, n_rows = w.C.size, w.Rate.size
     clear_rows(f, w)
     w.C[:] = 0.0
@@ -92,7 +92,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store right-hand sides in the rows of D: the negative independent columns of G, then the negative `rate`."""
+    """Store right-hand sides in the rows of D: -G_j for each independent column j of G, then -`rate`."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -101,20 +101,21 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-# largest difference step, s, and largest change of q in such a step, relative to max|q|. MIN_STEP_RATIO: lower bound of
-# the result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
+# MAX_DIFFERENCE_STEP: largest difference step, s, and largest change of q in a difference step, relative to max|q|.
+# MIN_STEP_RATIO: smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
-ROUNDING_DISAGREEMENT = 1e-9  # disagreement of both differences, relative to Gamma, that rounding alone may cause
-# disagreement, relative to Gamma, below which the difference step is doubled: accuracy suffices, and rounding decreases
+ROUNDING_DISAGREEMENT = 1e-9  # disagreement of the two differences, relative to Gamma, that rounding alone may cause
+# the difference step is doubled, which reduces rounding errors, if the two differences disagree by less, relative to
+# Gamma
 ENLARGE_BELOW = 1e-11
-# weights of the values at 0, e, 2 e and 4 e in first derivatives of order 2, with the step e, and with the step 2 e
+# weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2: with the step e, and with the step 2 e
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 # step of one-sided differences, relative to that of central ones: it is smaller, because their order is lower
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0
 # rounding error of Gamma if the terms of G v cancel, relative to the largest term divided by largest_difference_step
 ROUNDING_OF_TERMS = 1e-14
-CONVERGED_CHANGE = 0.01  # largest change of Gamma, over the required accuracy, that ends the search for a step
+CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this times the required accuracy
 
 
 @exact
@@ -132,12 +133,12 @@ def largest_difference_step(q, v):
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:
         return MAX_DIFFERENCE_STEP
-    return MAX_DIFFERENCE_STEP * max(size / speed, MIN_STEP_RATIO)  # the latter where all coordinates are near zero
+    return MAX_DIFFERENCE_STEP * max(size / speed, MIN_STEP_RATIO)  # size / speed is 0 if q is 0
 
 
 @merged
-def _one_sided_direction(notes, t, e):
-    """Return the side of t for differences near a known jump of C_t or b: 1 after t, -1 before t, 0 both sides."""
+def _difference_side(notes, t, e):
+    """Return on which side of t to take differences: 1 after, -1 before, if C_t or b jumps close to t; else 0, both."""
     before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(before, after) >= 2.0 * e:
         return 0.0
@@ -148,14 +149,15 @@ def _one_sided_direction(notes, t, e):
 def _differences(f, w, t, q, v, e, first, last):
     """Store Gamma[first:last], by differences with the steps e and 2 e, in w.Gamma; return three maxima.
 
-    These are max|Gamma|, the largest disagreement of both differences (both NaN if not finite), and max|terms of G v|.
+    They are max|Gamma|, the largest disagreement of the two differences (both NaN if not finite), and the largest
+    |term| of G v.
     """
     Gamma_twice = w.Gamma_tried[0]
-    side = _one_sided_direction(w.notes, t, e)
-    shorter = representable_step(t, ONE_SIDED_STEP_RATIO * e)
-    if side != 0.0 and shorter > 0.0:
-        e = shorter
-    terms = 0.0
+    side = _difference_side(w.notes, t, e)
+    one_sided_step = representable_step(t, ONE_SIDED_STEP_RATIO * e)
+    if side != 0.0 and one_sided_step > 0.0:
+        e = one_sided_step
+    largest_term = 0.0
     for i in range(first, last):
         w.Gamma[i] = 0.0
         Gamma_twice[i] = 0.0
@@ -169,7 +171,7 @@ def _differences(f, w, t, q, v, e, first, last):
         for i in range(first, last):
             for j in range(v.size):
                 w.g[i] += w.Gx[i, j] * v[j]
-                terms = max(terms, abs(w.Gx[i, j] * v[j]))
+                largest_term = max(largest_term, abs(w.Gx[i, j] * v[j]))
             if side != 0.0:
                 w.Gamma[i] -= ONE_SIDED[k] * w.g[i] / (side * e)
                 Gamma_twice[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
@@ -184,19 +186,19 @@ def _differences(f, w, t, q, v, e, first, last):
         w.Gamma[i] = (4.0 * w.Gamma[i] - Gamma_twice[i]) / 3.0
         largest = max(largest, abs(w.Gamma[i]))
         if not np.isfinite(w.Gamma[i]):
-            return np.nan, np.nan, terms
-    return largest, disagreement, terms
+            return np.nan, np.nan, largest_term
+    return largest, disagreement, largest_term
 
 
 @merged
 def _max_disagreement(notes):
-    """Return the largest accepted disagreement of both differences; the error of their combination is much smaller."""
+    """Return the largest accepted disagreement of the two differences; their combination has a much smaller error."""
     return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
 
 
 @compiled
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
-    """Store Gamma in w.Gamma, by the difference step, among ever smaller ones, at which Gamma changes least.
+    """Store Gamma[first:last] in w.Gamma, by the difference step at which Gamma changes least when the step decreases.
 
     Stores this step as GAMMA_STEP_RATIO. Returns GAMMA_INACCURATE if the change at this step is too large, else DONE.
     """
@@ -227,7 +229,7 @@ def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
 
 @compiled
 def gamma_by_differences(f, w, t, q, v, first, last):
-    """Store Gamma[first:last] in w.Gamma, by differences; return GAMMA_INACCURATE if no step suffices, else DONE.
+    """Store Gamma[first:last] in w.Gamma, by differences; return GAMMA_INACCURATE if no step is accurate, else DONE.
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
@@ -239,7 +241,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     if e > 0.0:
         largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
-            return DONE  # the caller reports values that are not finite; without a scale, no error can be judged
+            return DONE  # the caller reports values that are not finite; without a scale, errors cannot be judged
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
         if disagreement < ENLARGE_BELOW * w.notes[GAMMA_SCALE]:

@@ -1,12 +1,12 @@
-"""Inner loop: evaluate accelerations, and move states onto the constraints, for all steps.
+"""Evaluate accelerations, and move states onto the constraints: the inner loop, which the steps of all methods call.
 
-The inner loop is compiled once, as one function, and passed to steps in a `Kit`; steps call it by the helpers in this
-file, one for each task. Accelerations and multipliers are those of eqs. (6)-(8) of the paper.
+The inner loop is compiled once, as one function, and passed to steps in a `Kit`; steps call it through the functions at
+the end of this file, one for each task. Accelerations and multipliers are those of eqs. (6)-(8) of the paper.
 
 If a step integrates all coordinates, its states are off the constraints by the error of the formula. One pass of a
 projection moves positions and velocities to the nearest state on the constraints, in the metric of M, which does not
-depend on the partition. The error of positions is then the square of their correction, but that of velocities and
-accelerations is of the size of this correction: if it is not near rounding, another pass follows.
+depend on the partition. After a pass, the error of positions is about the square of their correction, but the errors of
+velocities and accelerations are about as large as this correction: if it is not near rounding, another pass follows.
 """
 
 import numpy as np
@@ -75,23 +75,23 @@ from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm,
 
 @merged
 def acceleration_constraint(f, w, t, q, v):
-    """Store Gamma, the right-hand side of G a = Gamma, in w.Gamma; return DONE, or the reason of a failure."""
+    """Store Gamma, the right-hand side of G a = Gamma, in w.Gamma; return DONE or the code of a failure."""
     n_c, n_rows = w.C.size, w.Rate.size
     if w.notes[KNOWN] == 1.0 and n_rows == n_c:
         return DONE
-    given, given_a = f.flags[GAMMA_GIVEN] == 1, f.flags[NONHOLONOMIC_GAMMA_GIVEN] == 1
+    has_gamma, has_gamma_a = f.flags[GAMMA_GIVEN] == 1, f.flags[NONHOLONOMIC_GAMMA_GIVEN] == 1
     first, last = 0, n_rows  # range of the rows of Gamma that no callback computes
     w.Gamma[:] = 0.0
-    if given:
+    if has_gamma:
         f.gamma(t, q, v, f.p, w.Gamma[:n_c])
         first = n_c
-    if n_rows == n_c or given_a:
+    if n_rows == n_c or has_gamma_a:
         last = n_c
-    if (last > n_c or not given) and not gamma_by_program(f, w, t, q, v):
+    if (last > n_c or not has_gamma) and not gamma_by_program(f, w, t, q, v):
         code = gamma_by_differences(f, w, t, q, v, first, last)
         if code != DONE:
             return code
-    if n_rows > n_c and given_a:
+    if n_rows > n_c and has_gamma_a:
         f.nonholonomic_gamma(t, q, v, f.p, w.Gamma[n_c:])
     return DONE
 
@@ -105,7 +105,7 @@ def mass_matrix(f, w, t, q):
 
 @merged
 def factor_mass_at(f, w, t, q):
-    """Store M(t, q) in w.M, and its factors if the form of the equations needs them; return a code."""
+    """Store M(t, q) in w.M, and factors of M in w.L if the form of the equations needs them; return a code."""
     w.notes[FACTORED] = 0.0
     mass_matrix(f, w, t, q)
     code = factor_mass(f, w) if f.flags[FORM] == MULTIPLIERS or banded_mass(f) else DONE
@@ -114,7 +114,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_at(f, w, t, q):
-    """Factor the equations of accelerations at a state whose rows, their factors and w.D are in w; return a code."""
+    """Factor the equations of accelerations at (t, q), with the rows at q, their factors and w.D; return a code."""
     if f.flags[CONSTANT_MASS] == 0:
         w.notes[FACTORED] = 0.0
         mass_matrix(f, w, t, q)
@@ -126,7 +126,7 @@ def factor_at(f, w, t, q):
 
 @merged
 def accelerate(f, w, t, q, v, a):
-    """Store in `a` the accelerations at (q, v), whose rows, their factors and w.D are in w; return a code."""
+    """Store in `a` the accelerations at (q, v), from the rows at q, their factors and w.D in w; return a code."""
     w.counters[N_EVALUATIONS] += 1
     code = factor_at(f, w, t, q)
     if code == DONE:
@@ -147,7 +147,7 @@ def accelerate(f, w, t, q, v, a):
 
 @compiled
 def _record_gamma_scale(w, a):
-    """Update GAMMA_SCALE, the scale of errors of Gamma, by the largest sum of |terms| in a row of G a."""
+    """Increase GAMMA_SCALE, the scale of errors of Gamma, to at least the largest sum of |terms| in a row of G a."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.places[i], w.places[i + 1]):
@@ -166,7 +166,10 @@ def equilibrate(f, w, a, lam):
 
 @merged
 def _factor_rows_at(f, w, t, q, v):
-    """Store rows and factors, with NULL_SPACE also w.D, at (q, v), which may be off the constraints; return a code."""
+    """Store in w the rows at (q, v), their factors and, for NULL_SPACE, w.D; return a code.
+
+    The state (q, v) may be off the constraints.
+    """
     if f.flags[KINEMATICS_GIVEN] == 1:
         kinematics(f, w, t, q, v)
         w.notes[KNOWN] = 1.0
@@ -180,13 +183,13 @@ def _factor_rows_at(f, w, t, q, v):
 
 @merged
 def accelerate_at(f, w, t, q, v, a):
-    """Store in `a` the accelerations at (q, v), which may be off the constraints; return a code."""
+    """Factor the rows at (q, v), which may be off the constraints, and store the accelerations; return a code."""
     code = _factor_rows_at(f, w, t, q, v)
     return accelerate(f, w, t, q, v, a) if code == DONE else code
 
 
 @merged
-def _correct(f, w, x):
+def _add_least_correction(f, w, x):
     """Add to x the least correction in the metric of M that changes G x by w.g; return its largest entry."""
     w.Q[:] = 0.0
     solve(f, w, w.Q, w.g, w.y)
@@ -200,29 +203,29 @@ def _correct(f, w, x):
 
 
 @merged
-def _correct_both(f, w, q, v):
-    """Correct q and v in place by the factors at q; return the largest correction of a position and of a velocity."""
+def _correct_state(f, w, q, v):
+    """Move q and v towards the constraints, by the factors at q; return the largest corrections of q and of v."""
     rows, n_c = w.rows_v, w.C.size
     for i in range(rows.size):
         w.g[rows[i]] = -w.C[rows[i]] if rows[i] < n_c else 0.0
-    moved = _correct(f, w, q)
+    correction_q = _add_least_correction(f, w, q)
     row_residual(w, v, rows)
     for i in range(rows.size):
         w.g[rows[i]] = -w.z[i]
-    return moved, _correct(f, w, v)
+    return correction_q, _add_least_correction(f, w, v)
 
 
 @merged
 def project_state(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints in place, then store accelerations in `a` and multipliers in lam.
+    """Project (q, v) onto the constraints in place, store accelerations in `a` and multipliers in lam; return a code.
 
     Rows of A constrain velocities only; positions are corrected in directions that these rows allow.
 
-    Passes end when a correction of positions is at most theta, and that of velocities at most theta times the largest
-    velocity. They also end when a correction of positions is at most theta times the smallest pivot: the inverse of
-    this pivot bounds how fast tangents turn, so that velocities are accurate after the same pass.
+    Passes end when the correction of positions is at most theta, and that of velocities at most theta max(1, max|v|).
+    They also end when the correction of positions is at most theta times the smallest pivot: the inverse of this pivot
+    bounds how fast tangents turn, so that velocities are accurate after the same pass.
     """
-    before = np.inf
+    last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):
         code = _factor_rows_at(f, w, t, q, v)
@@ -237,39 +240,39 @@ def project_state(f, w, t, q, v, theta, a, lam):
         # with NULL_SPACE, find_null_space has already evaluated the rates
         if f.flags[KINEMATICS_GIVEN] == 0 and f.flags[FORM] != NULL_SPACE:
             constraint_rates(f, w, t, q, w.Rate)
-        moved, faster = _correct_both(f, w, q, v)
-        if not np.isfinite(moved):
+        correction_q, correction_v = _correct_state(f, w, q, v)
+        if not np.isfinite(correction_q):
             return not_finite(w.notes, CONSTRAINT, t, q)
-        if moved <= theta and faster <= theta * max(1.0, largest_of(v)):
+        if correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v)):
             break
-        if moved <= w.notes[PIVOT] * theta:
+        if correction_q <= w.notes[PIVOT] * theta:
             w.notes[KNOWN] = 0.0  # Gamma was computed at the old velocities: compute it again
             break
-        if moved > CONTRACTION * before:
+        if correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            if not (moved <= limit or (moved <= AMPLIFICATION * limit and rows_hold(w, q))):
+            if not (correction_q <= limit or (correction_q <= AMPLIFICATION * limit and rows_hold(w, q))):
                 return INNER_DIVERGED
             break
-        before = max(moved, theta)
+        last_correction = max(correction_q, theta)
     code = accelerate(f, w, t, q, v, a)
     if code == DONE:
         equilibrate(f, w, a, lam)
     return code
 
 
-ROUNDING_OF_Q = 2e-14  # about a hundred times the rounding error of q, relative to max|q|, see rounding_floor
+ROUNDING_OF_Q = 2e-14  # change of q that counts as rounding, relative to max|q|: about a hundred rounding errors
 
 
 @merged
 def _verify_pattern(w):
-    """Return DONE if the Jacobian has no new entry; else write new programs, and return a failure of the evaluation."""
+    """Return DONE if w.G has no new nonzero entry; else write new programs, and return INNER_DIVERGED or SINGULAR."""
     if not record_entries(w):
         return DONE
     return INNER_DIVERGED if write_programs(w) else SINGULAR
 
 
 @compiled
-def _other_task(f, w, task, t, q, v):
+def _do_other_task(f, w, task, t, q, v):
     if task == tasks.FIND_NULL_SPACE:
         code = factor_dependent(f, w, t, q)
         if code == DONE:
@@ -288,9 +291,9 @@ def _other_task(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task`, one of tasks.py, at (t, q, v); return a code. The functions below explain the tasks."""
+    """Do `task`, a number of tasks.py, at (t, q, v); return a code. The functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
-        return _other_task(f, w, task, t, q, v)
+        return _do_other_task(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN) and w.notes[TIME_IS_UP] == 1.0:
         return STOPPED
     if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT are for methods that integrate all coordinates
@@ -317,29 +320,29 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 
 @merged
 def evaluate(f, w, t, q, v, tolerance, a):
-    """Store in q and v dependent coordinates that fit the independent ones, and in `a` accelerations; return a code.
+    """Store the dependent entries of q and v, from the independent ones, and the accelerations `a`; return a code.
 
-    Velocities and accelerations are computed with the last Jacobian that was factored; its position differs from the
-    final one by at most w.notes[REUSE].
+    Velocities and accelerations are computed with the Jacobian that was factored last, at a position that differs from
+    the final q by at most w.notes[REUSE].
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Do the task of `evaluate` for a state that may be accepted: up to rounding, with multipliers in lam."""
+    """Evaluate a state that may be accepted: as `evaluate`, but up to rounding, and store lam, too; return a code."""
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
 @merged
 def evaluate_as_given(f, w, t, q, v, a):
-    """Store in `a` the accelerations at (q, v), which may be off the constraints, and return a code."""
+    """Store in `a` the accelerations at (q, v), a state that may be off the constraints; return a code."""
     return f.inner(f, w, tasks.EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
 
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints in place, and store a and lam; see `project_state`."""
+    """Project (q, v) onto the constraints in place, and store a and lam, see `project_state`; return a code."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -348,31 +351,31 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore(f, w, t, q, v, tolerance):
-    """Store in q and v dependent coordinates that fit the independent ones, up to rounding; return a code."""
+    """Store the dependent entries of q and v, from the independent ones, up to rounding; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Store in `a` and lam the solution of eqs. (6)-(8) at (q, v), right after `restore`; return a code."""
+    """Store the accelerations `a` and multipliers lam at the state (q, v) that `restore` stored; return a code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def multipliers(f, w, t, q, v, a, lam):
-    """Store in lam the multipliers for `a`, right after the evaluation of `a`; return a code."""
+    """Store in lam the multipliers that belong to `a`, the accelerations of the last evaluation; return a code."""
     return f.inner(f, w, tasks.MULTIPLIERS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def find_tangents(f, w, t, q):
-    """Factor the rows at a position q on the constraints, and store the velocities they allow in w.D; return a code."""
+    """Factor the rows at a position q on the constraints, and store the null space of G in w.D; return a code."""
     return f.inner(f, w, tasks.FIND_NULL_SPACE, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def prepare_mass(f, w, t, q):
-    """Store M(t, q), and its factors if the form of the equations needs them, in w; return a code."""
+    """Store M(t, q) in w, and the factors of M if the form of the equations needs them; return a code."""
     return f.inner(f, w, tasks.PREPARE_MASS, t, q, q, 0.0, w.x, w.lam)
 
 
@@ -384,56 +387,56 @@ def renew_partition(f, w, t, q):
 
 @merged
 def adopt_midpoint_partition(f, w, t_mid, state, new_state):
-    """Adopt the partition that suits the middle of a step; return a code, see `partition_of_midpoint`."""
+    """Adopt the partition chosen by pivoting at the middle of a step; return a code, see `partition_of_midpoint`."""
     return f.inner(f, w, tasks.ADOPT_MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 
 @merged
 def check_redundant(f, w, t, q, v):
-    """Return DONE if an accepted state satisfies the redundant rows, else ROWS_CONTRADICT."""
+    """Return DONE if the accepted state (q, v) satisfies the redundant rows, else ROWS_CONTRADICT."""
     return f.inner(f, w, tasks.CHECK_REDUNDANT, t, q, v, 0.0, w.x, w.lam)
 
 
 @merged
 def rounding_floor(q):
-    """Return the change, due to rounding of q, at which a stagnant fixed-point iteration counts as converged."""
+    """Return the largest change, due to rounding of q, at which a stagnant fixed-point iteration has converged."""
     return max(ROUNDING_OF_CORRECTIONS, ROUNDING_OF_Q * largest_of(q))
 
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by the mechanism's generated code, or else by the general inner loop; return a code."""
+    """Do a task by the mechanism's generated code or, where this fails, by the general inner loop; return a code."""
     if task == tasks.EVALUATE_AS_GIVEN:
         w.counters[N_EVALUATIONS] += 1
         w.counters[N_FACTORIZATIONS] += 1
         if f.own_accelerate(t, q, v, f.numbers, a):
             return DONE
     elif task == tasks.PROJECT:
-        least, before = max(theta, MIN_CORRECTION * w.notes[ROUNDED]), np.inf
+        tolerance, last_correction = max(theta, MIN_CORRECTION * w.notes[ROUNDED]), np.inf
         for k in range(MAX_ITERATIONS):
             w.counters[N_INNER] += 1
             w.counters[N_FACTORIZATIONS] += 1
             if k == 0:
-                fine = f.own_correct_positions(t, q, v, f.numbers, w.x, q)
+                is_valid = f.own_correct_positions(t, q, v, f.numbers, w.x, q)
             else:
-                fine = f.own_project(t, q, v, f.numbers, a, w.x, q, v, lam)
-            if not fine:
+                is_valid = f.own_project(t, q, v, f.numbers, a, w.x, q, v, lam)
+            if not is_valid:
                 break
-            moved = 0.0
+            correction = 0.0
             for j in range(q.size):
-                moved = max(moved, abs(w.x[j]))
-            if moved <= least and k > 0:
+                correction = max(correction, abs(w.x[j]))
+            if correction <= tolerance and k > 0:
                 w.counters[N_EVALUATIONS] += 1
                 w.notes[BY_GENERAL] = 0.0
                 return DONE
-            if moved > CONTRACTION * before:
+            if correction > CONTRACTION * last_correction:
                 break
-            before = max(moved, least)
+            last_correction = max(correction, tolerance)
         w.notes[BY_GENERAL] = 1.0
     elif task == tasks.CHECK_REDUNDANT and w.notes[BY_GENERAL] == 0.0:
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
-        f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # evaluates the rows at q into w
+        f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores the rows at q in w
     elif task <= tasks.MULTIPLIERS:  # tasks with a partition, for which there is no generated code
         w.notes[BY_GENERAL] = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)

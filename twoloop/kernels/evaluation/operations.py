@@ -9,14 +9,14 @@ import math
 
 from twoloop.kernels.data.common import compiled, exact
 
-# kinds of operations. PENDING: product in a Taylor series whose second factor is known only after the linear equations
-# of the present order are solved. RESULT: output of a program
+# kinds of operations. PENDING: product of Taylor series, in which the coefficient of the current order of the second
+# factor is computed only by solving the linear equations of this order. RESULT: output of a program
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
 # columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of its result among
 # the nodes, or among the results for RESULT. FIRST to SECOND - 1 and SECOND to END - 1: terms of its two arguments
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# indices of the sizes with which a program, a vector of integers, begins. The rows of the table, the node of each term,
-# and the index of each result in its array follow. The last nodes are the results
+# indices of the sizes at the beginning of a program, a vector of integers; HEAD is the number of sizes. The rows of the
+# table, the node of each term, and the index of each result in its array follow. The last nodes are the results
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, HEAD = range(5)
 
 
@@ -75,7 +75,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
 
 @exact
 def _run_program(program, numbers, nodes, t, q, v):
-    """Compute all `nodes` of a program that replaces a callback of a system."""
+    """Compute all `nodes` of a program that replaces a callback of a system, from the inputs t, q and v."""
     n_rows = program[N_ROWS]
     columns = HEAD + N_COLUMNS * n_rows
     run_table(program, HEAD, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
@@ -83,14 +83,20 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _results(program):
-    """Return the number of results, the index of the first one in the nodes, and that of their indices in `program`."""
+    """Return the number of results, the index of the first result in the nodes, and where `program` has array indices.
+
+    The array indices, one for each result, are the places of the results in the array that the program fills.
+    """
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Store the rows of Gamma that no callback computes; return False if there is no program or a value not finite."""
+    """Store in w.Gamma, by a program, the entries that no callback computes; return whether all values are finite.
+
+    Returns False if there is no program, too.
+    """
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -105,7 +111,10 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in rows of G that are zero on entry; return False if there is no program or a value is not finite."""
+    """Store C_q in the first rows of G, zero on entry, by a program; return whether all values are finite.
+
+    Returns False if there is no program, too.
+    """
     program = f.jacobian_program
     if program.size == 0:
         return False

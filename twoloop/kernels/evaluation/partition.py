@@ -55,41 +55,43 @@ from twoloop.kernels.linalg.markowitz_lu import (
 
 RANK_TOLERANCE = 1e-11  # largest pivot that counts as zero, for rows scaled to 1
 CHANGED = -1  # code returned instead of DONE if a new partition has been adopted
-MAX_ROWS_ELIMINATED = 200  # largest number of rows that are eliminated only to measure how near a singular position is
-SENSITIVITY_GROWTH = 3.0  # ratio of max|C_qd^-1 C_qi| to its value for a new partition above which a partition is poor
+# largest number of rows that are eliminated only to measure how near a singular position is: with more rows, this takes
+# too long
+MAX_ROWS_ELIMINATED = 200
+SENSITIVITY_GROWTH = 3.0  # a partition is poor if max|C_qd^-1 C_qi| has grown by more than this factor since its choice
 
 
 @compiled
 def scale_rows(A):
     """Divide each row of A in place by a power of two, so that the largest entry of the row is about 1."""
     for i in range(A.shape[0]):
-        top = largest_of(A[i])
-        if top > 0.0 and top < np.inf:
-            scale = 2.0 ** -np.round(np.log2(top))
+        largest = largest_of(A[i])
+        if largest > 0.0 and largest < np.inf:
+            scale = 2.0 ** -np.round(np.log2(largest))
             for j in range(A.shape[1]):
                 A[i, j] *= scale
 
 
 @merged
-def _largest_from(row, first):
-    largest = 0.0
+def _max_abs_from(row, first):
+    maximum = 0.0
     for j in range(first, row.size):
-        if abs(row[j]) > largest:  # false for NaN
-            largest = abs(row[j])
-    return largest
+        if abs(row[j]) > maximum:  # false for NaN
+            maximum = abs(row[j])
+    return maximum
 
 
 @compiled
 def full_pivoting(A, order, row_order, largest, first, last, max_rank):
-    """Eliminate A in place by Gauss with full pivoting, from pivot number `first` on; return the numerical rank.
+    """Do Gaussian elimination of A in place with full pivoting, from pivot `first` on; return the numerical rank.
 
-    Pivots are chosen among the rows before `last`; there are at most `max_rank`, including those before `first`.
-    `order` and `row_order` are permuted as the columns and rows of A; `largest` is scratch, with one number per row.
+    Pivots are chosen in the rows before row `last`; there are at most `max_rank` pivots, including those before
+    `first`. `order` and `row_order` are permuted as the columns and rows of A; `largest` (one per row) is scratch.
     """
     n_q = A.shape[1]
     k = first
     for i in range(k, last):
-        largest[i] = _largest_from(A[i], k)
+        largest[i] = _max_abs_from(A[i], k)
     while k < min(last, n_q) and k < max_rank:
         r = k
         for i in range(k + 1, last):
@@ -115,17 +117,17 @@ def full_pivoting(A, order, row_order, largest, first, last, max_rank):
                 for j in range(k + 1, n_q):
                     A[i, j] -= factor * A[k, j]
                 if i < last:
-                    largest[i] = _largest_from(A[i], k + 1)
+                    largest[i] = _max_abs_from(A[i], k + 1)
         k += 1
     return k
 
 
 @compiled
 def least_pivot(f, w, t, q):
-    """Return the ratio of the smallest to the largest pivot of C_q and A at (t, q), without a new partition.
+    """Return the ratio of the smallest to the largest pivot of C_q and A at (t, q), without changing the partition.
 
-    Rows are not scaled, because this would hide that a row is short at a singular position. In the static form, or with
-    more than MAX_ROWS_ELIMINATED rows, the result is w.notes[PIVOT], of the last partition.
+    Rows are not scaled, because this would hide that a row has a small norm at a singular position. In the static form,
+    or with more than MAX_ROWS_ELIMINATED rows, the result is w.notes[PIVOT], from the last choice of a partition.
     """
     if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.notes[PIVOT]
@@ -148,10 +150,10 @@ def least_pivot(f, w, t, q):
 
 
 @compiled
-def _eliminate(w, max_rank, max_rank_v):
-    """Store in w.row_order and w.order the order of pivots of w.Gx, first those of C_q, then those that A adds.
+def _find_pivot_order(w, max_rank, max_rank_v):
+    """Store in w.row_order and w.order the rows and columns of the pivots of w.Gx: those of C_q, then those of A.
 
-    Returns the rank of C_q and that of C_q and A together, counted up to `max_rank` and `max_rank_v`.
+    Returns the rank of C_q, at most `max_rank`, and the rank of C_q and A together, at most `max_rank_v`.
     """
     G, order, row_order = w.Gx, w.order, w.row_order
     n_c, n_rows = w.C.size, w.Rate.size
@@ -175,7 +177,7 @@ def _eliminate(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot of C_q at (t, q), with rows scaled as for w.notes[PIVOT], without a new partition."""
+    """Return the smallest pivot of C_q at (t, q), with rows scaled to 1, without changing the partition."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -193,7 +195,7 @@ def smallest_pivot(f, w, t, q):
 
 
 @merged
-def _insert_sorted(source, target):
+def _copy_sorted(source, target):
     for k in range(source.size):
         i = k
         while i > 0 and target[i - 1] > source[k]:
@@ -204,16 +206,16 @@ def _insert_sorted(source, target):
 
 @compiled
 def _adopt_order(w):
-    """Store the partition by the order of `_eliminate`, and its programs; return False if C_qd is singular."""
+    """Store the partition by the pivot order in w, and write its programs; return False if C_qd is singular."""
     rank, rank_v = w.rows.size, w.rows_v.size
-    # in ascending order, so that equal sets of coordinates are equal partitions
-    _insert_sorted(w.row_order[:rank], w.rows)
-    _insert_sorted(w.order[:rank], w.dependent)
-    _insert_sorted(w.order[rank:], w.independent)
+    # indices are stored in ascending order, so that equal sets of coordinates are equal partitions
+    _copy_sorted(w.row_order[:rank], w.rows)
+    _copy_sorted(w.order[:rank], w.dependent)
+    _copy_sorted(w.order[rank:], w.independent)
     if w.Rate.size > w.C.size:
-        _insert_sorted(w.row_order[:rank_v], w.rows_v)
-        _insert_sorted(w.order[:rank_v], w.dependent_v)
-        _insert_sorted(w.order[rank_v:], w.independent_v)
+        _copy_sorted(w.row_order[:rank_v], w.rows_v)
+        _copy_sorted(w.order[:rank_v], w.dependent_v)
+        _copy_sorted(w.order[rank_v:], w.independent_v)
     w.notes[SENSITIVITY] = 0.0
     w.notes[LEANING] = 0.0
     w.notes[ORIENTATION] = 0.0
@@ -252,7 +254,7 @@ def _record_columns(w):
 
 @compiled
 def record_entries(w):
-    """Set w.pattern to 1 where w.G has entries; return whether an entry is new, so that programs must be rewritten."""
+    """Set w.pattern to 1 where w.G is not zero; return whether an entry is new, so that programs must be rewritten."""
     if not note_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -272,10 +274,10 @@ def choose_partition(f, w, t, q):
     copy_matrix(w.G, w.Gx)
     w.counters[N_FACTORIZATIONS] += 1
     w.counters[N_PARTITIONS] += 1
-    first = w.notes[GENERATION] == 0.0
-    max_rank, max_rank_v = (w.C.size, w.Rate.size) if first else (w.rows.size, w.rows_v.size)
-    rank, rank_v = _eliminate(w, max_rank, max_rank_v)
-    if first and (rank != w.rows.size or rank_v != w.rows_v.size):
+    is_first = w.notes[GENERATION] == 0.0
+    max_rank, max_rank_v = (w.C.size, w.Rate.size) if is_first else (w.rows.size, w.rows_v.size)
+    rank, rank_v = _find_pivot_order(w, max_rank, max_rank_v)
+    if is_first and (rank != w.rows.size or rank_v != w.rows_v.size):
         w.notes[RANK], w.notes[RANK_V] = rank, rank_v
         return RANK_DIFFERS
     if rank < w.rows.size or rank_v < w.rows_v.size:
@@ -299,26 +301,26 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
         w.x[j] = 0.5 * (state[j] + new_state[j])
     w.entries[:] = 0.0
     constraint_rows(f, w, t_mid, w.x, w.G)
-    new = record_entries(w)
+    has_new_entry = record_entries(w)
     copy_matrix(w.G, w.Gx)
     rank, rank_v = w.rows.size, w.rows_v.size
     w.counters[N_FACTORIZATIONS] += 1
-    new_rank, new_rank_v = _eliminate(w, rank, rank_v)
+    new_rank, new_rank_v = _find_pivot_order(w, rank, rank_v)
     if new_rank < rank or new_rank_v < rank_v:
         return SINGULAR
-    same = _same_set(w.independent, w.order[rank:])
-    if same and not new and _same_set(w.independent_v, w.order[rank_v:]):
+    is_same = _is_same_set(w.independent, w.order[rank:])
+    if is_same and not has_new_entry and _is_same_set(w.independent_v, w.order[rank_v:]):
         return DONE
     w.counters[N_PARTITIONS] += 1
     return CHANGED if _adopt_order(w) else SINGULAR
 
 
 @merged
-def _same_set(a, b):
-    same = True
+def _is_same_set(a, b):
+    is_same = True
     for number in a:
-        same = same and contains(b, number)
-    return same
+        is_same = is_same and contains(b, number)
+    return is_same
 
 
 @compiled
@@ -337,18 +339,18 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest coefficient, in w.minimum, of an independent row in a redundant one, for rows scaled to 1."""
+    """Return the largest |coefficient| of an independent row in a redundant row, in w.minimum, for rows scaled to 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
     for row in range(w.Rate.size):
         if contains(w.rows_v, row):
             continue
-        size = _largest_from(w.G[row], 0)
+        row_scale = _max_abs_from(w.G[row], 0)
         for k in range(rows.size):
-            scaled = abs(w.minimum[begin + k]) * _largest_from(w.G[rows[k]], 0)
-            if scaled > largest * size:
-                largest = scaled / size
+            scaled = abs(w.minimum[begin + k]) * _max_abs_from(w.G[rows[k]], 0)
+            if scaled > largest * row_scale:
+                largest = scaled / row_scale
         begin += rows.size
     return largest
 
@@ -378,12 +380,12 @@ def partition_is_poor(w):
 
 
 MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
-CONTRACTION = 0.5  # largest ratio of a correction to the one before in a converging iteration
+CONTRACTION = 0.5  # largest ratio of a correction to the previous one at which an iteration counts as convergent
 ROUNDING_OF_CORRECTIONS = 1e-12  # largest correction due to rounding alone, relative to the largest coordinate
-# factor on ROUNDING_OF_CORRECTIONS if all rows are satisfied up to rounding: the rounding of a position of 1 m turns a
-# rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
+# factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding: the rounding error of a position of
+# 1 m turns a rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
 AMPLIFICATION = 1e3
-ROUNDING_OF_ROWS = 2e-15  # largest violation of a row that counts as a rounding error, relative to its largest term
+ROUNDING_OF_ROWS = 2e-15  # largest |C_i| that counts as a rounding error, relative to the largest |G_ij q_j|
 MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.notes[ROUNDED], the rounding of positions
 MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
 
@@ -409,7 +411,7 @@ def factor_rows(w, t, q):
     if w.Rate.size > w.C.size:
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
         w.counters[N_FACTORIZATIONS] += 1
-    # a small ratio may be due to an order of elimination that does not suit the numbers, or to NaN
+    # the ratio may also be small because of NaN, or of an order of elimination that does not suit the values
     return DONE if ratio > RANK_TOLERANCE else _factor_in_new_order(w, t, q)
 
 
@@ -426,10 +428,10 @@ def factor_dependent(f, w, t, q):
 def rows_hold(w, q):
     """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
     for i in range(w.C.size):
-        size = 0.0
+        largest_term = 0.0
         for p in range(w.places[i], w.places[i + 1]):
-            size = max(size, abs(w.G[i, w.places[p]] * q[w.places[p]]))
-        if not abs(w.C[i]) <= ROUNDING_OF_ROWS * size:
+            largest_term = max(largest_term, abs(w.G[i, w.places[p]] * q[w.places[p]]))
+        if not abs(w.C[i]) <= ROUNDING_OF_ROWS * largest_term:
             return False
     return True
 
@@ -438,21 +440,21 @@ def rows_hold(w, q):
 def restore_positions(f, w, t, q, v, tolerance, reuse):
     """Solve eq. (15) by Newton's method for the dependent positions in q; return a code.
 
-    The iteration ends after a correction of at most `tolerance`. On return, rows and factors in w are those at q, or
-    those before a last correction of at most `reuse`; the fused callback also stores w.Rate and w.Gamma, for v.
+    The iteration ends after a correction of at most `tolerance`. On return, rows and factors in w belong to q, or to q
+    before the last correction, if this was at most `reuse`; the fused callback also stores w.Rate and w.Gamma, for v.
     """
     last_correction = np.inf
-    converged = w.C.size == 0
-    fused = f.flags[KINEMATICS_GIVEN] == 1
+    has_converged = w.C.size == 0
+    is_fused = f.flags[KINEMATICS_GIVEN] == 1
     for _ in range(MAX_ITERATIONS):
-        if fused:
+        if is_fused:
             kinematics(f, w, t, q, v)
             code = factor_rows(w, t, q)
         else:
             code = factor_dependent(f, w, t, q)
-        if code != DONE or converged:
+        if code != DONE or has_converged:
             return code
-        if not fused:
+        if not is_fused:
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
         w.counters[N_INNER] += 1
@@ -468,13 +470,13 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
             correction = max(correction, abs(w.z[k]))
         if correction <= reuse:
             return DONE
-        converged = correction <= tolerance
-        if not converged and correction > CONTRACTION * last_correction:
+        has_converged = correction <= tolerance
+        if not has_converged and correction > CONTRACTION * last_correction:
             # accept a correction that is due to rounding; otherwise Newton's method has left its region of convergence,
             # and could converge to another assembly of the mechanism
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            converged = correction <= limit or (correction <= AMPLIFICATION * limit and rows_hold(w, q))
-            if not converged:
+            has_converged = correction <= limit or (correction <= AMPLIFICATION * limit and rows_hold(w, q))
+            if not has_converged:
                 return INNER_DIVERGED
         last_correction = correction
     return INNER_DIVERGED
@@ -482,19 +484,19 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
 
 @merged
 def find_null_space(f, w, t, q):
-    """Store in w.D the velocities that the constraints allow (see Work), from the rows and factors in w."""
+    """Store in w.D the null space of G and the driven velocities (see Work), from the rows and factors in w."""
     if f.flags[KINEMATICS_GIVEN] == 0 or w.notes[KNOWN] == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
-    driven = f.flags[CONSTRAINT_RATE_GIVEN] == 1 or f.flags[NONHOLONOMIC_RATE_GIVEN] == 1
-    solve_rows(w.index_v, w.values_v, w.D, w.D.shape[0] if driven else w.D.shape[0] - 1)
+    is_driven = f.flags[CONSTRAINT_RATE_GIVEN] == 1 or f.flags[NONHOLONOMIC_RATE_GIVEN] == 1
+    solve_rows(w.index_v, w.values_v, w.D, w.D.shape[0] if is_driven else w.D.shape[0] - 1)
 
 
 @merged
 def restore_velocities(f, w, t, q, v, reuse):
     """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, with rows and factors in w.
 
-    A w.Gamma that the fused callback has computed stays valid (KNOWN) if velocities change by at most `reuse`.
+    If no velocity changes by more than `reuse`, w.Gamma stays valid if the fused callback has computed it (KNOWN).
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size

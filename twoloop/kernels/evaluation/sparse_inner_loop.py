@@ -1,10 +1,10 @@
-"""Inner loop of large systems, by sparse factors whose order of elimination is chosen once.
+"""Do the tasks of the inner loop for large systems, by sparse factors in an order of elimination that is chosen once.
 
 There is no partition: all coordinates are integrated, and evaluated without a projection. Tasks that compute dependent
 coordinates in other forms move all coordinates to the nearest state on the constraints, in the metric of M. If sparse
 factors do not show which rows are independent, a task returns NEEDS_DENSE: the run then continues with the forms of
 saddle_point.py, which methods with a partition always use. If callbacks return values of entries, no array has n_c
-times n_q numbers. Callbacks that fill dense matrices are also allowed: the entries are copied from these.
+times n_q numbers. Callbacks may also fill dense matrices, from which the entries are copied.
 
 If rows are redundant, multipliers have the least norm. Of all lam with G^T lam = b, that of least norm is G x for some
 x, and both solve
@@ -79,9 +79,9 @@ from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacob
 # pivot, relative to the size of its row, below which a row is checked, because the pivot may be a rounding error
 SUSPECT_PIVOT = 1e-6
 MIN_PIVOT = 1e-10  # smallest pivot, relative to the size of its row, with which factors by 1-by-1 pivots are accurate
-MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows, see _sine, is at most this
-PROJECT_STAGES = 2.0  # value of NEARLY_SINGULAR near a singular position, where stages must be projected
-# ratios of the smallest pivot to the size of its row below which solutions are refined once, and twice
+MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the others is at most this
+PROJECT_STAGES = 2.0  # value of w.notes[NEARLY_SINGULAR] near a singular position, where stages must be projected
+# solutions are refined once, or twice, if the smallest pivot, relative to the size of its row, is at most this
 REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7
 
 
@@ -117,12 +117,12 @@ def fill_jacobian_values(f, w, t, q):
 
 
 @compiled
-def _factor(f, w, least):
-    """Factor the entries of M and G in w by `factor` of sparse_ldl.py, with `least`; return its result."""
+def _factor(f, w, min_sine_square):
+    """Factor M and G from their entries in w; return the smallest squared sine, see `factor` of sparse_ldl.py."""
     w.counters[N_FACTORIZATIONS] += 1
     stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
     load(f.static_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
-    smallest = factor(f.static_program, w.counts, w.factors, w.pivot_sizes, least)
+    smallest = factor(f.static_program, w.counts, w.factors, w.pivot_sizes, min_sine_square)
     w.notes[SMALLEST] = smallest
     w.notes[PIVOT] = np.sqrt(max(smallest, 0.0))
     return smallest
@@ -147,7 +147,7 @@ def factor_at(f, w, t, q):
     smallest = _factor(f, w, MIN_PIVOT)
     if not smallest > 0.0:
         return _factor_fault(w, t, q)
-    if _count(w.counts) == w.rows_v.size:
+    if _count_independent(w.counts) == w.rows_v.size:
         return DONE
     w.counters[N_PARTITIONS] += 1  # independent rows have become dependent: others may replace them
     code = _choose_rows(f, w, t, q)
@@ -155,8 +155,8 @@ def factor_at(f, w, t, q):
 
 
 @compiled
-def solve_values(f, w, times):
-    """Replace the right-hand side in w.unknowns by the solution, refined `times` times; see `solve_refined`."""
+def solve_values(f, w, n_corrections):
+    """Replace the right-hand side in w.unknowns by the solution, with `n_corrections`; see `solve_refined`."""
     n = f.static_program[N_PIVOTS]
     scratch = w.solutions
     return solve_refined(
@@ -167,7 +167,7 @@ def solve_values(f, w, times):
         w.factors,
         scratch[3 * n :],
         w.unknowns,
-        times,
+        n_corrections,
         scratch[:n],
         scratch[n : 2 * n],
         scratch[2 * n : 3 * n],
@@ -176,38 +176,38 @@ def solve_values(f, w, times):
 
 @compiled
 def n_refinements(w):
-    """Return the number of refinements that solutions with the factors in w need."""
+    """Return how many times solutions with the factors in w must be refined."""
     smallest = w.notes[SMALLEST]
     return 0 if smallest > REFINED_ONCE else 1 if smallest > REFINED_TWICE else 2
 
 
 @compiled
-def _sine(f, w, row, size):
-    """Return the sine of the angle between the row g, number `row`, and the independent rows; `size` is g M^-1 g^T."""
+def _sine_of_row(f, w, row, square):
+    """Return the sine of the angle between row g, number `row` of G, and the independent rows; `square`: g M^-1 g^T."""
     x, part = w.unknowns, 0.0
     x[:] = 0.0
     rows, columns, _ = jacobian_of(f.static_program)
-    for k in range(rows.size):  # x = [g, 0] for the row g
+    for k in range(rows.size):  # set x to [g, 0]
         if rows[k] == row:
             x[columns[k]] += w.jacobian_values[k]
     solve_values(f, w, 2)
     rows, columns, _ = mass_of(f.static_program)
-    for k in range(rows.size):  # x^T M x
+    for k in range(rows.size):  # add up x^T M x
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
-    return np.sqrt(part / size) if size > 0.0 else 0.0
+    return np.sqrt(part / square) if square > 0.0 else 0.0
 
 
 @compiled
-def _count(counts):
-    number = 0
+def _count_independent(counts):
+    n_independent = 0
     for i in range(counts.size):
-        number += int(counts[i])
-    return number
+        n_independent += int(counts[i])
+    return n_independent
 
 
 @compiled
 def _choose_rows(f, w, t, q):
-    """Store the choice of independent rows in w.counts, and factor with these rows; return a code.
+    """Choose independent rows, store the choice (1 or 0) in w.counts, and factor with these rows; return a code.
 
     Rows with small pivots are left out at first, then added one by one if independent of the rows chosen so far.
     """
@@ -215,18 +215,18 @@ def _choose_rows(f, w, t, q):
     if not _factor(f, w, SUSPECT_PIVOT) > 0.0:
         return _factor_fault(w, t, q)
     order, n_q = order_of(f.static_program), w.Q.size
-    copy(w.counts, w.z)  # 0 for rows that must be checked
+    copy(w.counts, w.z)  # w.z is 0 for rows that must be checked
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
             continue
-        sine = _sine(f, w, row, w.pivot_sizes[k])
+        sine = _sine_of_row(f, w, row, w.pivot_sizes[k])
         if sine <= MAX_DEPENDENT_SINE:
             continue
-        number = _count(w.counts)
+        n_independent = _count_independent(w.counts)
         w.counts[row] = 1.0
         smallest = _factor(f, w, MIN_PIVOT) if sine * sine > MIN_PIVOT else 0.0
-        if not smallest > 0.0 or _count(w.counts) != number + 1:
+        if not smallest > 0.0 or _count_independent(w.counts) != n_independent + 1:
             return _factor_fault(w, t, q)
     return DONE
 
@@ -234,28 +234,28 @@ def _choose_rows(f, w, t, q):
 @compiled
 def _adopt_rows(w):
     """Store the indices of the rows with w.counts = 1 in w.rows_v; return SINGULAR if their number differs, or DONE."""
-    if _count(w.counts) != w.rows_v.size:
+    if _count_independent(w.counts) != w.rows_v.size:
         return SINGULAR
-    place = 0
+    position = 0
     for i in range(w.counts.size):
         if w.counts[i] != 0.0:
-            w.rows_v[place] = i
-            place += 1
+            w.rows_v[position] = i
+            position += 1
     return DONE
 
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose and store the independent rows at (t, q); return RANK_DIFFERS if w is allocated for another number."""
+    """Choose and store the independent rows at (t, q); return RANK_DIFFERS if w is allocated for another rank."""
     w.counters[N_PARTITIONS] += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
     code = _choose_rows(f, w, t, q)
     if code != DONE:
         return code
-    number = _count(w.counts)
-    if w.notes[GENERATION] == 0.0 and number != w.rows_v.size:
-        w.notes[RANK] = w.notes[RANK_V] = number
+    n_independent = _count_independent(w.counts)
+    if w.notes[GENERATION] == 0.0 and n_independent != w.rows_v.size:
+        w.notes[RANK] = w.notes[RANK_V] = n_independent
         return RANK_DIFFERS
     w.notes[GENERATION] += 1.0
     return _adopt_rows(w)
@@ -264,12 +264,12 @@ def choose_rows(f, w, t, q):
 REGULARIZATION = 1e-11  # diagonal entry of W, relative to the sum of squares of the column of G
 CONVERGED_RESIDUAL = 1e-14  # residual at which the refinement ends, relative to the largest force
 MAX_RESIDUAL = 1e-9  # largest residual, relative to the largest force, that is accepted if it no longer decreases
-MAX_SOLUTIONS = 30  # largest number of solutions in the refinement of multipliers of least norm
+MAX_SOLUTIONS = 30  # largest number of linear solutions in the refinement of multipliers of least norm
 
 
 @compiled
-def _load(program, jacobian, n_q, weights, values):
-    """Store the numbers of the matrix [W G^T; G -1] in their slots in `values`; `weights` (n_q) is scratch."""
+def _load_least_norm_matrix(program, jacobian, n_q, weights, values):
+    """Store the entries of the matrix [W G^T; G -1] in their slots in `values`; `weights` (n_q) is scratch."""
     rows, columns, slots = jacobian_of(program)
     for j in range(n_q):
         weights[j] = 0.0
@@ -291,7 +291,7 @@ def _load(program, jacobian, n_q, weights, values):
 @compiled
 def _residual(program, jacobian, force, x, r):
     """Store r = [b - G^T lam, lam - G x] for the force b and unknowns [x, lam]; return max|b - G^T lam| / max|b|."""
-    n_q, largest, left = force.size, 0.0, 0.0
+    n_q, largest, residual = force.size, 0.0, 0.0
     copy(force, r[:n_q])
     for i in range(n_q, x.size):
         r[i] = x[i]
@@ -301,8 +301,8 @@ def _residual(program, jacobian, force, x, r):
         r[j] -= jacobian[k] * x[i]
         r[i] -= jacobian[k] * x[j]
     for j in range(n_q):
-        largest, left = max(largest, abs(force[j])), max(left, abs(r[j]))
-    return left / largest if largest > 0.0 else 0.0
+        largest, residual = max(largest, abs(force[j])), max(residual, abs(r[j]))
+    return residual / largest if largest > 0.0 else 0.0
 
 
 @compiled
@@ -311,7 +311,7 @@ def least_norm(f, w, lam):
     program, n_q = f.static_program, w.Q.size
     n = program[N_PIVOTS]
     n_factors = n + program[N_OFF] + 1
-    values, counts, without = w.minimum[:n_factors], w.z, w.g
+    values, counts, no_stiffness = w.minimum[:n_factors], w.z, w.g
     force, x = w.minimum[n_factors : n_factors + n_q], w.minimum[n_factors + n_q :]
     change, y, weights = w.solutions[:n], w.solutions[n : 2 * n], w.solutions[2 * n : 3 * n]
     rows, columns, _ = jacobian_of(program)
@@ -319,26 +319,26 @@ def least_norm(f, w, lam):
         force[j] = 0.0
     for k in range(rows.size):
         force[columns[k]] += w.jacobian_values[k] * lam[rows[k]]
-    _load(program, w.jacobian_values, n_q, weights, values)
+    _load_least_norm_matrix(program, w.jacobian_values, n_q, weights, values)
     for i in range(lam.size):
-        counts[i], without[i] = 1.0, 0.0
+        counts[i], no_stiffness[i] = 1.0, 0.0
     if not factor(program, counts, values, w.pivot_sizes, 0.0) > 0.0:
         return NEEDS_DENSE
     for i in range(n):
         x[i] = 0.0
-    before = _residual(program, w.jacobian_values, force, x, change)
+    last_residual = _residual(program, w.jacobian_values, force, x, change)
     for _ in range(MAX_SOLUTIONS):
-        if before <= CONVERGED_RESIDUAL:
+        if last_residual <= CONVERGED_RESIDUAL:
             break
-        solve(program, values, without, change, y)
+        solve(program, values, no_stiffness, change, y)
         for i in range(n):
             x[i] += change[i]
-        left = _residual(program, w.jacobian_values, force, x, change)
-        if not left < before:
-            before = left
+        residual = _residual(program, w.jacobian_values, force, x, change)
+        if not residual < last_residual:
+            last_residual = residual
             break
-        before = left
-    if not before <= MAX_RESIDUAL:
+        last_residual = residual
+    if not last_residual <= MAX_RESIDUAL:
         return NEEDS_DENSE
     copy(x[n_q:], lam)
     return DONE
@@ -353,8 +353,8 @@ def _add_jacobian_times(f, w, x, out):
 
 
 @compiled
-def _gamma(f, w, t, q, v):
-    """Store the right-hand side of G a = Gamma in w.Gamma; return NEEDS_DENSE if this needs differences, else DONE."""
+def _fill_gamma(f, w, t, q, v):
+    """Store the right-hand side of G a = Gamma in w.Gamma; return DONE, or NEEDS_DENSE if this requires differences."""
     w.Gamma[:] = 0.0
     if f.flags[GAMMA_GIVEN] == 1:
         f.gamma(t, q, v, f.p, w.Gamma)
@@ -364,7 +364,7 @@ def _gamma(f, w, t, q, v):
 
 @compiled
 def _acceleration_fault(w, t, q):
-    """Store which callback made an acceleration non-finite; return NOT_FINITE."""
+    """Store in w.notes which callback made an acceleration non-finite; return NOT_FINITE."""
     if not finite_vector(w.Gamma):
         return not_finite(w.notes, GAMMA, t, q)
     if not finite_vector(w.Q):
@@ -374,9 +374,9 @@ def _acceleration_fault(w, t, q):
 
 @compiled
 def _accelerate(f, w, t, q, v, a):
-    """Store accelerations at (q, v) in `a`, and multipliers in w.z, by the factors in w; return a code."""
+    """Store the accelerations at (q, v) in `a`, and the multipliers in w.z, by the factors in w; return a code."""
     w.counters[N_EVALUATIONS] += 1
-    code = _gamma(f, w, t, q, v)
+    code = _fill_gamma(f, w, t, q, v)
     if code != DONE:
         return code
     w.Q[:] = 0.0
@@ -392,13 +392,13 @@ def _accelerate(f, w, t, q, v, a):
 
 @compiled
 def _equilibrate(f, w, lam):
-    """Store the multipliers of all rows in lam, from w.z, of least norm if rows are redundant; return a code."""
+    """Copy the multipliers in w.z to lam; if rows are redundant, replace them by those of least norm; return a code."""
     copy(w.z, lam)
     return least_norm(f, w, lam) if w.rows_v.size < lam.size else DONE
 
 
 @compiled
-def _move(f, w, x):
+def _add_least_correction(f, w, x):
     """Add to x the least correction in the metric of M that changes G x by w.g; return its largest entry."""
     n = x.size
     w.unknowns[:n] = 0.0
@@ -417,20 +417,20 @@ def _move(f, w, x):
 def _rows_hold(f, w, q):
     """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
     rows, columns, _ = jacobian_of(f.static_program)
-    size = w.solutions[: w.g.size]
-    size[:] = 0.0
+    largest_terms = w.solutions[: w.g.size]
+    largest_terms[:] = 0.0
     for k in range(rows.size):
-        size[rows[k]] = max(size[rows[k]], abs(w.jacobian_values[k] * q[columns[k]]))
-    held = True
-    for i in range(size.size):
-        held = held and abs(w.C[i]) <= ROUNDING_OF_ROWS * size[i]
-    return held
+        largest_terms[rows[k]] = max(largest_terms[rows[k]], abs(w.jacobian_values[k] * q[columns[k]]))
+    all_hold = True
+    for i in range(largest_terms.size):
+        all_hold = all_hold and abs(w.C[i]) <= ROUNDING_OF_ROWS * largest_terms[i]
+    return all_hold
 
 
 @compiled
-def _to_constraints(f, w, t, q, v, theta):
-    """Project (q, v) onto the constraints in place, with factors before the last correction in w; return a code."""
-    before = np.inf
+def _project(f, w, t, q, v, theta):
+    """Project (q, v) onto the constraints in place; the last correction does not renew the factors; return a code."""
+    last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):
         code = factor_at(f, w, t, q)
@@ -441,39 +441,41 @@ def _to_constraints(f, w, t, q, v, theta):
         w.counters[N_INNER] += 1
         for i in range(w.g.size):
             w.g[i] = -w.C[i]
-        moved = _move(f, w, q)
-        if not np.isfinite(moved):
+        correction_q = _add_least_correction(f, w, q)
+        if not np.isfinite(correction_q):
             return not_finite(w.notes, CONSTRAINT, t, q)
         constraint_rates(f, w, t, q, w.Rate)
         copy(w.Rate, w.g)
         _add_jacobian_times(f, w, v, w.g)
         for i in range(w.g.size):
             w.g[i] = -w.g[i]
-        faster = _move(f, w, v)
-        if not np.isfinite(faster):
+        correction_v = _add_least_correction(f, w, v)
+        if not np.isfinite(correction_v):
             return not_finite(w.notes, RATE, t, q)
-        if moved <= theta and faster <= theta * max(1.0, largest_of(v)):
+        if correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v)):
             return DONE
-        if moved <= w.notes[PIVOT] * theta:
+        if correction_q <= w.notes[PIVOT] * theta:
             return DONE
-        if moved > CONTRACTION * before:
+        if correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
             return (
-                DONE if moved <= limit or (moved <= AMPLIFICATION * limit and _rows_hold(f, w, q)) else INNER_DIVERGED
+                DONE
+                if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _rows_hold(f, w, q))
+                else INNER_DIVERGED
             )
-        before = max(moved, theta)
+        last_correction = max(correction_q, theta)
     return INNER_DIVERGED
 
 
 @compiled
 def _mass_pattern_holds(w):
-    """Return whether w.M, if a callback fills this dense matrix, has entries only where the program expects them."""
+    """Return whether w.M has entries only where the program expects them; True if w.M is empty, and not used."""
     return w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern)
 
 
 @compiled
-def _redundant_rows_hold(f, w, t, q, v):
-    """Return DONE if an accepted state, whose entries are in w, satisfies all rows, else ROWS_CONTRADICT."""
+def _check_redundant_rows(f, w, t, q, v):
+    """Return DONE if an accepted state, with its entries of G in w, satisfies all rows, else ROWS_CONTRADICT."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
@@ -492,8 +494,8 @@ def _redundant_rows_hold(f, w, t, q, v):
 
 
 @compiled
-def _solve(f, w, r, c, a, lam):
-    """Store in `a` and lam the solution for the right-hand side (r, c), by the factors in w; return DONE."""
+def _solve_task(f, w, r, c, a, lam):
+    """Store in `a` and lam the accelerations and multipliers for the right-hand side (r, c); return DONE."""
     n = r.size
     copy(r, w.unknowns[:n])
     copy(c, w.unknowns[n:])
@@ -504,7 +506,7 @@ def _solve(f, w, r, c, a, lam):
 
 
 @compiled
-def _other_task(f, w, task, t, q, v, a, lam):
+def _do_other_task(f, w, task, t, q, v, a, lam):
     if task == tasks.FIND_NULL_SPACE:
         return factor_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:
@@ -513,9 +515,9 @@ def _other_task(f, w, task, t, q, v, a, lam):
         fill_mass_values(f, w, t, q)
         return DONE if finite_vector(w.mass_values) else not_finite(w.notes, MASS, t, q)
     if task == tasks.CHECK_REDUNDANT:
-        return _redundant_rows_hold(f, w, t, q, v)
+        return _check_redundant_rows(f, w, t, q, v)
     if task == tasks.SOLVE:
-        return _solve(f, w, q, v, a, lam)
+        return _solve_task(f, w, q, v, a, lam)
     return NEEDS_DENSE
 
 
@@ -525,17 +527,17 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN):
         code = STOPPED if w.notes[TIME_IS_UP] == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
-            code = _to_constraints(f, w, t, q, v, tolerance)
+            code = _project(f, w, t, q, v, tolerance)
         if code == DONE:
             code = factor_at(f, w, t, q)
         return _accelerate(f, w, t, q, v, a) if code == DONE else code
     if task == tasks.MULTIPLIERS:
         return _equilibrate(f, w, lam)
     if task >= tasks.FIND_NULL_SPACE:
-        return _other_task(f, w, task, t, q, v, a, lam)
+        return _do_other_task(f, w, task, t, q, v, a, lam)
     code = DONE
     if task != tasks.ACCELERATIONS:
-        code = _to_constraints(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)
+        code = _project(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)
         if code != DONE or task == tasks.RESTORE:
             return code
     code = _accelerate(f, w, t, q, v, a)
