@@ -47,7 +47,7 @@ def call_lapack(typing_context, address, arguments):
     """Call the LAPACK routine at `address` with `arguments` and Fortran's last argument `info`; return `info`.
 
     `arguments` is a tuple of arrays and integers. An array is passed as the address of its first element, an integer as
-    the address of a 32-bit copy, which also serves as a character, because numba's machines have the low byte first.
+    the address of a 32-bit copy. The copy also serves as a character, because all machines of numba are little-endian.
     """
 
     def generate(context, builder, signature, values):
@@ -69,14 +69,14 @@ def call_lapack(typing_context, address, arguments):
     return types.int64(address, arguments), generate
 
 
-# smallest number of coordinates for which Newton steps by banded algebra count as faster: the measured limit is 36 to
-# 75, on chains of bandwidth 1 to 11 and on beams. Single evaluations, as in a fixed-point iteration, are faster only
-# above about 150 coordinates; with 56 coordinates they take a third longer
+# smallest number of coordinates for which Newton steps by banded algebra count as faster than by dense algebra: the
+# measured limit is 36 to 75, on chains of bandwidth 1 to 11 and on beams. Single evaluations, as in a fixed-point
+# iteration, are faster only above about 150 coordinates; with 56 coordinates they take a third longer
 BANDED_FROM = 56
 
 
 def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
-    """Return whether banded linear algebra is faster than dense, and its arrays fit in the memory of the dense ones."""
+    """Return whether banded algebra is faster than dense algebra, and its arrays fit in those of dense algebra."""
     return n_q >= max(BANDED_FROM, 3 * bandwidth + 2 + 2 * n_c)
 
 
@@ -94,7 +94,7 @@ def _mass_band(w, b):
 
 @inlined
 def _mass_diagonals(w, b):
-    """Return a view of w.L behind the Cholesky factor, for the diagonals of M: entry (i, i + k) of M is at [k, i]."""
+    """Return a view of w.L behind the Cholesky factor for the diagonals of M: entry (i, i + k) of M is at [k, i]."""
     n = w.Q.size
     return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
 
@@ -117,7 +117,7 @@ def factor_banded_mass(f, w):
 
 @merged
 def solve_banded_mass(f, w, x):
-    """Replace x by M^-1 x, with the factor of `factor_banded_mass`."""
+    """Replace x (n_q) by M^-1 x, with the Cholesky factor that `factor_banded_mass` stored."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     call_lapack(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))
@@ -140,14 +140,14 @@ def add_banded_mass_times(f, w, x, y):
             y[i + k] += diagonals[k, i] * x[i]
 
 
-# The bordered system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], where b is the bandwidth of B, has the solution
+# The bordered system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], with a matrix B of bandwidth b, has the solution
 # mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r, x = B^-1 (r - Cq^T mu). The array `numbers`, real or complex, contains the LU of B,
-# the transpose of B^-1 Cq^T, the matrix Cq B^-1 Cq^T, and scratch (n_c).
+# the transpose of B^-1 Cq^T, the LU of Cq B^-1 Cq^T, and scratch (n_c).
 
 
 @inlined
 def lu_band(numbers, n, b):
-    """Return the view of `numbers` that contains B, then its LU: entry (i, j) of B is at [j, 2 b + i - j]."""
+    """Return the view of `numbers` for B and, after a factorization, its LU: entry (i, j) is at [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 
@@ -171,17 +171,20 @@ def _scratch(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the bordered system in `numbers` by the routines `factorize` and `substitute` (xGBTRF, xGBTRS)."""
+    """Factor the bordered system in `numbers` by the routines `factorize` (xGBTRF) and `substitute` (xGBTRS).
+
+    Returns DONE, or SINGULAR if a matrix is singular.
+    """
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
-    rows = pivots[: n - n_c].view(np.int32)
-    if call_lapack(w.lapack[factorize], (n, n, b, b, band, 3 * b + 1, rows)) != 0:
+    exchanges = pivots[: n - n_c].view(np.int32)
+    if call_lapack(w.lapack[factorize], (n, n, b, b, band, 3 * b + 1, exchanges)) != 0:
         return SINGULAR
     border = _border(numbers, n, n_c, b)
     for i in range(n_c):
         for j in range(n):
             border[i, j] = Cq[i, j]
-    call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, n_c, band, 3 * b + 1, rows, border, n))
+    call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, n_c, band, 3 * b + 1, exchanges, border, n))
     S = _complement(numbers, n, n_c, b)
     for i in range(n_c):
         for k in range(n_c):
@@ -195,8 +198,8 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
 def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
     """Replace x (n_q), the right-hand side r, by the solution of the bordered system factored by `factor_bordered`."""
     n_c, n = Cq.shape
-    band, rows = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
-    call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, rows, x, n))
+    band, exchanges = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
+    call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, exchanges, x, n))
     mu = _scratch(numbers, n, n_c, b)
     for i in range(n_c):
         mu[i] = 0.0

@@ -1,6 +1,6 @@
-"""Factor small dense matrices in place, without allocation, and record where matrices have entries.
+"""Factor small dense matrices in place, without allocation, and record where matrices have nonzero entries.
 
-Inner loops run along rows, and are skipped if their factor is zero: even small constraint Jacobians are sparse.
+Innermost loops run along rows, and are skipped if their factor is zero: even small constraint Jacobians are sparse.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -15,7 +15,7 @@ def copy(source, target):
 
 @merged
 def copy_matrix(source, target):
-    """Copy rows of `source` to `target`, as many as both matrices have."""
+    """Copy the first rows of the matrix `source` to `target`, as many rows as both matrices have."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -34,8 +34,8 @@ def largest_of(x):
 def contains(numbers, number):
     """Return whether `number` is one of `numbers`."""
     contained = False
-    for each in numbers:
-        contained = contained or each == number
+    for element in numbers:
+        contained = contained or element == number
     return contained
 
 
@@ -47,7 +47,7 @@ def _magnitude(x):
 
 @merged
 def lu_factor(A, pivots):
-    """Replace A, real or complex, by its factors L U with row exchanges `pivots`, with 1/u_kk on the diagonal.
+    """Replace A, real or complex, by its factors L and U, with 1/u_kk on the diagonal; store row exchanges in `pivots`.
 
     Returns min|u_kk| / max|u_kk|, or 0 if A is singular or a pivot is not finite.
     """
@@ -56,17 +56,17 @@ def lu_factor(A, pivots):
     largest = 0.0
     for k in range(n):
         p = k
-        top = _magnitude(A[k, k])
+        pivot_size = _magnitude(A[k, k])
         for i in range(k + 1, n):
-            size = _magnitude(A[i, k])
-            if size > top:
-                top = size
+            magnitude = _magnitude(A[i, k])
+            if magnitude > pivot_size:
+                pivot_size = magnitude
                 p = i
         pivots[k] = p
-        if not top > 0.0:  # also true for NaN
+        if not pivot_size > 0.0:  # also true for NaN
             return 0.0
-        smallest = min(smallest, top)
-        largest = max(largest, top)
+        smallest = min(smallest, pivot_size)
+        largest = max(largest, pivot_size)
         if p != k:
             for j in range(n):
                 A[k, j], A[p, j] = A[p, j], A[k, j]
@@ -83,7 +83,7 @@ def lu_factor(A, pivots):
 
 @merged
 def lu_sign(A, pivots):
-    """Return the sign of the determinant of a real matrix, whose factors by `lu_factor` are A and `pivots`."""
+    """Return the sign of the determinant of a real matrix, from its factors A and `pivots` by `lu_factor`."""
     sign = 1.0
     for k in range(A.shape[0]):
         if (A[k, k] < 0.0) != (pivots[k] != k):
@@ -93,7 +93,7 @@ def lu_sign(A, pivots):
 
 @merged
 def lu_solve(A, pivots, x):
-    """Replace x, the right-hand side, by the solution, with the factors A and `pivots` of `lu_factor`."""
+    """Replace the right-hand side x by the solution, with the factors A and `pivots` by `lu_factor`."""
     n = A.shape[0]
     for k in range(n):
         p = pivots[k]
@@ -156,7 +156,7 @@ def invert_definite(A):
 
 @merged
 def ldl_solve(A, x):
-    """Replace x, the right-hand side, by the solution, with the factors A of `ldl_factor`."""
+    """Replace the right-hand side x by the solution, with the factors A by `ldl_factor`."""
     n = A.shape[0]
     for k in range(n):
         if x[k] != 0.0:
@@ -172,7 +172,7 @@ def ldl_solve(A, x):
 
 @merged
 def ldl_solve_rows(A, B):
-    """Replace the columns of B, right-hand sides, by the solutions, with the factors A of `ldl_factor`."""
+    """Replace the right-hand sides, the columns of B, by the solutions, with the factors A by `ldl_factor`."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):
@@ -193,7 +193,7 @@ def ldl_solve_rows(A, B):
 def has_new_entries(G, pattern):
     """Return whether G has a nonzero entry where `pattern` is 0."""
     entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
-    unseen = 0.0  # a sum without a branch, because new entries are rare
+    unseen = 0.0  # sum of the new |entries|: a sum needs no branch, and new entries are rare
     for i in range(seen.size):
         unseen += abs(entries[i]) * (1.0 - seen[i])
     return unseen != 0.0  # also true for NaN
@@ -204,10 +204,10 @@ def note_pattern(G, pattern):
     """Set `pattern` to 1 where G is not zero; return whether this changes `pattern`."""
     if not has_new_entries(G, pattern):
         return False
-    new = False
+    has_new = False
     for i in range(pattern.shape[0]):
         for j in range(pattern.shape[1]):
             if G[i, j] != 0.0 and pattern[i, j] == 0.0:
                 pattern[i, j] = 1.0
-                new = True
-    return new
+                has_new = True
+    return has_new

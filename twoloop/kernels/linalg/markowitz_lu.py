@@ -2,8 +2,9 @@
 
 A mechanism's Jacobian has few nonzero entries, and their pattern does not change. So the order of elimination is chosen
 once for each partition (Markowitz's rule with a threshold), and written as a program, a list of operations. Later
-factorizations follow this program, without a search for pivots and without tests for zeros. If multipliers become
-large, another order is chosen. If the program is nearly as long as that of a full matrix, the factors are dense.
+factorizations follow this program, without a search for pivots and without tests for zeros. If multipliers of the
+elimination become large, another order is chosen. If the program is nearly as long as that of a full matrix, dense
+factors replace the sparse ones.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
 lists that it changes. So the work is proportional to the number of rows times the number of entries, instead of to the
@@ -18,16 +19,17 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
 THRESHOLD = 0.1  # smallest pivot, relative to the largest entry in its column
-DENSE_SHARE = 0.5  # number of subtractions, relative to a dense factorization, above which the factors are dense
-SMALL_SIZE = 3  # largest number of rows for which factors are never dense
+DENSE_ABOVE = 0.5  # factors are dense if the number of subtractions, relative to a dense factorization, exceeds this
+MAX_SPARSE_ROWS = 3  # with at most this number of rows, factors are sparse whatever the number of subtractions
 ZERO_PIVOT = 1e-11  # largest pivot that counts as zero, relative to the largest pivot so far
-# largest number of subtractions in a program, for which memory is allocated: MIN_SUBTRACTIONS + PER_ROW r
+# memory of a program: it has room for at most MIN_SUBTRACTIONS + PER_ROW r subtractions for r rows; with more, factors
+# are dense
 MIN_SUBTRACTIONS, PER_ROW = 2000, 100
-MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or a column of the factors
+MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or a column of the sparse factors; with more, dense
 
 ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # results of `order`; TOO_MANY: too many entries for sparse factors
 
-# indices in `index`. SIZE: number of rows r. DENSE: 1 if the factors are dense. SIGN: sign of the permutations.
+# indices in `index`. SIZE: number of rows r. DENSE: 1 if the factors are dense. SIGN: sign of the permutations (1, -1).
 # N_SLOTS: number of entries of the factors. FIRST_LOWER: first entry of L. WIDTH: number of columns of the Jacobian.
 # Arrays follow: rows (r), columns (r), row exchanges of dense factors (r), first entries (r) and ends (r) of the rows
 # of U, first entries of the rows of L (r + 1); row, column and source of each entry, where the source is the index of a
@@ -90,7 +92,7 @@ def end_upper(r):
 
 @merged
 def begin_lower(r):
-    """Return the position in `index` of the list of the first entries of the rows of L, and of the end of the last."""
+    """Return the position in `index` of the list of the first entries of the rows of L, then of the last row's end."""
     return N_HEAD + 5 * r
 
 
@@ -102,7 +104,7 @@ def begin_entries(r):
 
 @inlined
 def lists_of(index, values):
-    """Return views for the elimination in `order`: counts (N_COUNTS, r), lists (N_LISTS, r, width), numbers."""
+    """Return views of both arrays for `order`: counts (N_COUNTS, r), lists (N_LISTS, r, width), numbers (r, width)."""
     r = index[SIZE]
     width = min(r, MAX_ENTRIES_PER_LINE)
     counts = index[index.size - N_COUNTS * r :].reshape((N_COUNTS, r))
@@ -121,7 +123,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j), a number with a source, to the lists of `matrix`; return False if a list is full."""
+    """Add entry (i, j), with its number and the index of its source, to the lists; return False if a list is full."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -136,9 +138,9 @@ def put_entry(matrix, i, j, number, source):
 
 @compiled
 def _choose_pivot(matrix, rows, columns, k):
-    """Return row and column of pivot k, the entry with the least fill of those large enough; (-1, -1): there is none.
+    """Return row and column of pivot k, the large enough entry that causes the least fill-in; (-1, -1): there is none.
 
-    Among entries with equal fill the largest is chosen, and among equally large ones the first in the order so far.
+    Of entries with equal fill-in, the largest is chosen; of equally large ones, the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -159,15 +161,15 @@ def _choose_pivot(matrix, rows, columns, k):
             if size > 0.0 and size >= THRESHOLD * largest:
                 cost = (counts[ROW_LEFT, i] - 1) * n_others
                 position = counts[ROW_POSITION, i] * r + p
-                better = cost < best_cost or (cost == best_cost and size > best_size)
-                if better or (cost == best_cost and size == best_size and position < best_position):
+                is_better = cost < best_cost or (cost == best_cost and size > best_size)
+                if is_better or (cost == best_cost and size == best_size and position < best_position):
                     best_cost, best_size, best_position, row, column = cost, size, position, i, j
     return row, column
 
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Exchange `chosen` and the number at position k of `order`; return 1 if `chosen` is already there, else -1."""
+    """Bring the index `chosen` to position k of `order` by an exchange; return -1, or 1 if it is there already."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -183,9 +185,9 @@ def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
         counts[WHERE, lists[ROWS, j, m]] = m + 1
-    index = counts[WHERE, row] - 1
-    number = numbers[j, index]
-    fits = True
+    position = counts[WHERE, row] - 1
+    number = numbers[j, position]
+    has_space = True
     for m in range(counts[COLUMN_SIZE, column]):
         i = lists[ROWS, column, m]
         if i == row:
@@ -194,20 +196,20 @@ def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
         if entry > 0:
             numbers[j, entry - 1] -= change
         else:
-            fits = fits and put_entry(matrix, i, j, -change, zero_source)
+            has_space = has_space and put_entry(matrix, i, j, -change, zero_source)
     last = counts[COLUMN_SIZE, j] - 1
     for m in range(last + 1):
         counts[WHERE, lists[ROWS, j, m]] = 0
-    lists[ROWS, j, index], numbers[j, index] = lists[ROWS, j, last], numbers[j, last]
+    lists[ROWS, j, position], numbers[j, position] = lists[ROWS, j, last], numbers[j, last]
     counts[COLUMN_SIZE, j] = last
-    return fits
+    return has_space
 
 
 @compiled
-def order(index, matrix, zero_source, zero_share):
+def order(index, matrix, zero_source, zero_ratio):
     """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a code.
 
-    Fill-in entries get the source `zero_source`, the index of a zero. A pivot of at most `zero_share` times the largest
+    Fill-in entries get the source `zero_source`, the index of a zero. A pivot of at most `zero_ratio` times the largest
     one so far counts as zero. The code is ORDERED, SINGULAR_MATRIX or TOO_MANY; `index` is complete only if ORDERED.
     """
     counts, lists, numbers = matrix
@@ -228,17 +230,17 @@ def order(index, matrix, zero_source, zero_share):
             if lists[ROWS, j, m] == i:
                 pivot = numbers[j, m]
         largest = max(largest, abs(pivot))
-        if not abs(pivot) > zero_share * largest:
+        if not abs(pivot) > zero_ratio * largest:
             return SINGULAR_MATRIX
         for n in range(counts[ROW_SIZE, i]):
-            other = lists[COLUMNS, i, n]
-            if counts[COLUMN_POSITION, other] > k and not _eliminate_entry(matrix, i, j, pivot, other, zero_source):
+            column = lists[COLUMNS, i, n]
+            if counts[COLUMN_POSITION, column] > k and not _eliminate_entry(matrix, i, j, pivot, column, zero_source):
                 return TOO_MANY
     return ORDERED if _store_program(index, counts, lists) else TOO_MANY
 
 
 @compiled
-def _sort(columns, sources, size, position):
+def _sort_row(columns, sources, size, position):
     """Sort the first `size` entries of a row, in place, by the order of elimination of their columns."""
     for n in range(1, size):
         column, source, k = columns[n], sources[n], n
@@ -249,8 +251,8 @@ def _sort(columns, sources, size, position):
 
 
 @compiled
-def _size_of_program(rows, counts, lists):
-    """Sort the lists of the rows by the order of elimination; return the numbers of entries and subtractions.
+def _sort_and_count(rows, counts, lists):
+    """Sort the lists of the rows by the order of elimination; return the numbers of entries and of subtractions.
 
     Stores the number of entries of each row of U, in the order of elimination, in counts[ROW_LEFT].
     """
@@ -258,7 +260,7 @@ def _size_of_program(rows, counts, lists):
     entries, subtractions = 0, 0
     for k in range(rows.size):
         i = rows[k]
-        _sort(lists[COLUMNS, i], lists[SOURCES, i], counts[ROW_SIZE, i], position)
+        _sort_row(lists[COLUMNS, i], lists[SOURCES, i], counts[ROW_SIZE, i], position)
         entries += counts[ROW_SIZE, i]
         lower = 0
         while position[lists[COLUMNS, i, lower]] < k:
@@ -270,12 +272,12 @@ def _size_of_program(rows, counts, lists):
 
 @compiled
 def _store_program(index, counts, lists):
-    """Store the program in `index`; return False, without storing it, if dense factors would be faster."""
+    """Store the program in `index` and return True; store nothing and return False if dense factors are faster."""
     r = index[SIZE]
     rows = rows_of(index)
-    n_slots, subtractions = _size_of_program(rows, counts, lists)
+    n_slots, subtractions = _sort_and_count(rows, counts, lists)
     n_dense = (r * (r - 1) * (2 * r - 1)) / 6.0
-    if subtractions > MIN_SUBTRACTIONS + PER_ROW * r or (r > SMALL_SIZE and subtractions > DENSE_SHARE * n_dense):
+    if subtractions > MIN_SUBTRACTIONS + PER_ROW * r or (r > MAX_SPARSE_ROWS and subtractions > DENSE_ABOVE * n_dense):
         return False
     in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
     source, target = in_column + n_slots, in_column + 2 * n_slots
@@ -309,7 +311,8 @@ def _store_program(index, counts, lists):
     return True
 
 
-MAX_MULTIPLIER = 1e3  # multiplier above which the order of elimination is chosen again
+# largest multiplier of an elimination with accurate results; above it, the order of elimination is chosen again
+MAX_MULTIPLIER = 1e3
 
 
 @compiled
@@ -346,9 +349,9 @@ def make_program(G, pattern, rows, columns, index, values):
 def factor(entries, index, values):
     """Store in `values` the factors of G[rows][:, columns], with 1/pivot on the diagonal.
 
-    `entries` is G as a vector, whose last row is zero. Returns the ratio of the smallest to the largest pivot. If this
-    is negative (0 from dense factors), a pivot is zero or not finite, or a multiplier exceeds MAX_MULTIPLIER: the order
-    must be chosen again.
+    `entries` is G, with a last row of zeros, as a vector. Returns the ratio of the smallest to the largest pivot. A
+    negative result (0 from dense factors) means that a pivot is zero or not finite, or that a multiplier exceeds
+    MAX_MULTIPLIER: the order of elimination must be chosen again.
     """
     r = index[SIZE]
     if index[DENSE] == 1:
@@ -366,31 +369,31 @@ def factor(entries, index, values):
 
 @merged
 def run_program(index, values):
-    """Replace the entries in `values` by their factors, by the program; return the result of `factor`."""
+    """Replace the entries in `values` by the factors, by the program in `index`; return the result of `factor`."""
     r, n_slots = index[SIZE], index[N_SLOTS]
     in_column = begin_entries(r) + n_slots
     target = in_column + 2 * n_slots
     upper, end, lower = begin_upper(r), end_upper(r), begin_lower(r)
-    smallest, largest, growth = 1e300, 0.0, 0.0
+    smallest, largest, largest_multiplier = 1e300, 0.0, 0.0
     for i in range(r):
         for s in range(index[lower + i], index[lower + i + 1]):
             k = index[in_column + s]
             multiplier = values[s] * values[k]
             values[s] = multiplier
-            growth = max(growth, abs(multiplier))
+            largest_multiplier = max(largest_multiplier, abs(multiplier))
             for u in range(index[upper + k], index[end + k]):
                 values[index[target]] -= multiplier * values[u]
                 target += 1
-        size = abs(values[i])
-        if not size > 0.0:  # also true for NaN
+        pivot = abs(values[i])
+        if not pivot > 0.0:  # also true for NaN
             return -1.0
-        smallest = min(smallest, size)
-        largest = max(largest, size)
+        smallest = min(smallest, pivot)
+        largest = max(largest, pivot)
         values[i] = 1.0 / values[i]
-    if not growth <= MAX_MULTIPLIER:
+    if not largest_multiplier <= MAX_MULTIPLIER:
         return -1.0
     in_row = begin_entries(r)
-    for u in range(r, index[FIRST_LOWER]):  # divide U by its diagonal, which makes solutions faster
+    for u in range(r, index[FIRST_LOWER]):  # divide the rows of U by the diagonal, which makes solutions faster
         values[u] *= values[index[in_row + u]]
     return smallest / largest if r > 0 else 1.0
 
@@ -410,7 +413,7 @@ def determinant_sign(index, values):
 
 @merged
 def solve(index, values, x):
-    """Replace x, the right-hand side in the order of rows, by the solution, in the order of columns."""
+    """Replace x, the right-hand side in the order of rows_of, by the solution, in the order of columns_of."""
     r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), pivots_of(index), x)
@@ -426,14 +429,14 @@ def solve(index, values, x):
 
 @merged
 def solve_rows(index, values, X, n):
-    """Replace each of the first n rows of X, right-hand sides, by its solution, see `solve`."""
+    """Replace the first n rows of X, each a right-hand side, by the solutions, see `solve`."""
     for j in range(n):
         solve(index, values, X[j])
 
 
 @merged
 def solve_transposed(index, values, x):
-    """Replace x, in the order of columns, by the solution with the transposed matrix, in the order of rows."""
+    """Replace x, a right-hand side in the order of columns_of, by the solution with the transposed matrix."""
     r = index[SIZE]
     if index[DENSE] == 1:
         A, pivots = values[: r * r].reshape((r, r)), pivots_of(index)

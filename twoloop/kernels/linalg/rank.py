@@ -1,4 +1,4 @@
-"""Choose independent rows of G, and rows that make M invertible if added to M; bound the pivots and the solutions."""
+"""Choose independent rows of G, and rows g for which M + sum s g g^T is invertible; bound the pivots and solutions."""
 
 import math
 
@@ -9,8 +9,8 @@ from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl
 
 # rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# squared norm of the orthogonal part of a row, relative to that of the row, below which orthogonalisation is repeated
-MOST_OF_SQUARE = 0.5
+# orthogonalisation is repeated if the squared norm of the orthogonal part of a row, relative to the row, is below this
+REPEAT_BELOW = 0.5
 
 
 @compiled
@@ -23,7 +23,7 @@ def _dot(x, y):
 
 @compiled
 def _orthogonalise(basis, n, rest, parts):
-    """Subtract from `rest` its components along n orthonormal rows, add them to `parts`; return |rest|^2."""
+    """Subtract from `rest` its components along n orthonormal rows, add these to `parts`; return the squared norm."""
     for i in range(n):
         part = _dot(basis[i], rest)
         if part != 0.0:
@@ -34,13 +34,13 @@ def _orthogonalise(basis, n, rest, parts):
 
 
 @merged
-def select_rows(G, min_share, basis, factors, kept):
-    """Store in `kept` the indices of rows of G, each independent of those selected before; return their number.
+def select_rows(G, min_sine, basis, factors, kept):
+    """Store in `kept` the indices of rows of G, each independent of the rows selected before; return their number.
 
-    A row is independent if its part that is orthogonal to the selected rows has a norm above `min_share` times that of
-    the row. The part is computed by Gram-Schmidt orthogonalisation, which is repeated if most of the row is lost. On
-    return, the rows of `basis` are orthonormal, and the lower triangle `factors` times `basis` is the selected rows.
-    Both arrays have as many rows as can be independent, and one more for scratch.
+    A row is independent if the sine of its angle to the selected rows exceeds `min_sine`. Its orthogonal part is
+    computed by Gram-Schmidt orthogonalisation, which is repeated if most of the row is lost. On return, the rows of
+    `basis` are orthonormal, and the selected rows are the lower triangle `factors` times `basis`. Both arrays have as
+    many rows as can be independent, and one more for scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -51,11 +51,11 @@ def select_rows(G, min_share, basis, factors, kept):
             rest[j] = G[k, j]
         for i in range(n_kept):
             parts[i] = 0.0
-        length = _dot(G[k], G[k])
+        square = _dot(G[k], G[k])
         rest_square = _orthogonalise(basis, n_kept, rest, parts)
-        if rest_square < MOST_OF_SQUARE * length:
+        if rest_square < REPEAT_BELOW * square:
             rest_square = _orthogonalise(basis, n_kept, rest, parts)
-        if rest_square > min_share**2 * length:
+        if rest_square > min_sine**2 * square:
             parts[n_kept] = math.sqrt(rest_square)
             for j in range(rest.size):
                 rest[j] /= parts[n_kept]
@@ -65,14 +65,14 @@ def select_rows(G, min_share, basis, factors, kept):
 
 
 @kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
-def independent_rows(G, min_share, basis, factors, kept):
-    """Call `select_rows` from Python."""
-    return select_rows(G, min_share, basis, factors, kept)
+def independent_rows(G, min_sine, basis, factors, kept):
+    """Return the result of `select_rows`, for calls from Python."""
+    return select_rows(G, min_sine, basis, factors, kept)
 
 
 @merged
 def _find_coefficients(n, basis, factors, row, coefficients):
-    """Store the `coefficients` with which `row` is a combination of the n selected rows, by least squares."""
+    """Store the `coefficients` (n) of the n selected rows in `row`, by least squares."""
     for k in range(n):
         coefficients[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -85,7 +85,7 @@ def _find_coefficients(n, basis, factors, row, coefficients):
 def norm_of_inverse(factors, n, column):
     """Return the Frobenius norm of the inverse of the lower triangle `factors`, of n rows; `column` is scratch.
 
-    With the factors of independent rows of G, the result times |b| bounds the solution of least norm of G x = b.
+    With the factors of independent rows of G, this norm times |b| bounds the solution of least norm of G x = b.
     """
     total = 0.0
     for j in range(n):
@@ -99,20 +99,20 @@ def norm_of_inverse(factors, n, column):
 
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
-def express_other_rows(rows, order, min_share, chosen_rows, basis, factors, kept, coefficients, lengths):
+def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept, coefficients, norms):
     """Return whether the first n rows in `order` are independent; if so, express all other rows by them.
 
     n is the number of rows of `chosen_rows`, in which the first n rows are stored. Row i of `coefficients` receives the
-    coefficients, by least squares, with which row order[n + i] is a combination of them; `lengths` receives the norms
-    of all `rows`. For the other arguments see `select_rows`.
+    coefficients, by least squares, with which row order[n + i] is a combination of the first n rows; `norms` receives
+    the norms of all `rows`. For the other arguments see `select_rows`.
     """
     n = len(chosen_rows)
     for i in range(len(rows)):
-        lengths[i] = math.sqrt(_dot(rows[i], rows[i]))
+        norms[i] = math.sqrt(_dot(rows[i], rows[i]))
     for k in range(n):
         for j in range(rows.shape[1]):
             chosen_rows[k, j] = rows[order[k], j]
-    if select_rows(chosen_rows, min_share, basis, factors, kept) < n:
+    if select_rows(chosen_rows, min_sine, basis, factors, kept) < n:
         return False
     for i in range(len(coefficients)):
         _find_coefficients(n, basis, factors, rows[order[n + i]], coefficients[i])
@@ -120,14 +120,14 @@ def express_other_rows(rows, order, min_share, chosen_rows, basis, factors, kept
 
 
 @kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def least_solution(rows, values, min_share, basis, factors, kept, coefficients, gram, parts, x):
+def least_solution(rows, values, min_sine, basis, factors, kept, coefficients, gram, parts, x):
     """Store in `x` the vector of least norm for which rows @ x is nearest to `values`; return the rank of `rows`.
 
     `x` must be zero on entry; `values` is overwritten with the residuals. If y and b are the values of independent and
-    other rows, and S the coefficients of independent rows in the other ones, then the independent rows times x are
-    y + S^T z, with (1 + S S^T) z = b - S y. `basis` to `parts` are scratch; for `min_share` see `select_rows`.
+    other rows, and S the coefficients of independent rows in the other rows, then the independent rows times x are
+    y + S^T z, with (I + S S^T) z = b - S y. `basis` to `parts` are scratch; for `min_sine` see `select_rows`.
     """
-    n, n_others = select_rows(rows, min_share, basis, factors, kept), 0
+    n, n_others = select_rows(rows, min_sine, basis, factors, kept), 0
     y, z = parts[0], parts[1]
     for i in range(len(rows)):
         if i - n_others < n and kept[i - n_others] == i:
@@ -158,29 +158,29 @@ def least_solution(rows, values, min_share, basis, factors, kept, coefficients, 
 
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
 def singular_values_exceed(rows, ratio, gram):
-    """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one.
+    """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one, s.
 
-    They do if rows rows^T - (ratio s)^2 I is definite, where s, the largest one, is replaced by its upper bound, the
-    Frobenius norm. `gram` is scratch.
+    They do if rows rows^T - (ratio s)^2 I is positive definite; s is replaced by its upper bound, the Frobenius norm.
+    `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
         for j in range(i + 1):
-            gram[j, i] = _dot(rows[i], rows[j])  # only its upper triangle is used
+            gram[j, i] = _dot(rows[i], rows[j])  # only the upper triangle of `gram` is used
         total += gram[i, i]
     for i in range(n):
         gram[i, i] -= (ratio * ratio + ROUNDING_OF_SQUARES * n) * total
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # amount, relative to a bound, by which pivots may be smaller because of rounding
-NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no rows make M invertible
+BOUND_ROUNDING = 1e-12  # largest rounding error, relative to a bound, by which pivots may be below this bound
+NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
-# ratio of the smallest to the largest eigenvalue of M above which pivots show that all rows are independent, and that
-# no row must be added to M: if pivots exceed one of the bounds, which are at least 1e-5, the part of a row that is
-# orthogonal to other rows is at least 1e-6 of the row, whereas 1e-9 suffices
+# if the smallest eigenvalue of M exceeds this multiple of the largest one, pivots above a bound show that all rows are
+# independent and that no row must be added to M: as bounds are at least 1e-5, the part of a row that is orthogonal to
+# the other rows is then at least 1e-6 of the row, whereas 1e-9 suffices
 SIMILAR_EIGENVALUES = 1e-7
-# largest coefficient of an independent row in a redundant one, both scaled to length 1: above it the two rows are
+# largest coefficient of an independent row in a redundant one, both scaled to norm 1: above it the two rows are
 # exchanged. If the coefficient passes through zero during the motion, the independent rows become dependent, as at each
 # dead centre of the slider-crank with two rods; hence redundant rows with large coefficients become independent ones.
 # The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
@@ -195,7 +195,7 @@ def workspace_size(n_rows: int, n: int) -> int:
 
 @merged
 def _factor_and_count_negative(A):
-    """Replace a symmetric A by factors as `ldl_factor`, even if not definite; return the number of eigenvalues < 0."""
+    """Replace a symmetric A, definite or not, by the factors of `ldl_factor`; return the number of eigenvalues < 0."""
     n, count = len(A), 0
     for k in range(n):
         if not A[k, k] > 0.0:
@@ -212,23 +212,26 @@ def _factor_and_count_negative(A):
 
 
 @compiled
-def _count_weak_eigenvalues(mass, weak, A):
-    """Return the number of eigenvalues of M below b = `weak` times their bound; store factors of M - b I in A."""
+def _count_weak_eigenvalues(mass, weak_ratio, A):
+    """Return the number of eigenvalues of M below b, and store the factors of M - b I in A.
+
+    b is `weak_ratio` times an upper bound on the largest eigenvalue.
+    """
     largest = 0.0
     for i in range(len(mass)):
-        total = 0.0
+        row_sum = 0.0
         for j in range(len(mass)):
-            total += abs(mass[i, j])
-        largest = max(largest, total)
+            row_sum += abs(mass[i, j])
+        largest = max(largest, row_sum)
     copy_matrix(mass, A)
     for i in range(len(mass)):
-        A[i, i] -= weak * largest
+        A[i, i] -= weak_ratio * largest
     return _factor_and_count_negative(A)
 
 
 @compiled
 def _has_similar_eigenvalues(mass):
-    """Return whether Gershgorin's circles show that all eigenvalues of M exceed SIMILAR_EIGENVALUES of the largest."""
+    """Return whether, by Gershgorin's circles, all eigenvalues of M exceed SIMILAR_EIGENVALUES times the largest."""
     least, largest = math.inf, 0.0
     for i in range(len(mass)):
         row_sum = 0.0
@@ -240,20 +243,20 @@ def _has_similar_eigenvalues(mass):
 
 @merged
 def _scale_of_added_rows(mass, G):
-    """Return the power of two by which G^T G must be multiplied to have about the size of M."""
-    largest, longest = 0.0, 0.0
+    """Return the power of two s for which the largest entries of s G^T G and M are about equal."""
+    largest, largest_of_rows = 0.0, 0.0
     for i in range(len(mass)):
         for j in range(len(mass)):
             largest = max(largest, abs(mass[i, j]))
     for i in range(len(G)):
         for j in range(len(mass)):
-            longest = max(longest, abs(G[i, j]))
-    return 2.0 ** math.floor(math.log2(largest / (longest * longest)) + 0.5)
+            largest_of_rows = max(largest_of_rows, abs(G[i, j]))
+    return 2.0 ** math.floor(math.log2(largest / (largest_of_rows * largest_of_rows)) + 0.5)
 
 
 @merged
 def _sort_by_entries(G, order, counts):
-    """Store in `order` the indices of the rows of G sorted by number of entries, and in `counts` these numbers."""
+    """Sort the rows of G by their numbers of entries: store their indices in `order`, the numbers in `counts`."""
     for k in range(len(G)):
         count, i = 0.0, k
         for j in range(G.shape[1]):
@@ -266,9 +269,9 @@ def _sort_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return whether adding scale g g^T to a matrix, whose factors are A, changes the sign of its determinant.
+    """Return whether the matrix with the factors A has fewer negative eigenvalues after scale g g^T is added to it.
 
-    If so, a negative eigenvalue becomes positive. `x` is scratch.
+    This is so if the determinant changes its sign. `x` is scratch.
     """
     for j in range(x.size):
         x[j] = g[j]
@@ -280,13 +283,14 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 
 
 @merged
-def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
-    """Add scale g g^T to M in place, for rows g of G, until no eigenvalue of M is below `weak` times the largest.
+def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
+    """Add scale g g^T to M in place, for rows g of G, until all eigenvalues of M are large enough.
 
-    Tries rows in the sequence `order`. Stores indices of added rows in `added`; returns their number or STAYS_SINGULAR.
+    An eigenvalue is too small if it is less than `weak_ratio` times the largest one. Rows are tried in the sequence
+    `order`. Stores the indices of added rows in `added`; returns their number, or STAYS_SINGULAR.
     """
     n_added = 0
-    while _count_weak_eigenvalues(mass, weak, A) > 0:
+    while _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
         position = -1
         for k in range(len(G)):
             if order[k] >= 0 and _removes_weak_eigenvalue(A, G[order[k]], scale, x):
@@ -308,8 +312,8 @@ def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
 def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_kept):
     """Replace independent rows by redundant rows in which their coefficients exceed MAX_COEFFICIENT.
 
-    Each exchange multiplies the volume spanned by the independent rows by the coefficient. `basis`, `factors` and
-    `kept`, results of `select_rows`, are updated; `order`, `coefficients` (n_rows) and `rows_kept` (n, n) are scratch.
+    Each exchange multiplies the volume that the independent rows span by the coefficient. Updates `basis`, `factors`
+    and `kept`, results of `select_rows`; `order`, `coefficients` (n_rows) and `rows_kept` (n, n) are scratch.
     """
     for _ in range(2 * (len(G) - n_kept)):
         largest, leaving, entering, position = MAX_COEFFICIENT, -1, -1, 0
@@ -318,15 +322,15 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_ke
                 position += 1
                 continue
             _find_coefficients(n_kept, basis, factors, G[i], coefficients)
-            length = _dot(G[i], G[i])
+            row_square = _dot(G[i], G[i])
             for k in range(n_kept):
-                square = _dot(G[kept[k]], G[kept[k]])
-                coefficient = abs(coefficients[k]) * math.sqrt(square / max(length, TINY))
+                kept_square = _dot(G[kept[k]], G[kept[k]])
+                coefficient = abs(coefficients[k]) * math.sqrt(kept_square / max(row_square, TINY))
                 if coefficient > largest:
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
             return
-        k = leaving  # move the indices between those of both rows, so that `kept` stays sorted
+        k = leaving  # shift the indices between `leaving` and `entering`, so that `kept` stays sorted
         while k + 1 < n_kept and kept[k + 1] < entering:
             kept[k] = kept[k + 1]
             k += 1
@@ -344,8 +348,9 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_ke
 def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scratch, S_scratch, sizes):
     """Return the index of the first of `bounds` that is below all pivots of the rows `kept`; bounds.size if none is.
 
-    A pivot is relative to its diagonal entry of S = G M^-1 G^T. No pivot is below the least eigenvalue of S, scaled to
-    a diagonal of 1, which exceeds a bound b if S - b I is definite. Returns NOT_DEFINITE if M is not positive definite.
+    Pivots are relative to the diagonal entries of S = G M^-1 G^T. No pivot is below the smallest eigenvalue of S scaled
+    to a diagonal of 1, and this eigenvalue exceeds a bound b if the scaled S - b I is positive definite. Returns
+    NOT_DEFINITE if M is not positive definite.
     """
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
@@ -370,7 +375,7 @@ def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scr
     shifted = S[n_rows:]
     for index in range(bounds.size):
         for i in range(n_rows):
-            for k in range(i, n_rows):  # only its upper triangle is used
+            for k in range(i, n_rows):  # only the upper triangle of `shifted` is used
                 shifted[i, k] = S[i, k]
             shifted[i, i] -= bounds[index] * (1.0 - BOUND_ROUNDING)
         if ldl_factor(shifted):
@@ -379,14 +384,14 @@ def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scr
 
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
-def choose_rows(original_mass, G, min_share, weak_share, bounds, workspace, chosen):
+def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
     """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; return an index or a code.
 
-    Rows of G are selected as in `select_rows` with `min_share`, then exchanged as in `_exchange_rows`. Rows are added
-    to M if it has eigenvalues below `weak_share` times the largest; weak_share = 0: no rows are added. `chosen`, of
-    2 + 3 n_rows numbers, becomes the number of independent rows, the number of added rows, and the lists of both, of
-    length n_rows each. `workspace` is scratch, but workspace[0] becomes the factor of the added rows. Returns the
-    result of `_first_bound_below_pivots`, or STAYS_SINGULAR. See generate/elimination.py.
+    Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Rows are added to
+    M if it has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: no rows are added. `chosen`, of
+    2 + 3 n_rows numbers, receives the number of independent rows, the number of added rows, and the indices of both in
+    two lists of length n_rows. `workspace` is scratch, but workspace[0] receives the factor s of the added s g g^T.
+    Returns the result of `_first_bound_below_pivots`, or STAYS_SINGULAR. See generate/elimination.py.
     """
     n_rows, n = G.shape
     n_max = min(n_rows, n) + 1
@@ -405,15 +410,15 @@ def choose_rows(original_mass, G, min_share, weak_share, bounds, workspace, chos
         if 0 <= first_bound < bounds.size:  # all rows are independent, and M is invertible
             chosen[0], chosen[1], workspace[0] = n_rows, 0, 1.0
             return first_bound
-    n_kept = select_rows(G, min_share, basis, factors, kept)
+    n_kept = select_rows(G, min_sine, basis, factors, kept)
     if n_kept < n_rows:
         _exchange_rows(G, n_kept, basis, factors, kept, order, sizes, A)
     copy_matrix(original_mass, mass)
     n_added, scale = 0, 1.0
-    if n_kept > 0 and weak_share > 0.0 and _count_weak_eigenvalues(mass, weak_share, A) > 0:
+    if n_kept > 0 and weak_ratio > 0.0 and _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
         scale = _scale_of_added_rows(mass, G)
         _sort_by_entries(G, order, sizes)
-        n_added = _stiffen_mass(mass, G, weak_share, scale, A, x, order, added)
+        n_added = _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added)
     chosen[0], chosen[1], first_bound = n_kept, max(n_added, 0), n_added
     if n_added >= 0:
         first_bound = _first_bound_below_pivots(mass, G, kept, n_kept, bounds, A, solved, S, sizes)

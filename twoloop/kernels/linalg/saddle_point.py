@@ -55,7 +55,7 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 @compiled
 def find_null_space(w):
-    """Store in w.D (but for its last row) the velocities that the constraints allow, from the rows and factors in w."""
+    """Store the null space of G in w.D, except the last row of w.D (see Work), from the rows and factors in w."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -65,7 +65,7 @@ def find_null_space(w):
 
 @merged
 def _reduce_diagonal(columns, independent, M, D, A, m):
-    """Store the upper triangle of T^T M T in A, for a diagonal M; m is scratch."""
+    """Store the upper triangle of T^T M T in A (n_dof, n_dof) for a diagonal M; m is scratch."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
     for i in range(independent.size):
@@ -79,7 +79,7 @@ def _reduce_diagonal(columns, independent, M, D, A, m):
 
 @merged
 def _reduce_dense(columns, independent, M, D, A, MT):
-    """Store the upper triangle of T^T M T in A, for any M; MT is scratch."""
+    """Store the upper triangle of T^T M T in A (n_dof, n_dof) for any M; MT (n_q, n_dof) is scratch."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
         for j in range(n_dof):
@@ -101,7 +101,7 @@ def _reduce_dense(columns, independent, M, D, A, MT):
 
 @merged
 def factor_reduced(f, w):
-    """Store the factors of T^T M T in w.A, from w.M and w.D; return DONE, MASS_NOT_DEFINITE or NOT_FINITE."""
+    """Store the LDL factors of T^T M T, from w.M and w.D, in w.A; return DONE, MASS_NOT_DEFINITE or NOT_FINITE."""
     columns = columns_of(w.index_v)
     if f.flags[DIAGONAL_MASS] == 1:
         _reduce_diagonal(columns, w.independent_v, w.M, w.D, w.A, w.x)
@@ -124,12 +124,12 @@ def solve_reduced(f, w, r, c, a):
     copy(r, a)
     # `a` becomes r - M g, where g has the dependent entries z, and zero independent entries
     for k in range(columns.size):
-        m = columns[k]
+        column = columns[k]
         if f.flags[DIAGONAL_MASS] == 1:
-            a[m] -= M[m, m] * z[k]
+            a[column] -= M[column, column] * z[k]
         else:
             for j in range(a.size):
-                a[j] -= M[m, j] * z[k]
+                a[j] -= M[column, j] * z[k]
     for j in range(n_dof):
         total = a[independent[j]]
         for k in range(columns.size):
@@ -150,13 +150,13 @@ def reduced_multipliers(f, w, r, a, lam):
     """Store the multipliers of the independent rows in lam, from G^T lam = r - M a in the dependent columns."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
-        m = columns[k]
-        total = r[m]
+        column = columns[k]
+        total = r[column]
         if f.flags[DIAGONAL_MASS] == 1:
-            total -= w.M[m, m] * a[m]
+            total -= w.M[column, column] * a[column]
         else:
             for j in range(a.size):
-                total -= w.M[m, j] * a[j]
+                total -= w.M[column, j] * a[j]
         z[k] = total
     solve_transposed(w.index_v, w.values_v, z)
     for k in range(rows.size):
@@ -165,20 +165,20 @@ def reduced_multipliers(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Store in w.L factors of w.M, or its inverse if M is constant and dense (faster to apply); return a code."""
+    """Store in w.L the factors of w.M, or its inverse, faster to apply, if M is constant and dense; return a code."""
     if banded_mass(f):
-        definite = factor_banded_mass(f, w) == DONE
+        is_definite = factor_banded_mass(f, w) == DONE
     else:
         copy_matrix(w.M, w.L)
-        definite = invert_definite(w.L) if f.flags[CONSTANT_MASS] == 1 else ldl_factor(w.L)
-    if definite:
+        is_definite = invert_definite(w.L) if f.flags[CONSTANT_MASS] == 1 else ldl_factor(w.L)
+    if is_definite:
         return DONE
     return MASS_NOT_DEFINITE if finite(w.M) else NOT_FINITE
 
 
 @merged
-def _times_inverse_mass(f, w, x, y):
-    """Store M^-1 x in y; x and y may be the same array unless M is constant, dense and not diagonal."""
+def _apply_inverse_mass(f, w, x, y):
+    """Store M^-1 x in y, by w.L; x and y may be one array unless M is constant, dense and not diagonal."""
     n = x.size
     if f.flags[DIAGONAL_MASS] == 1:
         for i in range(n):
@@ -198,7 +198,7 @@ def _times_inverse_mass(f, w, x, y):
 
 
 @merged
-def _equal(A, B):
+def _is_equal(A, B):
     for i in range(B.shape[0]):
         for j in range(B.shape[1]):
             if A[i, j] != B[i, j]:  # also true for NaN
@@ -208,14 +208,14 @@ def _equal(A, B):
 
 @merged
 def factor_schur(f, w):
-    """Store the factors of S = G M^-1 G^T of the independent rows in w.S, if G or M has changed; return a code."""
+    """Store in w.S the factors of S = G M^-1 G^T, for the independent rows, if G or M has changed; return a code."""
     is_constant = f.flags[CONSTANT_MASS] == 1
-    if is_constant and _equal(w.G, w.G_of_S):
+    if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
     rows = w.rows_v
     S, solved = w.S, w.W
     for i in range(rows.size):
-        _times_inverse_mass(f, w, w.G[rows[i]], solved[i])
+        _apply_inverse_mass(f, w, w.G[rows[i]], solved[i])
     for i in range(rows.size):
         for k in range(i, rows.size):
             total = 0.0
@@ -234,9 +234,9 @@ def factor_schur(f, w):
 
 @merged
 def solve_schur(f, w, r, c, a):
-    """Store in `a` and w.z the accelerations and the multipliers of the independent rows, by the factors of S."""
+    """Store the accelerations in `a` and the multipliers of the independent rows in w.z, by the factors of S."""
     rows, solved = w.rows_v, w.W
-    _times_inverse_mass(f, w, r, a)
+    _apply_inverse_mass(f, w, r, a)
     for i in range(rows.size):
         total = -c[rows[i]]
         for j in range(a.size):
@@ -248,19 +248,20 @@ def solve_schur(f, w, r, c, a):
             a[j] -= solved[i, j] * w.z[i]
 
 
-MIN_ROWS = 8  # smallest number of rows, and of freedoms, for which the augmented form is the fastest (on chains: 7)
-# smallest number of coordinates for which the augmented form is the fastest even with few freedoms, unless M is
-# diagonal (measured: about 30)
+# smallest number of rows, and of degrees of freedom, with which the augmented form is the fastest (7 on chains)
+MIN_ROWS = 8
+# smallest number of coordinates with which the augmented form is the fastest even with fewer degrees of freedom, unless
+# M is diagonal (measured: about 30)
 MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Return whether the augmented form is faster than dense forms for sparse matrices; `diagonal`: M is diagonal."""
+    """Return whether the augmented form is faster than the dense forms; `diagonal` is whether M is diagonal."""
     return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
 @compiled
-def _largest(A):
+def _largest_entry(A):
     largest = 0.0
     for i in range(A.shape[0]):
         for j in range(A.shape[1]):
@@ -269,13 +270,13 @@ def _largest(A):
 
 
 @compiled
-def _make_program(w):
+def _write_augmented_program(w):
     """Store in w.index_a the program that factors the augmented matrix of w.M and w.G; return the result of `order`."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     note_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
     matrix = lists_of(index, values)
-    scale = 2.0 ** np.round(np.log2(_largest(w.G) / _largest(w.M))) if rows.size > 0 else 1.0
+    scale = 2.0 ** np.round(np.log2(_largest_entry(w.G) / _largest_entry(w.M))) if rows.size > 0 else 1.0
     w.notes[MASS_SCALE] = scale
     for i in range(n):
         for j in range(n):
@@ -292,29 +293,29 @@ def _make_program(w):
 
 
 @compiled
-def _factor(w):
-    """Store the factors of the augmented matrix in w.values_a, by its program; return False if it needs another one."""
+def _run_augmented_program(w):
+    """Store the factors of the augmented matrix in w.values_a; return False if another program must be written."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
     source = begin_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
-        place = index[source + s]
-        values[s] = w.augmented[place] * (scale if place >= first_of_mass else 1.0)
+        entry = index[source + s]
+        values[s] = w.augmented[entry] * (scale if entry >= first_of_mass else 1.0)
     return run_program(index, values) > 0.0
 
 
 @compiled
 def factor_sparse(f, w):
-    """Factor the augmented matrix, or store a dense form in f.flags if the factors are not sparse; return a code."""
+    """Factor the augmented matrix, or set f.flags[FORM] to a dense form if factors are not sparse; return a code."""
     w.counters[N_FACTORIZATIONS] += 1
-    new = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
-    if w.index_a[at.SIZE] == 0 or new or not _factor(w):
+    has_new_entry = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
+    if w.index_a[at.SIZE] == 0 or has_new_entry or not _run_augmented_program(w):
         if not finite(w.M):
             return NOT_FINITE
-        code = _make_program(w)
+        code = _write_augmented_program(w)
         if code == at.TOO_MANY:
             f.flags[FORM] = f.flags[DENSE_FORM]
             return DONE
-        if code != at.ORDERED or not _factor(w):
+        if code != at.ORDERED or not _run_augmented_program(w):
             w.index_a[at.SIZE] = 0
             return MASS_NOT_DEFINITE
     if determinant_sign(w.index_a, w.values_a) != (1.0 if w.rows_v.size % 2 == 0 else -1.0):
@@ -324,7 +325,7 @@ def factor_sparse(f, w):
 
 @compiled
 def solve_sparse(w, r, c, a):
-    """Store in `a` and w.z the accelerations and the multipliers of the independent rows, by the sparse factors."""
+    """Store the accelerations in `a` and the multipliers of the independent rows in w.z, by the sparse factors."""
     n, size, scale = r.size, w.index_a[at.SIZE], w.notes[MASS_SCALE]
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
@@ -344,8 +345,8 @@ def solve_sparse(w, r, c, a):
 
 
 @compiled
-def _factor_sparse(f, w):
-    """Factor the augmented matrix; if a dense form replaces it, compute w.D or factors of M instead; return a code."""
+def _factor_sparse_or_dense(f, w):
+    """Factor the augmented matrix, or store w.D or the factors of M if a dense form replaces it; return a code."""
     code = factor_sparse(f, w)
     if code == DONE and f.flags[FORM] == NULL_SPACE:
         find_null_space(w)
@@ -356,10 +357,10 @@ def _factor_sparse(f, w):
 
 @merged
 def factor(f, w):
-    """Factor the equations of accelerations with w.M, the rows, their factors and w.D in w; return a code."""
+    """Factor the equations of accelerations, with w.M, the rows, their factors and w.D, in form FORM; return a code."""
     if w.notes[FACTORED] == 1.0:
         return DONE
-    code = _factor_sparse(f, w) if f.flags[FORM] == AUGMENTED else DONE
+    code = _factor_sparse_or_dense(f, w) if f.flags[FORM] == AUGMENTED else DONE
     if code == DONE and f.flags[FORM] == NULL_SPACE:
         code = factor_reduced(f, w)
     elif code == DONE and f.flags[FORM] == MULTIPLIERS:
@@ -375,7 +376,7 @@ def factor(f, w):
 
 @merged
 def solve(f, w, r, c, a):
-    """Store in `a` the accelerations for the right-hand side (r, c); r, c and `a` must be different arrays."""
+    """Store in `a` the accelerations for the right-hand side (r, c) of the equations; the arrays must be different."""
     if f.flags[FORM] == NULL_SPACE:
         solve_reduced(f, w, r, c, a)
     elif f.flags[FORM] == MULTIPLIERS:
@@ -386,7 +387,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Store the multipliers of the last solution `a` in lam; those of redundant rows are not changed."""
+    """Store in lam the multipliers of the independent rows for the last solution `a`; keep those of other rows."""
     if f.flags[FORM] == NULL_SPACE:
         reduced_multipliers(f, w, r, a, lam)
     else:
@@ -405,8 +406,8 @@ def solve_both(f, w, r, c, a, lam):
 def least_norm(w, lam):
     """Replace lam by the multipliers of least norm with the same G^T lam.
 
-    Redundant row i is the sum over k of Z[i, k] times independent row k. The columns n_i = e_i - sum_k Z[i, k] e_k of N
-    span the null space of G^T, and lam -= N (N^T N)^-1 N^T lam.
+    Redundant row i is the sum over k of Z[i, k] times independent row k. The null space of G^T is spanned by the
+    columns n_i = e_i - sum_k Z[i, k] e_k of a matrix N, and lam -= N (N^T N)^-1 N^T lam.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     r, n_red = rows.size, lam.size - rows.size

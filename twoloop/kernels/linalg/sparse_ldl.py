@@ -1,10 +1,10 @@
-"""Factor and solve the matrix of a large system by its program, see symbolic_factorization.py.
+"""Factor and solve the matrix [M G^T; G 0] of a large system by a program, see symbolic_factorization.py.
 
 An independent row of G has a negative pivot: minus the squared norm of the part of the row that is orthogonal to
 previous rows, in the metric of M^-1. The squared norm of the row is the sum of the contributions of the bodies. The
-ratio of both is the squared sine of the angle between the row and the previous rows; `smallest` is the smallest of
-these squared sines. For a redundant row, 0 replaces 1 / pivot, which removes the row from the solution without another
-program. If the smallest squared sine is 10^-k, solutions lose k digits, which refinement with M and G recovers.
+ratio of these two squared norms is the squared sine of the angle between the row and the previous rows. For a redundant
+row, 0 replaces 1 / pivot, which removes the row from the solution without another program. If the smallest squared sine
+is 10^-k, solutions lose k digits, which refinement with M and G recovers.
 
 If a body's M is singular, as with four Euler parameters, rows g that involve this body alone stiffen it: M + s g g^T
 replaces M. Accelerations do not change, because g a is prescribed, and the multiplier of g decreases by s g a. So M
@@ -24,12 +24,12 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     stiffened_of,
 )
 
-NOT_DEFINITE = -1.0  # returned instead of the smallest pivot if a pivot of M is not positive
+NOT_DEFINITE = -1.0  # value that `factor` returns instead of the smallest squared sine if a pivot of M is not positive
 
 
 @compiled
 def _find_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Store in `stiffness`, for each row g that stiffens M, s = largest diagonal entry of M in its columns / |g|^2."""
+    """Store in `stiffness`, for each row g that stiffens M, s = largest diagonal entry of M in columns of g / |g|^2."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -38,16 +38,16 @@ def _find_stiffness(program, mass, jacobian, stiffness, scratch):
         if rows[k] == columns[k]:
             scratch[rows[k]] += mass[k]
     _, columns, _ = jacobian_of(program)
-    which, first, second, _ = stiffened_of(program)
-    for u in range(which.size):
-        stiffness[which[u]] = 0.0
-    for u in range(which.size):
+    product_rows, first, second, _ = stiffened_of(program)
+    for u in range(product_rows.size):
+        stiffness[product_rows[u]] = 0.0
+    for u in range(product_rows.size):
         if first[u] == second[u]:
-            row, number = which[u], jacobian[first[u]]
+            row, number = product_rows[u], jacobian[first[u]]
             stiffness[row] = max(stiffness[row], scratch[columns[first[u]]])
             scratch[n_q + row] += number * number
-    for u in range(which.size):
-        row = which[u]
+    for u in range(product_rows.size):
+        row = product_rows[u]
         if scratch[n_q + row] > 0.0:
             stiffness[row] /= scratch[n_q + row]
             scratch[n_q + row] = 0.0
@@ -64,20 +64,20 @@ def load(program, mass, jacobian, values, stiffness, scratch):
     _, _, slots = jacobian_of(program)
     for k in range(slots.size):
         values[slots[k]] += jacobian[k]
-    which, first, second, slots = stiffened_of(program)
-    if which.size > 0:
+    product_rows, first, second, slots = stiffened_of(program)
+    if product_rows.size > 0:
         _find_stiffness(program, mass, jacobian, stiffness, scratch)
-        for u in range(which.size):
-            values[slots[u]] += stiffness[which[u]] * jacobian[first[u]] * jacobian[second[u]]
+        for u in range(product_rows.size):
+            values[slots[u]] += stiffness[product_rows[u]] * jacobian[first[u]] * jacobian[second[u]]
 
 
 @compiled
-def factor(program, counts, values, sizes, least):
+def factor(program, counts, values, sizes, min_sine_square):
     """Replace `values` by the factors, with 1/pivot on the diagonal; return the smallest squared sine of a row.
 
-    The squared sine is minus the pivot over the squared norm of the row, which is stored in `sizes`. `counts` is 0 for
-    redundant rows, and becomes 0 for rows with a squared sine up to `least`; these rows do not affect the result.
-    Returns NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
+    The squared sine of a row is minus its pivot over its squared norm, which is stored in `sizes`. `counts` is 0 for
+    redundant rows, and is set to 0 for rows with a squared sine up to `min_sine_square`; these rows do not affect the
+    result. Returns NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = order_of(program), runs_of(program)
@@ -87,10 +87,10 @@ def factor(program, counts, values, sizes, least):
     smallest, u = 1.0, 0
     for k in range(n):
         first, last = n + begin[k], n + begin[k + 1]
-        pivot, of_row = values[k], order[k] >= n_q
-        if of_row:
+        pivot, is_row = values[k], order[k] >= n_q
+        if is_row:
             row = order[k] - n_q
-            if counts[row] != 0.0 and not -pivot > least * sizes[k]:  # also true for NaN
+            if counts[row] != 0.0 and not -pivot > min_sine_square * sizes[k]:  # also true for NaN
                 counts[row] = 0.0
             if counts[row] == 0.0:
                 values[k] = 0.0
@@ -108,13 +108,13 @@ def factor(program, counts, values, sizes, least):
         values[k] = inverse
         for s in range(first, last):
             multiplier = values[s] * inverse
-            if not of_row:
+            if not is_row:
                 sizes[row_of[s - n]] += multiplier * values[s]
             values[row_of[s - n]] -= multiplier * values[s]
             r = s + 1
             while r < last:
                 size = runs[u]
-                if multiplier != 0.0:  # two thirds are zero if a planar mechanism is modelled in space
+                if multiplier != 0.0:  # two thirds of the multipliers are 0 if a planar mechanism is modelled in space
                     into, own = values[runs[u + 1] : runs[u + 1] + size], values[r : r + size]
                     for i in range(size):
                         into[i] -= multiplier * own[i]
@@ -126,10 +126,10 @@ def factor(program, counts, values, sizes, least):
 
 @compiled
 def solve(program, values, stiffness, x, y):
-    """Replace x, the right-hand side [r, c], by the solution [a, lam], by the factors `values`; y is scratch."""
+    """Replace the right-hand side x = [r, c] by the solution [a, lam], with the factors `values`; y is scratch."""
     n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
     # with M + s g g^T in place of M, the right-hand side should be r + s g c. With r alone, accelerations are the same,
-    # because g a = c, and the multiplier of g is smaller by s c, which is added at the end
+    # because g a = c, but the multiplier of g is smaller by s c; the last loop adds s c
     begin, row_of = columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -149,12 +149,12 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_redundant_stiffness(program, jacobian, counts, stiffness, c, right):
-    """Add s g^T c_g to `right` in place, for each redundant row g that stiffens M; c_g is its entry in c = [r, c]."""
+    """Add s g^T c_g to `right` in place for each redundant row g that stiffens M; c_g: entry of g in c = [r, c]."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_of(program)
-    which, first, second, _ = stiffened_of(program)
-    for u in range(which.size):
-        row, entry = which[u], first[u]
+    product_rows, first, second, _ = stiffened_of(program)
+    for u in range(product_rows.size):
+        row, entry = product_rows[u], first[u]
         if entry == second[u] and counts[row] == 0.0:
             right[columns[entry]] += stiffness[row] * jacobian[entry] * c[n_q + row]
 
@@ -177,10 +177,10 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 
 
 @compiled
-def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
-    """Replace x, the right-hand side [r, c], by the solution [a, lam], refined `times` times.
+def solve_refined(program, mass, jacobian, counts, values, stiffness, x, n_corrections, right, residual, y):
+    """Replace the right-hand side x = [r, c] by the solution [a, lam], refined by `n_corrections` corrections.
 
-    Returns max|a| of the last correction over max|a|; 0 without refinement. The last three arguments are scratch.
+    Returns max|a| of the last correction over max|a|; 0 without corrections. The last three arguments are scratch.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):
@@ -190,7 +190,7 @@ def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, 
         if counts[i] == 0.0:
             x[n_q + i] = right[n_q + i] = 0.0
     solve(program, values, stiffness, x, y)
-    for _ in range(times):
+    for _ in range(n_corrections):
         for k in range(x.size):
             residual[k] = right[k]
         subtract_product(program, mass, jacobian, counts, x, residual)

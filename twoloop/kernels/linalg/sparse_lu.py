@@ -1,4 +1,4 @@
-"""Factor the unsymmetric Newton matrix of a large system by a static program, and group its columns.
+"""Factor the unsymmetric Newton matrix of a large system by a static program, and group the columns of K and D.
 
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
@@ -32,7 +32,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     stiffened_of,
 )
 
-MIN_PIVOT = 1e-11  # ratio of a pivot to the sum of its |terms| below which the pivot may be a rounding error
+MIN_PIVOT = 1e-11  # smallest pivot, relative to the sum of its |terms|, that cannot be a rounding error
 
 
 def newton_program(
@@ -44,7 +44,7 @@ def newton_program(
     together: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors Newton's matrix; None if it would have too many updates.
+    """Return the program that factors Newton's matrix; None if the program would have too many updates.
 
     `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`.
     """
@@ -52,7 +52,7 @@ def newton_program(
     begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
     order = elimination_order(n_q, n_rows, mass, jacobian, together, stiff_rows, tangents)
     entries = np.concatenate([mass[0], tangents[0]]), np.concatenate([mass[1], tangents[1]])
-    program = program_in_order(order, n_q, entries, jacobian, stiff_rows, both=True)
+    program = program_in_order(order, n_q, entries, jacobian, stiff_rows, unsymmetric=True)
     return None if program is None else np.concatenate([program, begins]).astype(np.int32)
 
 
@@ -65,21 +65,21 @@ def grouped_entries(tangents: Entries, n_q: int) -> Entries:
 def column_groups(entries: Entries, n_q: int) -> Integers:
     """Return the index of the group of each column (n_q); the columns of a group have no entry in the same row."""
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
-    for i, j in zip(*(each.tolist() for each in entries), strict=True):
+    for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
     groups = np.zeros(n_q, dtype=np.int64)
-    by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of the columns with an entry in it
-    for j, own in enumerate(rows_of):
-        used = set().union(*(by_row[i] for i in own))
-        groups[j] = group = next(k for k in range(n_q) if k not in used)
-        for i in own:
+    by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of the columns with an entry in the row
+    for j, rows in enumerate(rows_of):
+        groups_in_rows = set().union(*(by_row[i] for i in rows))
+        groups[j] = group = next(k for k in range(n_q) if k not in groups_in_rows)
+        for i in rows:
             by_row[i].add(group)
     return groups
 
 
 @inlined
 def tangents_of(program):
-    """Return rows and columns of the entries of K and D, and the indices at which groups of entries begin and end."""
+    """Return rows and columns of the entries of K and D, the indices at which groups of entries begin, and the end."""
     begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_of(program)
     n_mass = rows.size - begins[begins.size - 1]
@@ -101,9 +101,9 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
     for k in range(slots.size):
         values[slots[k]] += jacobian[k]
         values[slots[k] + off] += jacobian[k]
-    which, first, second, slots = stiffened_of(program)
-    for u in range(which.size):
-        product = stiffness[which[u]] * jacobian[first[u]] * jacobian[second[u]]
+    product_rows, first, second, slots = stiffened_of(program)
+    for u in range(product_rows.size):
+        product = stiffness[product_rows[u]] * jacobian[first[u]] * jacobian[second[u]]
         values[slots[u]] += product
         if slots[u] >= program[N_PIVOTS]:
             values[slots[u] + off] += product
@@ -113,7 +113,8 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
 def factor(program, counts, values, sizes):
     """Replace `values` by the factors, with 1/pivot on the diagonal; return whether all pivots are large enough.
 
-    Factors of redundant rows (0 in `counts`) become zeros, which removes these rows from solutions; `sizes` is scratch.
+    For redundant rows (0 in `counts`), the factors become zeros, which removes the rows from solutions. `sizes` is
+    scratch.
     """
     n_q, n, off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF]
     order, runs = order_of(program), runs_of(program)
@@ -162,7 +163,7 @@ def factor(program, counts, values, sizes):
 
 @compiled
 def solve(program, values, x, y):
-    """Replace x, the right-hand side [r, c], by the solution, by the factors `values`; y is scratch."""
+    """Replace the right-hand side x = [r, c] by the solution, with the factors `values`; y is scratch."""
     n, off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
     begin, row_of = columns_of(program)
     for k in range(n):

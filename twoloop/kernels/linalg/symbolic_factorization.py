@@ -1,4 +1,4 @@
-"""Symbolic factorization of large systems: choose the order of elimination, and write the program for the factors.
+"""Factor large systems symbolically: choose the order of elimination, and write the program for the factors.
 
     [M  G^T]
     [G   0 ]  = L D L^T
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MAX_JOINTS = 4  # largest number of joints of a body that is eliminated before its joints; bodies with more are hubs
+MAX_JOINTS = 4  # largest number of joints of a body that is eliminated before its joints; with more, the body is a hub
 
 Integers = NDArray[np.int64]
 
@@ -60,7 +60,7 @@ class _Supports:
         self.supported: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def may_eliminate(self, joint: int) -> bool:
-        """Return whether a joint may be eliminated next, see the docstring of this module."""
+        """Return whether a joint may be the next to be eliminated, see the docstring of this module."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone and any(not self.grounded[part] and not self.hubs_of[part] for part in parts):
@@ -105,7 +105,7 @@ def elimination_order(
     first: Sequence[int] = (),
     couplings: tuple[Integers, Integers] | None = None,
 ) -> Integers:
-    """Return the order of elimination as indices: j for coordinate j, and n_q + i for row i of G.
+    """Return the order of elimination (n_q + n_rows): j for coordinate j, n_q + i for row i of G.
 
     Parameters
     ----------
@@ -120,16 +120,16 @@ def elimination_order(
         Entries of K and D, which couple bodies as springs do. All bodies are then hubs, each with its rows in `first`.
     """
     body_of = bodies_of(n_q, mass_entries, together)
-    touched: list[set[int]] = [set() for _ in range(n_rows)]
+    bodies_in_row: list[set[int]] = [set() for _ in range(n_rows)]
     for i, j in zip(*(each.tolist() for each in jacobian_entries), strict=True):
-        touched[i].add(body_of[j])
+        bodies_in_row[i].add(body_of[j])
     first_rows = set(first)
     rows_of: dict[frozenset[int], list[int]] = {}
-    for i, bodies in enumerate(touched):
+    for i, bodies in enumerate(bodies_in_row):
         if i not in first_rows:
             rows_of.setdefault(frozenset(bodies), []).append(i)
     joints = list(rows_of)
-    joints_of: list[list[int]] = [[] for _ in range(n_q)]  # by body
+    joints_of: list[list[int]] = [[] for _ in range(n_q)]  # for each body: indices of its joints
     for k, joint in enumerate(joints):
         for body in joint:
             joints_of[body].append(k)
@@ -140,11 +140,11 @@ def elimination_order(
     for j, body in enumerate(body_of):
         coordinates.setdefault(body, []).append(j)
     order = [j for j in range(n_q) if body_of[j] not in hubs]
-    order += [n_q + i for i in first if not touched[i] & hubs]
-    late_rows = [n_q + i for i in first if touched[i] & hubs]
+    order += [n_q + i for i in first if not bodies_in_row[i] & hubs]
+    late_rows = [n_q + i for i in first if bodies_in_row[i] & hubs]
     if couplings is not None:
         for i in first:
-            coordinates[next(iter(touched[i]))].append(n_q + i)
+            coordinates[next(iter(bodies_in_row[i]))].append(n_q + i)
         late_rows = []
     nodes = [[n_q + i for i in rows_of[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
     pairs: set[tuple[int, int]] = set()
@@ -160,12 +160,12 @@ def elimination_order(
 
 
 def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
-    """Return, for each coordinate, the index of the first coordinate of its body."""
+    """Return, for each coordinate, the index of the first coordinate of the same body."""
     pairs = np.array([(first, other) for first, *others in together for other in others], dtype=np.int64).reshape(-1, 2)
     ones, others = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
-    first_of, before = np.arange(n_q), np.full(n_q, -1)
-    while (first_of != before).any():
-        before = first_of.copy()
+    first_of, previous = np.arange(n_q), np.full(n_q, -1)
+    while (first_of != previous).any():
+        previous = first_of.copy()
         least = np.minimum(first_of[ones], first_of[others])
         np.minimum.at(first_of, ones, least)
         np.minimum.at(first_of, others, least)
@@ -184,20 +184,20 @@ def _minimum_degree(
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    The next joint or hub is the allowed one whose neighbours have the fewest rows and coordinates. `pairs`: pairs of
-    hubs that are coupled other than by joints. `lone`: see `_Supports`.
+    The next joint or hub is the one, among those allowed, whose neighbours have the fewest rows and coordinates.
+    `pairs`: pairs of hubs that are coupled other than by joints. `lone`: see `_Supports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
     neighbours: list[set[int]] = [set() for _ in sizes]
-    for body, numbers in enumerate(joints_of):
+    for body, joint_indices in enumerate(joints_of):
         if body in node_of:
-            neighbours[node_of[body]].update(numbers)
-            for k in numbers:
+            neighbours[node_of[body]].update(joint_indices)
+            for k in joint_indices:
                 neighbours[k].add(node_of[body])
         else:
-            for k in numbers:
-                neighbours[k].update(numbers)
+            for k in joint_indices:
+                neighbours[k].update(joint_indices)
     for one, other in pairs:
         neighbours[node_of[one]].add(node_of[other])
         neighbours[node_of[other]].add(node_of[one])
@@ -236,9 +236,11 @@ Entries = tuple[Integers, Integers]  # rows and columns
 
 # indices of the sizes with which a program begins; the functions below return the sections that follow
 N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
-ALWAYS_ALLOWED_UPDATES = 3_000_000  # number of updates (multiplications) up to which a program is always written
-MAX_UPDATE_SHARE = 1e-3  # number of updates, relative to n^3 for n pivots, up to which a program is faster
-MAX_UPDATES = 30_000_000  # number of updates up to which writing a program does not need too much memory
+ALWAYS_ALLOWED_UPDATES = 3_000_000  # largest number of updates (multiplications) with which a program is always written
+# larger programs are written only if they are faster than dense factors: largest number of updates, relative to n^3 for
+# n pivots
+MAX_UPDATE_RATIO = 1e-3
+MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer one takes too much memory
 
 
 def factorization_program(
@@ -257,7 +259,7 @@ def factorization_program(
     mass, jacobian : (rows, columns)
         Entries of M, both triangles, and of G. If an entry occurs more than once, its numbers are added.
     together : iterable of sequence of int
-        Groups of coordinates of one body each, as far as they are known.
+        Groups of coordinates that form one body each, even if M does not couple them.
     stiff_rows : sequence of int
         Rows g along which M is to be stiffened by a multiple of g g^T; M must have the entries of g g^T.
     """
@@ -266,11 +268,11 @@ def factorization_program(
 
 
 def program_in_order(
-    order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], both: bool = False
+    order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], unsymmetric: bool = False
 ) -> NDArray[np.int32] | None:
-    """Return the program for an order of elimination; None if it would have too many updates.
+    """Return the program for an order of elimination; None if the program would have too many updates.
 
-    With `both`, factors are unsymmetric: the slot of an entry of U is that of the entry of L plus N_OFF.
+    With `unsymmetric`, factors have entries of U, too: program[N_OFF] slots after those of L.
     """
     n = len(order)
     position = np.empty(n, dtype=np.int64)
@@ -279,34 +281,34 @@ def program_in_order(
     columns = np.concatenate([position[mass[1]], position[jacobian[1]]])
     low, high = np.minimum(rows, columns), np.maximum(rows, columns)
     rows_below = _columns_of_factors(n, low, high)
-    sizes = np.array([len(each) for each in rows_below], dtype=np.int64)
-    if (sizes * (sizes + 1) // 2).sum() > max(ALWAYS_ALLOWED_UPDATES, min(MAX_UPDATES, MAX_UPDATE_SHARE * n**3)):
+    sizes = np.array([len(rows_in_column) for rows_in_column in rows_below], dtype=np.int64)
+    if (sizes * (sizes + 1) // 2).sum() > max(ALWAYS_ALLOWED_UPDATES, min(MAX_UPDATES, MAX_UPDATE_RATIO * n**3)):
         return None
     begin = np.concatenate([[0], np.cumsum(sizes)])
     row_of = np.concatenate([np.zeros(0, np.int64), *rows_below])
     column_of = np.repeat(np.arange(n), sizes)
-    keys = column_of * n + row_of  # ascending
+    keys = column_of * n + row_of  # the keys are ascending
 
     def slots(column: Integers, row: Integers) -> Integers:
         positions = n + np.searchsorted(keys, column * n + row)
         return np.where(column == row, column, positions)
 
     firsts, seconds = [row_of[:0]], [row_of[:0]]
-    for each in rows_below:
-        i, j = _index_pairs(len(each))
-        firsts.append(each[i])
-        seconds.append(each[j])
+    for rows_in_column in rows_below:
+        i, j = _index_pairs(len(rows_in_column))
+        firsts.append(rows_in_column[i])
+        seconds.append(rows_in_column[j])
     first_of, second_of = np.concatenate(firsts), np.concatenate(seconds)
     runs = _runs(slots(first_of, second_of), first_of == second_of)
     source = slots(low, high)
     n_mass = len(mass[0])
-    # entries of M above the diagonal: in symmetric factors they get a slot that is never read
+    # entries of M above the diagonal get slots of U, or, with symmetric factors, a slot that is never read
     above = rows[:n_mass] < columns[:n_mass]
-    source[:n_mass][above] = source[:n_mass][above] + len(keys) if both else n + len(keys)
-    which, first, second = _products_of_entries(jacobian[0], stiff_rows)
-    one, other = (position[jacobian[1][each]] for each in (first, second))
-    stiffened = [which, first, second, slots(np.minimum(one, other), np.maximum(one, other))]
-    head = [n_q, n, len(keys), len(first_of), len(runs), n_mass, len(jacobian[0]), len(which)]
+    source[:n_mass][above] = source[:n_mass][above] + len(keys) if unsymmetric else n + len(keys)
+    product_rows, first, second = _products_of_entries(jacobian[0], stiff_rows)
+    one, other = (position[jacobian[1][indices]] for indices in (first, second))
+    stiffened = [product_rows, first, second, slots(np.minimum(one, other), np.maximum(one, other))]
+    head = [n_q, n, len(keys), len(first_of), len(runs), n_mass, len(jacobian[0]), len(product_rows)]
     parts = [order, begin, row_of, runs, *mass, source[:n_mass], *jacobian, source[n_mass:], *stiffened]
     return np.concatenate([np.array(head), *parts]).astype(np.int32)
 
@@ -317,37 +319,37 @@ def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
     The rows of a joint are adjacent in all columns, so that runs are long: the numbers of a run are read and written as
     vectors, and the program is a tenth as long as a list of all targets.
     """
-    off = np.flatnonzero(~diagonal)
-    begins = np.flatnonzero(diagonal[off - 1] | (targets[off] != targets[off - 1] + 1))
-    lengths = np.diff(np.append(begins, len(off)))
-    return np.stack([lengths, targets[off][begins]], axis=1).ravel()
+    off_diagonal = np.flatnonzero(~diagonal)
+    begins = np.flatnonzero(diagonal[off_diagonal - 1] | (targets[off_diagonal] != targets[off_diagonal - 1] + 1))
+    lengths = np.diff(np.append(begins, len(off_diagonal)))
+    return np.stack([lengths, targets[off_diagonal][begins]], axis=1).ravel()
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return the row, and the indices of both entries, of each product of two entries in one of the rows `chosen`."""
+    """Return the row and the indices of both entries, for each product of two entries in one of the rows `chosen`."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     ordered = rows[sequence]
     for row in chosen:
         entries = sequence[np.searchsorted(ordered, row) : np.searchsorted(ordered, row + 1)]
-        one, other = _index_pairs(len(entries))
-        parts.append((np.full(len(one), row), entries[one], entries[other]))
-    which, first, second = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return which, first, second
+        first_index, second_index = _index_pairs(len(entries))
+        parts.append((np.full(len(first_index), row), entries[first_index], entries[second_index]))
+    product_rows, first, second = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return product_rows, first, second
 
 
 _INDEX_PAIRS: dict[int, Entries] = {}
 
 
 def _index_pairs(m: int) -> Entries:
-    """Return first and second index of all unordered pairs of m items, including each item with itself."""
+    """Return the first and second indices of all unordered pairs of m items, including each item with itself."""
     if m not in _INDEX_PAIRS:
         _INDEX_PAIRS[m] = tuple(each.astype(np.int64) for each in np.triu_indices(m))  # type: ignore[assignment]
     return _INDEX_PAIRS[m]
 
 
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
-    """Return, for each column of L, the indices of the rows below the diagonal that have an entry in it.
+    """Return, for each column of L, the indices of the rows with an entry below the diagonal.
 
     If i is the first row of a column, elimination adds all rows of this column to column i.
     """
@@ -380,7 +382,7 @@ def order_of(program):
 
 @inlined
 def columns_of(program):
-    """Return the index of the first entry of each column of L, then of the end, and the row (pivot) of each entry."""
+    """Return where the entries of each column of L begin, then the end, and the row, a pivot's index, of each entry."""
     first = N_HEAD + program[N_PIVOTS]
     middle = first + program[N_PIVOTS] + 1
     return program[first:middle], program[middle : middle + program[N_OFF]]
