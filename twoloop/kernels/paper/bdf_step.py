@@ -1,8 +1,8 @@
-"""Step of the backward differentiation formulas, orders 1 to 5, for (q_i, v_i), with a fixed-point outer loop.
+"""Attempt steps by backward differentiation formulas of orders 1 to 5 for (q_i, v_i), with a fixed-point outer loop.
 
 The history consists of modified divided differences (Krogh), scaled to the step size as in DASSL and IDA (fixed leading
-coefficient), so that the step size can change in every step. At equal steps they are backward differences. Differences
-of all coordinates (q, v) are stored, including the dependent ones, so that a new partition needs no conversion.
+coefficient), so that the step size can change in every step. With equal steps they are backward differences. They are
+stored for all coordinates (q, v), including the dependent ones, so that a new partition needs no conversion.
 """
 
 from typing import Any
@@ -23,32 +23,32 @@ N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
 SAFETY = 0.9  # factor on the step size after a rejected step; smallest ratio of step sizes after an accepted step
-LEAST_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or one whose end is far from its prediction
+LEAST_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or a step that ends far from its prediction
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
-STEP_SIZE_FACTOR = 6.0  # further factor on the estimate in the choice of step sizes, as in VODE: fewer rejected steps
+STEP_SIZE_FACTOR = 6.0  # second factor on the error estimate, for the next step size only, as in VODE: fewer rejections
 ORDER_FACTOR = 1.4  # factor on the error estimates of other orders, so that the order rarely changes to and fro
-KEEP_BELOW = 1.2  # ratio of the next step size to this one below which the step size is not increased
+KEEP_BELOW = 1.2  # smallest factor by which the step size is increased; by a smaller factor it is kept
 GROWTH = 2.0  # largest ratio of successive step sizes
 
-# indices of the scalars in `options`, which are followed by the options of the Gauss steps
+# indices in `options` of the scalars; the options of the Gauss steps follow
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
-# indices of the scalars in `memory`, which are followed by the arrays of _coefficients and _blocks
+# indices in `memory` of the scalars; the arrays of _coefficients and _blocks follow
 (
     HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
     ORDER,
     DEPTH,  # order of the highest difference in the history
-    AGE,  # number of accepted steps since the order changed or the error test failed
+    AGE,  # number of accepted steps since the last change of order or the last rejected step
     NEXT_ORDER,
     NEXT_DEPTH,
     N_MEMORY_SCALARS,
 ) = range(7)
 # indices of the rows of coefficients. SPANS: times, s, from earlier points of the history to its last point; NEW_SPANS:
-# times, s, from all points of the history to the end of the step; ERROR_CONSTANTS: one for each order 0, 1, ...
+# times, s, from all points of the history to the end of the step; ERROR_CONSTANTS: error constants of orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
 def options_array(max_order: int, inner_tol: float, outer_tol: float, starter: Any) -> NDArray[np.float64]:
-    """Return the array `options` that the step reads; `starter`: the Gauss tableau of STARTER_STAGES stages."""
+    """Return the array `options` of bdf_step; `starter` is the Gauss tableau of STARTER_STAGES stages."""
     gauss = gauss_options(starter.A, starter.b, starter.c, inner_tol, outer_tol, 0.0)
     return np.concatenate([[float(max_order), inner_tol, outer_tol], gauss])
 
@@ -67,10 +67,10 @@ def _coefficients(memory, row):
 
 @inlined
 def _blocks(memory, n):
-    """Return views of five parts of `memory`.
+    """Return views of `memory`: differences, trial differences, prediction, rate, and scratch.
 
-    They are the differences and the trial differences (N_DIFFERENCES, 2 n each), the prediction of (q, v) and its
-    derivative (2 n each), and scratch.
+    The differences have shapes (N_DIFFERENCES, 2 n); the prediction of (q, v) and `rate`, the derivative of the
+    prediction, have 2 n entries.
     """
     o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
@@ -82,7 +82,7 @@ def _blocks(memory, n):
 
 @kernel(SETTLE)
 def settle_bdf(f, w, options, memory, tolerances, accepted):
-    """Set ORDER to the chosen order; after an accepted attempt, also replace the history by the trial differences."""
+    """Set ORDER to the order chosen; if the attempt was accepted, also replace the history by the trial differences."""
     differences, trial, _, _, _ = _blocks(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -102,7 +102,7 @@ def settle_bdf(f, w, options, memory, tolerances, accepted):
 
 @compiled
 def _begin_history(memory, differences, state, h, order):
-    """Start a history of the given order, 0 or 1, from `state` and its derivative, for steps of size h."""
+    """Start a history of order `order`, 0 or 1, from `state` and its derivative, for steps of size h (s)."""
     size = differences.shape[1]
     for m in range(size):
         differences[0, m] = state[m]
@@ -114,10 +114,10 @@ def _begin_history(memory, differences, state, h, order):
 
 @compiled
 def _predict(memory, differences, trial, h, prediction, rate):
-    """Store the differences, scaled to a step of size h, in `trial`, and compute the prediction and its `rate`.
+    """Store the differences, scaled to a step of size h, in `trial`; also store `prediction` and its `rate`.
 
-    The prediction extrapolates the polynomial of degree ORDER to the end of the step, and `rate` is the derivative of
-    this polynomial there. Also stores NEW_SPANS and ERROR_CONSTANTS.
+    The prediction is the value, and `rate` the derivative, of the polynomial of degree ORDER at the end of the step.
+    Also stores NEW_SPANS and ERROR_CONSTANTS.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, new_spans = _coefficients(memory, SPANS), _coefficients(memory, NEW_SPANS)
@@ -193,7 +193,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
 
 @compiled
 def _norm(tolerances, y, y1, d, sign, difference):
-    """Return the largest component of |d + sign * difference|, relative to atol + rtol max(|y|, |y1|)."""
+    """Return the largest component of |d + sign * difference| / (atol + rtol max(|y|, |y1|))."""
     n_q = d.size // 2
     largest = 0.0
     for m in range(d.size):
@@ -204,11 +204,11 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return error (in tolerances) and ratio of the next step size to h; `d`: y1 - prediction."""
+    """Store NEXT_ORDER; return the error, in tolerances, and next step size / this step size; d: y1 - prediction."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _norm(tolerances, y, y1, d, 0.0, d)
-    # at unequal steps the interpolation of the history has an error, too; as in DASSL, the larger error counts
+    # with unequal steps, the interpolation of the history has an error, too; as in DASSL, the larger error counts
     interpolation = spans[0] / spans[k]
     for j in range(k):
         interpolation += spans[0] / spans[j] - 1.0 / (j + 1.0)
@@ -241,7 +241,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _update_differences(memory, trial, y1, d):
-    """Replace the scaled differences in `trial` by the differences at the end of the step, where the state is y1."""
+    """Replace the scaled differences in `trial` by those at the end of the step, from the state y1 = prediction + d."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:
@@ -257,7 +257,7 @@ def _update_differences(memory, trial, y1, d):
 
 @compiled
 def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
-    """Take a step of the Gauss method of order 6, which starts the history of fixed steps; return a code."""
+    """Take a step of the Gauss method of order 6, to fill the history of a run with fixed step size; return a code."""
     s, n = STARTER_STAGES, w.Q.size
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     A_stage = scratch[: s * n].reshape((s, n))

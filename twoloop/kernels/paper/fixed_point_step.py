@@ -1,4 +1,4 @@
-"""Implicit Runge-Kutta steps with a fixed-point iteration as outer loop: twoloop's iteration, or the paper's."""
+"""Attempt implicit Runge-Kutta steps with a fixed-point outer loop: twoloop's iteration, or the paper's."""
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(SETTLE)
 def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """Store rounding errors of an accepted step, and its stage accelerations, which predict those of the next step."""
+    """Store the stage accelerations of an accepted step, to predict the next ones, and its rounding errors."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)
@@ -45,7 +45,7 @@ def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by fixed-point iteration; to estimate its error, take a step of h and two steps of h/2.
+    """Attempt a step by fixed-point iteration; estimate its error by a step of size h and two steps of size h/2.
 
     The result is the end of the second half step. With EXTRAPOLATION = 1 / (2^order - 1), it is extrapolated by means
     of the whole step, and projected onto the constraints. The polynomial through the stage accelerations of the last
@@ -64,14 +64,16 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q_full, v_full = vector(memory, s, n, at.Q_FULL), vector(memory, s, n, at.V_FULL)
     q_mid, v_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID)
     weights = memory[memory.size - s :]
-    rest = rounding_errors_of(memory, s, n, tolerances)
+    rounding = rounding_errors_of(memory, s, n, tolerances)
     ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
     for j in range(s):
         if ratio <= MAX_STEP_RATIO:
             interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])
-    code, distance = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rest)
+    code, distance = iterate_accelerations(
+        f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rounding
+    )
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     error = 0.0
@@ -82,18 +84,18 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 0.5 * c[j], trial, weights, half[j])
         g = 0.5 * h
         code, distance_mid = iterate_accelerations(
-            f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid, rest
+            f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid, rounding
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
         code, distance = iterate_accelerations(
-            f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rest
+            f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rounding
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        distance = max(distance, distance_mid)  # the run continues from the half steps
+        distance = max(distance, distance_mid)  # the next step starts from the end of the half steps
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
         )
@@ -110,12 +112,12 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # END_ERROR_WEIGHT times `end_error` above which `paper_step` rejects a step; not part of the paper
+SUDDEN_ERROR = 10.0  # paper_step rejects a step if END_ERROR_WEIGHT `end_error` exceeds this; not part of the paper
 
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step as in Sects. 3.1-3.3 of the paper, with the error estimated from a step of h and two of h/2."""
+    """Attempt a step as in Sects. 3.1-3.3 of the paper; estimate its error by a step of h and two steps of h/2."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

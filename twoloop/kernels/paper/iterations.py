@@ -1,10 +1,10 @@
-"""Solve for the stages of implicit Runge-Kutta steps by fixed-point iteration: two outer loops, and their `memory`.
+"""Solve for the stages of implicit Runge-Kutta steps by one of two fixed-point iterations, the outer loops.
 
 `iterate_accelerations` iterates on the stage accelerations (the tableau applied twice to q'' = a).
 `iterate_first_order` is the loop of the paper on y_i = [v_i, q_i]. Both are compiled as parts of the steps in
 fixed_point_step.py. Equation numbers refer to the paper.
 
-Richardson's error estimate is the difference between a step and two half steps, which also allows extrapolation.
+Richardson's error estimate is the difference between a step and two half steps; it also allows extrapolation.
 """
 
 import numpy as np
@@ -16,11 +16,11 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_fl
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
-# number of rows of ROUNDING, rounding errors of the compensated sums in steps of fixed size: of q and v at the last
-# accepted step, then of q and v in this attempt. Without compensation, the energy of a symmetric method drifts
+# number of rows of ROUNDING, the rounding errors of compensated sums in steps of fixed size: two rows for q and v of
+# the last accepted step, two for q and v of this attempt. Without compensation, the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# indices of the scalars, of the stage blocks (s, n_q), and of the vectors (n_q) in `memory`, in this order
+# indices in `memory`: of the scalars, then of the stage blocks (s, n_q), then of the vectors (n_q)
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
@@ -33,46 +33,46 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def block(memory, s, n, which):
-    """Return a view (s, n) of block `which`, such as PREVIOUS, of `memory`."""
+    """Return a view (s, n) of the block with the index `which`, such as PREVIOUS, in `memory`."""
     start = N_MEMORY_SCALARS + which * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
 def vector(memory, s, n, which):
-    """Return a view (n) of vector `which`, such as Q_FULL, of `memory`."""
+    """Return a view (n) of the vector with the index `which`, such as Q_FULL, in `memory`."""
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
     return memory[start : start + n]
 
 
 @inlined
 def rounding_errors_of(memory, s, n, tolerances):
-    """Return a view (N_ROUNDING, n) of ROUNDING, or (0, n) under step-size control, where it is not needed."""
+    """Return a view (N_ROUNDING, n) of ROUNDING; with step-size control, (0, n): sums are then not compensated."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + ROUNDING) * n, N_ROUNDING if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
 
 @merged
 def store_rounding_errors(rounding):
-    """Copy the rows of `rounding` for this attempt, which was accepted, to its rows for the last accepted step."""
+    """Copy the rounding errors of this attempt, once accepted, to the rows of `rounding` for the last accepted step."""
     for i in range(rounding.shape[0] // 2):
         copy(rounding[rounding.shape[0] // 2 + i], rounding[i])
 
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
 MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_order` has failed; the paper has no limit
-# ratio of a change to the first change above which the iteration counts as divergent; a smaller growth is possible in a
-# convergent iteration, because its matrix is not normal
+# largest ratio of a change to the first one in a convergent iteration; changes may grow at first, because the iteration
+# matrix is not normal
 MAX_GROWTH = 1e3
-MIN_ITERATIONS = 8  # number of iterations after which a change larger than the previous one means divergence
+MIN_ITERATIONS = 8  # number of iterations after which a change that exceeds the previous one means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
 @merged
 def _test_convergence(change, last_change, first_change, iteration, tolerance, q):
-    """Return UNDECIDED, CONVERGED or DIVERGED, from the latest, the previous and the first change in an iteration.
+    """Return UNDECIDED, CONVERGED or DIVERGED, from the current, the previous and the first change of an iteration.
 
-    Changes that no longer decrease, and are not larger than rounding errors of q, mean convergence.
+    An iteration has also converged if its changes no longer decrease, but are at most rounding errors of q.
     """
     if change <= tolerance:
         return CONVERGED
@@ -96,7 +96,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set the rounding errors of this attempt to zero for `coordinates`, which the constraints determine."""
+    """Set the rounding errors of this attempt to zero for `coordinates`, the dependent ones, which are not sums."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0
@@ -171,7 +171,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
 @merged
 def _largest_change(coordinates, q, v, q_old, v_old):
-    """Return the largest change of `coordinates` and their velocities, relative to max(1, |value|)."""
+    """Return the largest change of `coordinates` and their velocities since (q_old, v_old), over max(1, |value|)."""
     change = 0.0
     for m in coordinates:
         change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
@@ -245,9 +245,9 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 
 @compiled
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
-    """Return the difference between a step and two half steps, in units of the tolerances (26).
+    """Return the norm of the difference between a step and two half steps, in units of the tolerances (26).
 
-    The result is the largest component for positions and velocities if `largest`, otherwise the root mean square (27).
+    The norm is the largest |component| of positions and velocities if `largest`, else the root mean square (27).
     """
     rtol = tolerances[RTOL]
     total = 0.0
@@ -263,7 +263,7 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 
 @compiled
 def estimate_and_extrapolate(f, w, factor, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
-    """Return a code and the error of Richardson's estimate; if `factor` > 0, also extrapolate (q1, v1).
+    """Return a code and Richardson's error estimate, in tolerances; if `factor` > 0, also extrapolate (q1, v1).
 
     (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. `factor`: 0 or 1 / (2^order - 1).
     """

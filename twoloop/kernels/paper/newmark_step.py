@@ -1,4 +1,4 @@
-"""Newmark step: the outer loop is a fixed-point iteration on independent accelerations. Equation numbers: the paper."""
+"""Attempt Newmark steps by a fixed-point iteration on the independent accelerations. Equation numbers: the paper."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# ratio of the largest coordinate so far after a step to that before the step, above which the coordinates count as
-# caused by this step
+# factor: if a step increases the largest |coordinate| so far by more, _motion_rate attributes the coordinates to this
+# step, as after rest at the origin
 GROWTH_AFTER_REST = 2.0
 TINY = 1e-300  # added to the tolerance, which is zero for a mechanism at rest at the origin
 
-# indices of the scalars in `memory`: largest coordinate, velocity and acceleration so far. The scalars are followed by
-# the new accelerations (n_q)
+# indices in `memory` of the scalars: largest |coordinate|, |velocity| and |acceleration| so far. The new accelerations
+# (n_q) follow
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
 # indices in `options`
@@ -32,7 +32,7 @@ def _largest_abs(x, at_least):
 
 @compiled
 def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
-    """Return the reciprocal, 1/s, of the time in which the largest coordinate changes by its own value.
+    """Return the rate of the motion, 1/s: the reciprocal of the time in which the largest coordinate changes by itself.
 
     The time follows from the largest absolute coordinate, velocity and acceleration so far, because all coordinates may
     be near zero at a single time, depending on the origin. If the largest coordinate is mainly caused by this step, as
