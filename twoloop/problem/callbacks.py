@@ -398,8 +398,8 @@ def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, 
     unknown = [kind for kind in callbacks if kind not in KINDS]
     if unknown:
         raise TypeError(f"a system has no argument {unknown[0]!r}; its callbacks are {', '.join(KINDS)}")
-    sizes = {"n_c": n_c, "n_a": n_a}
-    required = [kind for kind, entry in KINDS.items() if not entry.optional or sizes.get(entry.needed_by, 0) > 0]
+    n_rows = {"n_c": n_c, "n_a": n_a}
+    required = [kind for kind, entry in KINDS.items() if not entry.optional or n_rows.get(entry.needed_by, 0) > 0]
     missing = [kind for kind in required if kind not in callbacks or (KINDS[kind].optional and callbacks[kind] is None)]
     if callbacks.get("mass_values") is not None:
         missing = [kind for kind in missing if kind != "mass"]
@@ -408,7 +408,7 @@ def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, 
         raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
     given = {kind: callbacks[kind] for kind in KINDS if not _is_left_out(kind, callbacks)}
     for kind, entry in KINDS.items():
-        if kind in given and sizes.get(entry.shape[0], 1) == 0:
+        if kind in given and n_rows.get(entry.shape[0], 1) == 0:
             rows_of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
             raise ValueError(f"{kind} goes with {rows_of}, {entry.shape[0]} > 0; given for {entry.shape[0]} = 0")
     available = {*given, *(("jacobian",) if "jacobian_values" in given else ())}

@@ -14,7 +14,7 @@ from twoloop.checks.arguments import Array, check_call, shown
 SAMPLES = 4  # smallest number of equal parts of a step at whose ends the signs of event functions are checked
 WHOLE = 1.0 - 1e-9  # factor on the number of parts before rounding up, so that rounding errors do not add a part
 PRECISION = 4.0 * float(np.finfo(float).eps)  # relative precision of the time of an event, as in SciPy
-# iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
+# largest number of iterations of Brent's method, which at zeros of high order may need 53 to halve the interval
 MAX_ITERATIONS = 3000
 
 _checked: WeakSet[FunctionType] = WeakSet()  # functions whose arguments were checked, which takes 9 µs
@@ -141,10 +141,10 @@ class EventSearch:
         steps = np.diff(ends)
         counts = np.maximum(SAMPLES, np.ceil(WHOLE * steps / self._every)).astype(int)
         first = np.append(0, np.cumsum(counts))
-        begins, parts, lengths, before = (
+        start_times, n_parts, durations, first_samples = (
             np.repeat(per_step, counts) for per_step in (ends[:-1], counts, steps, first[:-1])
         )
-        times = np.append(begins + (np.arange(first[-1]) - before) / parts * lengths, ends[-1])
+        times = np.append(start_times + (np.arange(first[-1]) - first_samples) / n_parts * durations, ends[-1])
         rows = states.at(times)
         if not self._rates:
             self._in_steps(states, times, rows, ends[1:].tolist())

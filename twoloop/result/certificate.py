@@ -19,7 +19,7 @@ from twoloop.run.signals import SignalHandlers
 
 PIECES = 200  # smallest number of intervals into which the run is divided; also limits the step size of reruns
 LIMIT = 100.0  # largest defect of a step, and largest error of a state, in tolerances, of a run that passes
-FASTEST = 10.0  # largest rate of the motion, 1/s, by which errors of velocities are divided; untested ones always
+FASTEST = 10.0  # largest rate, 1/s, by which errors of velocities are divided; by this rate, if they are untested
 SECOND_RUN_FACTOR = 0.1  # factor on the tolerances of the second run, because its errors grow over the whole run
 STIFF = 4  # number of explicit steps per step of the run above which the run did not resolve untested velocities
 CHAOTIC = 10.0  # largest ratio of an error to the growth of an initial error of one tolerance that explains this error
@@ -230,7 +230,7 @@ class _Checker:
             i = j
 
     def errors(self) -> tuple[float, float, float]:
-        """Return the largest error of a state over the tolerance, its time, and the time from which growth explains it.
+        """Return the largest error of a state, in tolerances, its time, and the time from which growth explains errors.
 
         Errors are distances from a second run, which starts from the first state and uses no other stored state. The
         last number is infinite if no error exceeds the limit, or if growth does not explain the errors.

@@ -83,7 +83,7 @@ class Output(NamedTuple):
 
     times: Array | None  # output times; None: the ends of all steps
     at_ends: bool  # whether each output time is the start or the end of the run
-    dense: bool  # whether `sol` is requested, too
+    dense: bool  # whether the dense solution `sol` is requested
     time_limit: float | None  # limit of elapsed time, s
 
     @property
@@ -161,7 +161,7 @@ class CachedIntegrator:
 
     @staticmethod
     def can_provide(run: Run, output: Output, shared: SharedSetup | None) -> bool:
-        """Return whether an integrator that reuses its arrays can provide an output."""
+        """Return whether a cached integrator, which reuses its arrays, can provide the requested `output`."""
         # `sol` and interpolated output must agree; `sol` must not use arrays that are filled for other parameters
         if output.dense and (output.between is not None or shared is not None):
             return False
@@ -285,7 +285,7 @@ class CachedIntegrator:
         return (timed_states,)
 
     def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
-        """Set the redundant rows at a new start; return False if the start, or new parameters, need more checks."""
+        """Update the redundant rows of the run at a new start; return False if start or parameters need more checks."""
         run = self.run
         if run.rows_warning:  # rounding may decide which of several dependent rows is left out
             independent = self.arrays.start_rows.tobytes()
@@ -444,7 +444,7 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # a choice that also depends on the loss of digits, which kernels do not measure, equals none of theirs
+    # a choice that also depends on the loss of digits, which kernels do not measure, equals no choice of the kernels
     index = int(np.searchsorted(-LEAST, -choice.least)) if choice.refined is None else len(LEAST)
     numbers = index, len(choice.rows), len(choice.added), *choice.rows, *choice.added
     return np.array(numbers, dtype=np.int64), choice.scale

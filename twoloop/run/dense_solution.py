@@ -401,7 +401,7 @@ def _blocks(groups: Groups) -> list[Groups]:
 
 
 def _groups(table: Table, intervals: Groups) -> Groups:
-    """Return for each of `intervals` its group, a row of indices for kernels; those of output times are 0."""
+    """Return groups, rows of indices for kernels, of `intervals` (indices); the indices of output times are 0."""
     groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
     groups[:, indices.KIND] = table.kinds[intervals]
@@ -458,11 +458,11 @@ class OutputInterpolation:
         interpolator, rows = self._interpolator, self._rows
         if interpolator is None or interpolator.failures > 0:
             return None
-        added = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
-        interpolator.complete(times, rows, added)
+        a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
+        interpolator.complete(times, rows, a_and_lam)
         if interpolator.static is not None or interpolator.repairs:  # the interpolator may have another workspace
             self._interpolator = None
-        return np.concatenate([rows, added], axis=1) if interpolator.failures == 0 else None
+        return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 
 
 def interpolator_of(run: Run, row: Array) -> Interpolator:

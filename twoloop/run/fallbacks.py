@@ -98,7 +98,7 @@ STEP_RATIOS = tuple(0.85**k for k in range(28))
 # larger step sizes, relative to H_LONG, to try if too few nodes of a step are beyond the singular position
 LARGER_RATIOS = tuple(1.4**k for k in range(1, 7))
 # The distance of a state from a singular position is its smallest pivot of C_q over the largest such pivot so far.
-FAR = 0.2  # distance from which on a state may be the base of the polynomial
+FAR = 0.2  # distance from a singular position from which on a state may be the base of the polynomial across it
 # limits of steps across a singular position. STRICT: those of the run. WIDER: the longest time without an evaluation
 # is GAP_FACTOR times as long, or unlimited if forces cannot be short. LOOSER: as WIDER, with larger tolerances
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
@@ -119,7 +119,7 @@ LONGEST_PAST, FARTHEST = 1.5, 4.0
 # ratio of the distance of an earlier state to that of the base below which it is beyond another singular position
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
-CLEAR = 0.3  # distance from which on the run continues with steps of its own method
+CLEAR = 0.3  # distance (see FAR) from a singular position from which on the run continues with its own method
 
 
 def may_cross(run: Run, code: int) -> bool:
@@ -180,11 +180,11 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     longest, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and clock[a.T] - clock[a.T_START] < longest
     near_end = compiled and clock[a.T] + LARGER_RATIOS[-1] * longest > run.t1
-    places = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
-    run.origins = [*[Origin(*place) for place in places], Origin(np.inf, None)]
+    starts = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
+    run.origins = [*[Origin(*start) for start in starts], Origin(np.inf, None)]
     if not fixed:
         variants = [(limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]]
-        run.origins += [Origin(*place, *variant) for variant in variants[1:] for place in places]
+        run.origins += [Origin(*start, *variant) for variant in variants[1:] for start in starts]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule

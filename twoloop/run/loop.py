@@ -350,7 +350,7 @@ class IntegrationLoop:
             self.request.store.add(name, values)
 
     def _check_progress(self, steps: Array, across: bool, spent: float) -> None:
-        """Choose the number of attempts of the next chunk; change the code if the run stalls, or has to stop."""
+        """Choose the number of attempts of the next chunk; change `self.code` if the run stalls, or has to stop."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
         self.stiffness.add_steps(h)
@@ -371,7 +371,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, across: bool, n_steps: int) -> None:
-        """Change plan, controls or kit of the next steps if the code requires it, and then set the code to PAUSED."""
+        """If `self.code` requires it, change plan, controls or kit of the next steps, and set the code to PAUSED."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.is_lost_without_dense(self.code):
             run.change_form()

@@ -201,7 +201,7 @@ def _dominant_eigenvalue(
 NEARLY_SINGULAR = 1e-3  # ratio of singular values of C_q (or inertias) up to which the message of a failure mentions it
 # ratio of the rounding error of velocities (or accelerations) to the tolerance above which a run is not trusted further
 MAX_LASTING_ERROR = 100.0
-LOST_AT_END = 1e-6  # ratio of singular values up to which constraints do not determine the velocities at the end
+LOST_AT_END = 1e-6  # ratio of singular values up to which constraints do not determine velocities at the end of a run
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"

@@ -423,8 +423,8 @@ def _another_assembly(
 def _describe_change(before: Array, after: Array, scales: Scales) -> str:
     """Return words about the coordinate that changes most, with enough digits of both values to show the change."""
     j = int(np.abs((after - before) / scales.columns).argmax())
-    size, change = max(abs(float(before[j])), abs(float(after[j]))), abs(float(after[j] - before[j]))
-    digits = min(17, 3 + max(0, math.ceil(math.log10(size / change)))) if change > 0.0 else 3
+    magnitude, change = max(abs(float(before[j])), abs(float(after[j]))), abs(float(after[j] - before[j]))
+    digits = min(17, 3 + max(0, math.ceil(math.log10(magnitude / change)))) if change > 0.0 else 3
     return f"coordinate {j} from {before[j]:.{digits}g} to {after[j]:.{digits}g}"
 
 

@@ -89,10 +89,10 @@ class FileStore:
 
     def cut(self, name: str, n: int) -> None:
         """Keep the first n rows of an array."""
-        dtype, (before, *width) = self._shapes[name]
+        dtype, (n_before, *width) = self._shapes[name]
         with self._path(name).open("r+b") as file:
-            file.truncate(HEADER_SIZE + min(n, before) * self._row_bytes(dtype, width))
-            self._write_header(file, name, dtype, (min(n, before), *width))
+            file.truncate(HEADER_SIZE + min(n, n_before) * self._row_bytes(dtype, width))
+            self._write_header(file, name, dtype, (min(n, n_before), *width))
 
     def array(self, name: str) -> NDArray[Any]:
         """Return all rows of an array as a memory map; changes of the array do not change the file."""
@@ -334,13 +334,13 @@ class Recorder:
         """Return rows [q, v, a, lam] for states given by rows [q, v]; rows [q, v, a, lam] are returned unchanged."""
         if self.interpolator is None or rows.shape[1] == self._width:
             return rows
-        added = np.full((len(times), self._width - rows.shape[1]), np.nan)
+        a_and_lam = np.full((len(times), self._width - rows.shape[1]), np.nan)
         try:
-            self.interpolator.complete(times, rows, added)
+            self.interpolator.complete(times, rows, a_and_lam)
         except KeyboardInterrupt:
             self.interrupted = True
-            added[np.isnan(added).any(axis=1)] = np.nan  # a row may be half written
-        return np.concatenate([rows, added], axis=1)
+            a_and_lam[np.isnan(a_and_lam).any(axis=1)] = np.nan  # a row may be half written
+        return np.concatenate([rows, a_and_lam], axis=1)
 
     def solution(self) -> DenseSolution | None:
         """Return the dense solution, or None if it is not requested."""

@@ -77,13 +77,13 @@ def compare_callbacks_at(
 
     `everywhere`: compare at all states, not only at those outside `region`. If callbacks agree, extend the region.
     """
-    first = states[-1]
+    first_state = states[-1]
     if not everywhere:
         states = region.states_outside(states)
     old_status = status
     if len(states) > 0:
         if check_derivatives:
-            status, message = _check_derivatives(run, states, first, status, message)
+            status, message = _check_derivatives(run, states, first_state, status, message)
         status, message = _check_traces(run, states, status, message)
         if status == old_status and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
             difference = find_nondeterminism(run.system, states[:: 1 + len(states) // MAX_IN_PYTHON])
@@ -94,17 +94,17 @@ def compare_callbacks_at(
     return status, message
 
 
-def _check_derivatives(run: Run, states: Array, first: Array, status: Status, message: str) -> tuple[Status, str]:
+def _check_derivatives(run: Run, states: Array, first_state: Array, status: Status, message: str) -> tuple[Status, str]:
     """Return status and message, changed if a derivative, or a mass said to be constant, is wrong at states of the run.
 
-    `first`: the first state [t, q, v] of the run.
+    `first_state`: the first state [t, q, v] of the run.
     """
     n = run.system.n_q
     chosen = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
     compared = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
     exact = exact_derivatives(run.system)
     agrees = exact is not None and exact.difference(run.system, generic_states(compared)) is None
-    difference = run_inconsistency(run.system, compared, float(first[0]), first[1 : 1 + n])
+    difference = run_inconsistency(run.system, compared, float(first_state[0]), first_state[1 : 1 + n])
     for t, q, v in () if agrees or difference is not None else compared:
         wrong = wrong_derivative(run.system, t, q, v)
         if wrong is not None:
@@ -178,10 +178,10 @@ def describe_changed_force(run: Run) -> str | None:
     return None
 
 
-def _changed_value(name: str, t: float, entry: int, first: float, second: float) -> str:
+def _changed_value(name: str, t: float, entry: int, first_value: float, second_value: float) -> str:
     return (
         f"force of {name!r} gives something else when it is called again with the same t, q and v: at "
-        f"t = {t:.10g} entry {entry} is {first:.9g}, and then {second:.9g}. It must "
+        f"t = {t:.10g} entry {entry} is {first_value:.9g}, and then {second_value:.9g}. It must "
         "depend on its arguments alone: steps are tried, rejected and sampled in advance"
     )
 

@@ -38,9 +38,9 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # as FIRST_CHUNK, for callbacks that are called in Python, which may be slow
 SMALL = 32  # number of coordinates up to which a system is small; larger systems have proportionally smaller chunks
-TRIAL_STEPS = 10  # number of first steps during which a method that needs long steps is replaced after a short step
+TRIAL_STEPS = 10  # number of steps at the start of a run in which one short step replaces a method for long steps
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
-CONTRADICTS = 1e-6  # relative residual of a row for the accelerations at the start above which the rows contradict
+CONTRADICTS = 1e-6  # residual of a row of C_q a = gamma, relative to its terms, from which on constraints contradict
 
 
 class Run:
@@ -115,7 +115,7 @@ class Run:
         self.looser = self.tolerances  # tolerances of steps across singular positions
         self.lengths: list[float] = []  # sizes of steps that are still to be tried, s
         self.longer: list[float] = []  # larger sizes to be tried if too few nodes of a step are beyond the position, s
-        self.crossed = 0.0  # size of the last attempted step across, s
+        self.crossed = 0.0  # size of the last attempted step across a singular position, s
         self.pieces: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
         self.origins: list[Any] = []  # `Origin`s of polynomials across the position that are still to be tried
         self.t1 = np.inf  # end of the run, s

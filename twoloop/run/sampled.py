@@ -1,4 +1,4 @@
-"""Integrate from sample to sample of a controller; parameters may change at samples; callbacks are checked once."""
+"""Integrate from sample to sample of a controller; parameters of forces may change at samples."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class SampledRun:
         if self.run.start_warning:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
-        self._force_parameters: set[int] = set()  # indices of parameters on which, as checked, only forces depend
+        self._force_parameters: set[int] = set()  # indices of parameters that were found to affect forces only
         self._changed = self._failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = (
@@ -166,7 +166,7 @@ class SampledRun:
             self._write(index, float(values[index]))
 
     def step(self, dt: float) -> SampledState:
-        """Integrate over the time dt, s, from the last sample; store and return the state at the end, a new sample."""
+        """Integrate for a time dt, s, from the last sample; store the final state as a new sample, and return it."""
         if self._failed:
             self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
@@ -178,7 +178,7 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate from the last sample to the time `end`; if short changes may be missed, repeat more closely."""
+        """Integrate from the last sample to `end`; if short changes may be missed, repeat with more evaluations."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):

@@ -24,7 +24,7 @@ SAMPLES = 33  # number of positions between two states at which the ratio of sin
 SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DIFFERENCE = 1e-6
-MIN_ROW_NORM = 0.1  # smallest norm of a row, over the norm expected from its derivative, with which the row is scaled
+MIN_ROW_NORM = 0.1  # lower bound of the norm by which a row is divided, over the norm expected from its derivative
 # velocities turned if they changed by more than TURNED times the change that accelerations explain, and by more than
 # APPARENT times the tolerances
 TURNED, APPARENT = 3.0, 10.0
@@ -192,8 +192,8 @@ def _measured(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-WEAK = 1e-2  # singular value, relative to the largest one, up to which rounding errors along it are estimated
-# ratio of pivots below which rounding errors are always estimated; factor that converts ratios of singular values to it
+WEAK = 1e-2  # singular value, relative to the largest, up to which rounding errors along its vector are estimated
+# ratio of pivots below which rounding errors are always estimated; ratio of pivots over ratio of singular values
 LEAST, MARGIN = 1e-5, 30.0
 
 

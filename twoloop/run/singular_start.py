@@ -22,9 +22,9 @@ from twoloop.run.singular_positions import DIFFERENCE, in_any_units
 Array = NDArray[np.float64]
 
 TURN = 3e-3  # relative change of the rows from one sample to the next, for derivatives along the motion
-WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0  # first, second derivative
+WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0  # for f', f''
 NOTHING = 1e-8  # relative size up to which a derivative may be an error of the finite differences
-RISES = 1e-6  # relative derivative of the rows from which on the rank rises: v0 may violate constraints by 1e-8
+RISES = 1e-6  # relative derivative of the rows from which on the rank rises: well above 1e-8, the allowed error of v0
 # factor by which derivatives of the rows must exceed the derivatives along velocities as small as the tolerances
 DETERMINED = 10.0
 BESIDE, LENGTH = 0.1, 0.6  # relative change of the rows up to the state beside the start, and in the first step to try
@@ -66,7 +66,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
         return None
     mass, rows, lengths, units = in_any_units(system, t, q)
     left, _, right = np.linalg.svd(rows)
-    lost, free = left[:, rank:].T, right[rank:].T
+    lost, free = left[:, rank:].T, right[rank:].T  # rows u^T with u^T C_q = 0; directions that C_q allows, as columns
 
     def derivative_of_rows(way: Array, step: float) -> Array:
         samples = [system.rows(t, q + s * way) * units for s in step * np.array([-2.0, -1.0, 1.0, 2.0])]
@@ -82,7 +82,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
         return None
     step = TURN / speed
     added = lost @ derivative_of_rows(way, step) / speed
-    gained = np.linalg.svd(added @ free, compute_uv=False)
+    gained = np.linalg.svd(added @ free, compute_uv=False)  # derivatives of the singular values that are zero here
     if gained.max() <= RISES * size:
         return None
     distance = step * float(np.abs(way).max())  # displacement for finite differences
@@ -98,7 +98,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
     motions = np.linalg.svd(equations)[2][rank:].T
     a += motions @ np.linalg.solve(motions.T @ mass @ motions, motions.T @ (units * system.force(t, q, v) - mass @ a))
     a *= units
-    bend = 0.0
+    bend = 0.0  # relative acceleration of the rows, 1/s^2
     if a.any():
         bend = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / size
     for change in BESIDE * 0.5 ** np.arange(HALVINGS):
