@@ -85,7 +85,7 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # the quadrature is not exact for the square of the last polynomial
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # value by quadrature, which is not exact for the last polynomial
     coefficients = values[:N] * weights / norms[:, None]  # (k, node): Legendre coefficients of the Lagrange polynomials
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
@@ -135,7 +135,7 @@ INFINITE = float("inf")
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
-# the iteration; its contraction rho is the ratio of the changes of velocities in two successive sweeps
+# constants of the iteration, whose contraction rho is the ratio of the changes of velocities in two successive sweeps
 KAPPA = 0.02  # iteration error, in tolerances, at which the sweeps end: then total errors are at most those of DOP853
 TARGET_SWEEPS = 6.0  # number of sweeps for which the step size is chosen; larger with predictions of degree 6 and more
 EXTRA_SWEEPS = 7  # number of sweeps beyond the target at which a step that has not converged is rejected
@@ -718,7 +718,7 @@ class Collocation(NamedTuple):
 
     functions: DeferredFunctions
     code: CollocationCode
-    numbers: Any  # coefficients that the functions read, or (shared between systems) expressions for them
+    numbers: Any  # coefficients that the functions read; if shared between systems, expressions for the coefficients
 
 
 def compiled_collocation(generated: GeneratedCode) -> Collocation:

@@ -152,7 +152,7 @@ class LaneSteps:
                 power = builder.sub(builder.sub(order, integer(1)), m)
                 row = emit.pointer(at.series, builder.mul(power, integer(n)))
                 for j, (q, v, a) in zip(group, _triples(carried), strict=True):
-                    # from a to q: in this order each new number takes the register of the old one
+                    # a first and q last: in this order each new number takes the register of the old one
                     a = emit.add(emit.multiply(a, x), v)
                     v = emit.add(emit.multiply(v, x), q)
                     new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
@@ -248,7 +248,7 @@ class LaneSteps:
         store_mask(emit, work, lanes.ACCEPTED, accepted)
         n_refused = emit.load(work, lanes.REFUSED)
         n_refused = select(builder.both(running, refused), emit.add(n_refused, one), n_refused)
-        # fail if a value is not finite: shorter steps could pass over the point where the equations are undefined
+        # end a run with a value that is not finite: shorter steps could pass the point where equations are undefined
         n_refused = select(is_valid, n_refused, emit.constant(math.inf))
         emit.store(n_refused, work, lanes.REFUSED)
         h_longest = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(MAX_FACTOR)))
@@ -327,7 +327,7 @@ def changed_orientation(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
     one, zero, select, compare = emit.constant(1.0), emit.constant(0.0), emit.builder.select, emit.builder.compare
     remaining, sign = set(range(len(matrix))), one
     while remaining:
-        # minimum degree, counted in rows alone, because rows and columns have the same pattern
+        # pivot of minimum degree: fewest entries in its row, because rows and columns have the same pattern
         i = min(remaining, key=lambda each: (len(matrix[each]), each))
         remaining.remove(i)
         pivot = matrix[i].pop(i)
@@ -417,7 +417,7 @@ class _Coordinate:
         self.before = tuple(emit.load(memory, lanes.BEGIN * n + place) for place in (0, n))
         self._slopes = [(memory, (lanes.SLOPES + k) * n) for k in range(count)]
         self._loaded: dict[int, Value] = {}
-        if count > 1:  # the acceleration of the last stage was just computed
+        if count > 1:  # the acceleration of the last stage was just computed, and is not stored yet
             self._loaded[count - 1] = emit.load(emit.pointer(at.a, j))
             emit.store(self._loaded[count - 1], *self._slopes[count - 1])
 

@@ -219,7 +219,7 @@ class LaneSeries:
         self.late = self._operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._rows(program.rows, program.row_places)
         self.balance = self._rows(program.balance, program.balance_places)
-        # by product whose sum is carried over: the factors of this sum; empty while `_shared_sums` calls `_factors`
+        # factors of the sums that are carried over, by product; empty while `_shared_sums` calls `_factors`
         self._carried: dict[int, tuple[int, int]] = {}
         self._carried |= self._shared_sums()
         self.sums_ahead = sorted(set(self._carried.values()))
@@ -348,7 +348,7 @@ class LaneSeries:
         solution = self.solution
         _, (a, lam) = lower(emit, solution.solved, [*r, *c, *stored], self.numbers)
         per_v, per_q = emit.multiply(unit, per_order), emit.divide(unit, emit.number(next_order))
-        before = Quantities(emit, lambda i: zero)  # a and lam of order k - 1
+        before = Quantities(emit, lambda i: zero)  # values at order k - 1: a and lam; 0 for other quantities
         for j in range(n):
             v = emit.multiply(per_v, a[j])
             quantities.define(1 + n + j, v)

@@ -426,7 +426,7 @@ def _compile_writable(
     ) from None
 
 
-# part of numba's message if a helper does not accept read-only arrays
+# pattern of numba's message if a helper does not accept read-only arrays
 _HELPER_REJECTS_READ_ONLY = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 
@@ -462,9 +462,9 @@ def _describe(function: Callable[..., Any]) -> str:
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
-# numba's excerpt of a source file, down to a mark ^
+# pattern of an excerpt of a source file in numba's messages, which ends with the mark ^ in a line of its own
 _EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
-# beginnings of lines of numba's messages that only refer to other lines
+# pattern of beginnings of lines in numba's messages that give no reason, but only refer to other lines
 _UNINFORMATIVE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"

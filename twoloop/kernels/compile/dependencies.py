@@ -391,7 +391,7 @@ class FunctionCopier:
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.known[id(helper)] = self.wrap(copy, helper)  # before its values are replaced: they may include it
+        self.known[id(helper)] = self.wrap(copy, helper)  # its values, replaced below, may include the helper itself
         for name in used_names & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
         if function.__defaults__ is not None:

@@ -69,7 +69,7 @@ def add_signature(function: Dispatcher, signature: Any) -> None:
     (compiled,) = dispatcher.overloads.values()
     dispatcher._insert([each._code for each in signature.args], compiled.entry_point, False)
     dispatcher.overloads[signature.args] = compiled._replace(signature=signature)
-    description = copy(compiled.fndesc)  # read by compiled callers
+    description = copy(compiled.fndesc)  # compiled callers read the types of the arguments in this description
     description.argtypes = signature.args
     dispatcher.targetctx.insert_user_function(compiled.entry_point, description, [compiled.library])
 

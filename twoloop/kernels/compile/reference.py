@@ -54,7 +54,7 @@ class Reference(types.Type):
         self.llvm_functions: set[str] = set()  # names of the generated functions among `functions`
         self.offsets: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = BoundedCache()  # addresses by tuple of functions; `machine_code` is slow
+        self._addresses: Any = BoundedCache()  # addresses by tuples of functions, because `machine_code` is slow
         for field, kind in self.arrays.items():
             self.offsets[field] = self.n_words
             self.n_words += 1 + kind.ndim

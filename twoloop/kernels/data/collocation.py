@@ -21,7 +21,7 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     TRIED,  # 1: the other polynomial is that of the step just attempted
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     KEPT_DEGREE,  # value of DEGREE before a step was rejected, which a later step restores; 0: no step was rejected
-    MAY_GUESS,  # 1: the step size is a guess: try another one if the contraction is far from its target
+    MAY_GUESS,  # 1: the step size is a guess, to be replaced by another one if the contraction is far from its target
     CAREFUL,  # number of next steps that use the elimination that begins with M
     STARTS,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
@@ -34,16 +34,16 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     CHANGE,  # change of velocities by the last sweep, relative to the tolerances
     ERROR,  # error of the step, relative to the tolerances
     CURVED,  # largest Legendre coefficient of degree 5 or 6 of the accelerations, relative to the tolerances
-    FACTOR,  # ratio of the next step size to this one that convergence allows
-    FACTOR_OF_ERROR,  # ratio of the next step size to this one that the error allows
-    FACTOR_OF_DEFECT,  # ratio of the next step size to this one that the defect allows
-    ALLOWED_H,  # step size that the error would have allowed in the last step, s
+    FACTOR,  # largest ratio of the next step size to this one that the convergence allows
+    FACTOR_OF_ERROR,  # largest ratio of the next step size to this one that the error allows
+    FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
+    ALLOWED_H,  # largest size of the last step that the error would have allowed, s
     SIZE,  # largest sum of a velocity and its change in the step, relative to the tolerances
     STRICTER,  # ratio of the largest of WEIGHTS to the largest of those of iterated coordinates
 ) = range(28)
 # offsets of the arrays that follow the scalars
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE
-SCALED = 40  # offset of eight numbers: coefficients of a polynomial, multiplied by these powers
+SCALED = 40  # offset of eight numbers: coefficients of a polynomial, multiplied by POWERS
 MOVED = 48  # offset of eight numbers: largest change of a coordinate by the last projection, for each of eight steps
 FINE = 56  # offset of eight numbers: 1 for steps whose projection succeeded
 DEFECTS = 64  # offset of eight numbers: defects of successive steps

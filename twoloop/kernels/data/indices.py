@@ -39,7 +39,7 @@ NONHOLONOMIC_RATE_GIVEN, NONHOLONOMIC_GAMMA_GIVEN = (
 )
 MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_values", "jacobian_values"))
 
-# indices in Work.counters, which count since the start of a run
+# indices in Work.counters: numbers of steps, iterations, evaluations etc. since the start of the run
 (
     N_ACCEPTED,
     N_REJECTED_ERROR,

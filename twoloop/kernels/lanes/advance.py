@@ -140,7 +140,7 @@ def _count_evaluations(settings, work, n_evaluations):
 
 @compiled
 def _advance_time(work, control, n_steps):
-    """Add the step to T and count it in `n_steps` (n_runs), in lanes whose step was accepted."""
+    """Add the step size to T, and 1 to the entry of `n_steps` (n_runs) of the run, in lanes whose step was accepted."""
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
             h, t = work[H * LANES + k], work[T * LANES + k]

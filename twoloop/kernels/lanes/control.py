@@ -252,12 +252,12 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
             work[X * LANES + k] = work[X * LANES + k] / work[UNIT * LANES + k]
         code.evaluate(order, control, work)
         return
-    for k in range(LANES):  # in stiff motion, the number of steps may be large with any tolerance
+    for k in range(LANES):  # end runs with too many steps: in stiff motion, any tolerance may need many
         if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
             leave_run(work, status, k, MANY_STEPS)
     code.series(order, control, work)
     code.lengths(order, control, work)
-    for k in range(LANES):  # number of evaluations of the defect within the step
+    for k in range(LANES):  # count the evaluations of the defect within the step
         if work[FINE * LANES + k] == 1.0 and work[H * LANES + k] > control[GAP]:
             work[EVALUATED * LANES + k] = np.ceil(work[H * LANES + k] / control[GAP]) - 1.0
     code.check_within(order, control, work)

@@ -61,20 +61,20 @@ TASKS = (
     "approach",  # move the positions of NEW, at the time AHEAD, towards the constraints, in lanes with FINE = 1
     "refine",  # correct NEW once in lanes with LEFT_TO_MOVE = 1; compute A and LAM; FINE is 1 if NEW has converged
     "redundant",  # clear FINE in lanes in which redundant constraints do not hold at NEW
-    "departure",  # compute OFF, the departure of NEW from PREDICTED, in a step H from STATE
+    "departure",  # compute OFF, the ratio of |NEW - PREDICTED| to its limit, for a step H from STATE
     "commit",  # copy NEW to STATE in lanes with ACCEPTED = 1
 )
-# "rows": store C, C_t and the entries of C_q at NEW and AHEAD in the method's memory; it succeeds if all are finite
+# "rows": store C, C_t and the entries of C_q at NEW and AHEAD in the method's memory; succeed if all are finite
 TASKS_OF_STARTS = ("rows",)
 TASKS_OF_STAGES = ("accelerate",)  # compute the accelerations A at the state NEW, without a projection
 # "stages": compute the state NEW at the time X after the beginning of the step, and ERROR if X is the whole step
 TASKS_OF_EXPLICIT = ("stages",)
 TASKS_OF_SERIES = (
-    "series",  # compute the coefficients of the series about STATE at T, in units of time UNIT
-    "lengths",  # compute LENGTH, H and X of the step; it succeeds if the run can continue
+    "series",  # compute the coefficients of the Taylor series about STATE, with UNIT as the unit of time
+    "lengths",  # compute LENGTH, H and X of the step; succeed if the run can continue
     "check_within",  # compute WORST, the largest defect within a step H, and AHEAD, the time of its end
     "evaluate",  # compute NEW, PREDICTED and the accelerations SERIES_A by the series, X units of time after T
-    "defect",  # compute DEFECT, the defect of A at NEW, the end of a step H
+    "defect",  # compute DEFECT at NEW, the end of a step H: the difference of A and SERIES_A, relative to its limit
     "judge",  # set ACCEPTED, and choose the size of the next step
 )
 CODE = Reference("LaneKit", {})  # numba's type of a LaneKit
@@ -90,7 +90,8 @@ CODE.add_function("step", STEP)
 # of the step (2 n vectors), velocities before the projection, and accelerations of the stages
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
-N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)  # indices in `settings`
+# indices in `settings`, whole numbers that describe the mechanism and the method
+N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)
 T0, T1, GAP, RTOL, ATOL = range(5)  # indices in `control`; from ATOL on, one absolute tolerance for each coordinate
 
 SHORTEST = 1e-13  # smallest step size, relative to the larger of |t| at its beginning and |t1|

@@ -422,7 +422,7 @@ def _embedded_estimate(settings, method_options, A, work, memory):
         total += e[i]
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
-    for j in range(s):  # velocities of the stages
+    for j in range(s):  # the velocity at stage j changes by H sum_k A_jk a_k from the beginning of the step
         sum_rows(A[j], stage_rows, vectors(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[H * LANES + i % LANES] * work[sums * LANES + i]
@@ -466,7 +466,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         second_difference = (
             work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
         )
-        largest_difference = max(largest_difference, abs(second_difference))  # (z J)^2 e
+        largest_difference = max(largest_difference, abs(second_difference))  # (z J)^2 e of the velocity error e
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]

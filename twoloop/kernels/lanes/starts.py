@@ -377,7 +377,7 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
             subtract_row(work, x + i, factors, pattern, i, displacement)
-        # the component of the displacement that is normal to the constraints
+        # `change` becomes the component of the displacement that is normal to the constraints
         along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
             distance, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, nearest, n, k)
