@@ -378,8 +378,8 @@ class CollocationCode:
         """Sweep over the stages until they converge, or the step is rejected; return the code of `attempt`.
 
         `evaluate` stores the accelerations of the iterated coordinates at [t, q, v]; the function that it returns
-        stores the other accelerations, and returns whether all accelerations are valid. If they are not, the code is
-        that of `fallback`.
+        stores the other accelerations, and returns whether all accelerations are valid. If not, `fallback` returns
+        the code.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
 

@@ -220,11 +220,11 @@ class LaneSteps:
         emit.store(error, work, lanes.OFF)
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return a mask of the lanes that may have passed a singular position in this step, or None: not checked."""
+        """Return a mask of the lanes that may have passed a singular position in this step, or None without a check."""
         return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store ACCEPTED, and LONGEST, the limit of the next step; stop lanes after MAX_REJECTIONS or a NaN."""
+        """Store ACCEPTED, and LONGEST, the limit of the next step; clear RUNNING after MAX_REJECTIONS or a NaN."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, emit.divide(one, emit.number(order))
         off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
@@ -766,7 +766,7 @@ class GeneratedLanes(Generic[Code]):
 
     @cached_property
     def functions(self) -> GeneratedFunctions:
-        """Return the functions, compiled at their first use."""
+        """Return the compiled functions; the first use compiles them, or reads them from the disk."""
         return generated_functions(KIND, _stamp(), self.code.structure, self._module_text)
 
     def _module_text(self) -> tuple[list[str], str]:
@@ -783,7 +783,7 @@ class GeneratedLanes(Generic[Code]):
         return BUILD_SECONDS * self.code.n_quantities
 
     def numbers(self, parameters: Array) -> Array:
-        """Return the coefficients (n_runs, n_numbers) that vary, for parameters (n_runs, n_p)."""
+        """Return the coefficients (n_runs, n_numbers) that vary between runs, for parameters (n_runs, n_p)."""
         return self.code.numbers.for_parameters(self.record, parameters)
 
 

@@ -51,14 +51,14 @@ class LaneEmitter(Emitter):
         return LaneEmitter(builder, self.lanes)
 
     def splat(self, value: Value) -> Value:
-        """Return a vector with one number in all lanes."""
+        """Return a vector with the number `value` in all lanes."""
         if self.lanes == 1:
             return value
         vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)
         return self.builder.first_everywhere(vector)
 
     def far(self, value: float) -> Value:
-        """Return a vector with one number in all lanes, loaded just before its use, see `Builder.far`."""
+        """Return a vector with the number `value` in all lanes, loaded just before its use, see `Builder.far`."""
         return self.splat(super().far(value))
 
     def coefficient(self, number: float) -> Value:
@@ -235,7 +235,7 @@ class LaneSeries:
         self.table = self.zeros + self.width
 
     def scratch_size(self, order: int) -> int:
-        """Return the length of `scratch`, in vectors, for a series of the given order."""
+        """Return the length of `scratch`, in vectors, for a series up to `order`."""
         return self.table + self.width * (order + 1)
 
     @property
@@ -267,7 +267,10 @@ class LaneSeries:
         return operations
 
     def _slot(self, *key: Any) -> int:
-        """Return the index in a row of a factor: (terms, constant), or times the order: ("scaled", terms, constant)."""
+        """Return the index of a factor in a row.
+
+        `key` is (terms, constant), or ("scaled", terms, constant) for this factor multiplied by the order.
+        """
         return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
@@ -290,7 +293,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return, for each result, the indices in a row of the factors X and Y of the products in its recurrence."""
+        """Return the indices in a row of the factors X and Y in the recurrence of each result of an operation."""
         kind, results, first, second = operation
         if results[0] in self._carried:
             return []
@@ -406,9 +409,9 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Return sums over 1 < j < k for pairs of factors (X, Y): the values of a dict with keys (pair, bool).
+        """Return a dict of sums over 1 < j < k; its keys are (indices of the factors X and Y, whether for order k + 1).
 
-        The sum is that of X[j] Y[k - j] for the key (pair, False), and of X[j] Y[k + 1 - j] for (pair, True). `_Edges`
+        The value for (pair, False) is the sum of X[j] Y[k - j], for (pair, True) that of X[j] Y[k + 1 - j]. `_Edges`
         adds the first and last terms when they are known. So one loop computes several sums, does not wait for the
         previous order, and loads each row once.
         """

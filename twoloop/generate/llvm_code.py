@@ -137,7 +137,7 @@ class Emitter:
         return self.builder.convert("sitofp", whole, DOUBLE)
 
     def function(self, name: str, x: Value) -> Value:
-        """Return f(x) of the function `name`, computed by its LLVM intrinsic if there is one, else by libm."""
+        """Return the function `name` of x, computed by its LLVM intrinsic if there is one, else by libm."""
         intrinsic = INTRINSICS.get(name)
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 

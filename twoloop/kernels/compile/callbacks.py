@@ -308,7 +308,7 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
 
     The arguments are the time, the coordinates `q` (n_q,), in some kinds the velocities `v` (n_q,) or the multipliers
     `lam` (n_c,), the parameters `p`, and the array to fill. This array contains zeros at first; for a tangent of a
-    system with a bandwidth, only its band does: add to it. The function must not write to the other arrays::
+    system with a bandwidth, only the band does: add to it. The function must not write to the other arrays::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):

@@ -290,7 +290,7 @@ def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenVa
 
 
 def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
-    """Yield the defaults of a function, and its globals and closure variables, with the attributes used of modules."""
+    """Yield the defaults, globals and closure variables of a function; for a module, also the attributes used of it."""
     code, namespace = function.__code__, function.__globals__
     last_arguments = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last_arguments, (function.__defaults__ or ())[::-1], strict=False):
@@ -307,9 +307,9 @@ def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
 
 
 def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
-    """Yield the attributes that are used of a user's module, and of modules within it.
+    """Yield the attributes of a user's module, and of modules within it, that a function uses.
 
-    `attributes` are the names loaded one after another, as in `module.inner.K`. Without any, the module itself is
+    `attributes` are the names loaded one after another, as in `module.inner.K`. If it is empty, the module itself is
     passed on, for example to a local variable or a helper, and all attributes listed in `names` are yielded.
     """
     if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
@@ -345,8 +345,8 @@ def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
 class FunctionCopier:
     """Copy functions, and replace the compiled helpers in their globals, defaults and closure variables.
 
-    `wrap(copy, original)` returns the replacement of the helper `original`. `copy` is a copy of its Python function, in
-    which values are replaced only afterwards.
+    `wrap(copy, original)` returns the replacement of the helper `original`. `copy` is a copy of its Python function,
+    whose values are replaced after this call.
     """
 
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):

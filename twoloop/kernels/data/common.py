@@ -135,8 +135,8 @@ class Attempt(NamedTuple):
     """Result of an attempted step: its code, its error and the factor for the next step size.
 
     code : DONE, or the reason why the step failed.
-    error : error in tolerances: the step is accepted if this is at most 1. If a step is longer than the method allows,
-        the step is not computed, and `error` is the ratio of its size to the allowed size.
+    error : error in units of the tolerances: the step is accepted if this is at most 1. If a step is longer than the
+        method allows, the step is not computed, and `error` is the ratio of its size to the allowed size.
     factor : ratio of the next step size to this one; 0: the controller computes the ratio from the error. If both
         factor and error exceed 1, the step size was a guess: the step was not completed, and has to be repeated with a
         larger size.
@@ -237,7 +237,10 @@ def _imports(text: str) -> set[str]:
 
 @cache
 def stamp(module: str) -> str:
-    """Return a digest of the callback signatures and of all sources that a module, such as "steps.stages", needs."""
+    """Return a digest of the callback signatures, and of the sources of a module and of all modules that it imports.
+
+    `module`: name below twoloop.kernels, such as "steps.stages".
+    """
     modules: set[str] = set()
     pending = {module}
     while pending:
@@ -376,7 +379,7 @@ def finite(A):
 
 @compiled
 def not_finite(notes, kind, t, q):
-    """Store t and `kind` in `notes`: the callback that is not finite, or -1 if q is not finite; return NOT_FINITE."""
+    """Store t and the kind of a callback with a non-finite value (-1 if q is not finite) in `notes`; return a code."""
     notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
     notes[FAULT_TIME] = t
     return NOT_FINITE

@@ -139,7 +139,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set AHEAD to T + X, without a rounding error if this is t1."""
+    """Set AHEAD, the time of NEW, to T + X; to exactly t1 at the end of the run."""
     for k in range(LANES):
         t, x = work[T * LANES + k], work[X * LANES + k]
         work[AHEAD * LANES + k] = control[T1] if x == control[T1] - t else t + x
@@ -221,7 +221,7 @@ def memory_size(s: int, n: int) -> int:
 
 @kernel(STEP)
 def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of at most control[GAP] in each lane.
+    """Take a step of DOP853, of size control[GAP] at most, in each lane.
 
     With `within`, compute instead the states at the time X after the beginning of the last accepted step.
     """
@@ -242,7 +242,7 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 
 @kernel(STEP)
 def step_by_series(code, settings, control, options, work, status, n_steps, within):
-    """Take a step by the series about its beginning in each lane.
+    """Take a step by the Taylor series about its beginning in each lane.
 
     With `within`, compute instead the states at the time X after the beginning of the last accepted step.
     """

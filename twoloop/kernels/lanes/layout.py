@@ -191,7 +191,7 @@ def _add_four(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign x y to the vector `target`; four lanes are read before any is written, as LLVM assumes an overlap."""
+    """Add sign x y to the vector `target`, reading four lanes before writing any: LLVM assumes that vectors overlap."""
     for k in range(0, LANES, 4):
         _add_four(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 

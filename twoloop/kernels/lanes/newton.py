@@ -160,7 +160,7 @@ def _evaluate_middle(code, settings, control, c, work, new, a, memory):
 def find_derivatives(code, settings, control, c, work):
     """Store the derivatives BY_Q and BY_V of the accelerations in the middle of the step, in lanes with FINE = 1.
 
-    The middle is the time of a stage: between two stages a force may act that no stage contains.
+    The middle is the time of a stage, because a force that acts only between two stages has no effect on the step.
     """
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -575,7 +575,7 @@ def _store_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of at most control[GAP] in each lane.
+    """Take a step of an implicit Runge-Kutta method, of size control[GAP] at most, in each lane.
 
     With `within`, compute instead the states at the time X after the beginning of the last accepted step.
     """

@@ -314,7 +314,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _project_velocities(code, settings, control, pattern, moves, work):
-    """Project the velocities of NEW so that C_q v + C_t = 0; store `factor_gram` of NEW at the offset `at_nearest`."""
+    """Project the velocities of NEW so that C_q v + C_t = 0; store results of `factor_gram` at offset `at_nearest`."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     G, x, change, _, _, _, _, row, at_nearest, _, _ = _offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
@@ -397,7 +397,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
     """Replace the states q and v (n_runs, n) by their projections onto the constraints at t0.
 
     `fine` (n_runs,) becomes 1 for runs whose projection succeeds, otherwise 0. pattern : sparsity pattern of G, see
-    above; moves : (n,) 1 for coordinates that may change; numbers : (n_runs, n_numbers) data of the generated code.
+    module docstring; moves : (n,) 1 for coordinates that may change; numbers : (n_runs, n_numbers) data of the code.
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])
