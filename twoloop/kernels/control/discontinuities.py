@@ -1,7 +1,7 @@
 """Detect sudden changes of forces, C_t and b ahead of a step, such as gusts, blows and switches.
 
-A step evaluates the equations at its stages only, and may pass over a force that acts between two stages. So forces,
-C_t and b are sampled ahead of the step, at less cost than by evaluations of the equations.
+A step evaluates the equations at its stages only, and may miss a force that acts between two stages. So forces, C_t and
+b are sampled ahead of the step, which costs less than evaluations of the equations.
 
 - A force, C_t or b is smooth if the second differences of its samples are small relative to the range of the samples
   (after the straight line from the first to the last sample is subtracted). A change within one or two samples makes
@@ -11,8 +11,8 @@ C_t and b are sampled ahead of the step, at less cost than by evaluations of the
   one long step, or for all short steps that end within LEAST_DISTANCE spacings.
 - All other samples are samples in time alone, at the state at which the step begins. Their spacing is also limited to a
   fraction of the step size.
-- Two durations are recorded: the shortest time between two changes, and the shortest time during which a value differs
-  from the values before and after. With a wider spacing, equally short changes may be missed: a message says so.
+- The shortest time between two changes, and the shortest duration of a change within a short step, are recorded. If the
+  spacing of samples is not much smaller, equally short changes may be missed: a message says so.
 
 A jump of C_t or b, as at the end of a ramp in a drive, changes velocities as an impulse does. Methods that restore the
 dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So if velocities
@@ -37,14 +37,14 @@ RATE_HALVINGS = 60  # largest number of bisections that locate a jump or a ramp 
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
 TIME_ROUNDING = 5e3  # rounding error of the twelfth difference due to that of t, relative to slope times np.spacing(t)
 STEEPNESS = 4.0  # slope of C_t or b, relative to its mean over the step, above which a part of the step is a ramp
-MAX_RAMP_SHARE = 0.125  # longest part of a step, relative to the step, that counts as a ramp: a step has to end at it
-MIN_SPACINGS = 8.0  # size of the shortest interval that is halved, in spacings of floating-point numbers
-SMOOTH, RAMP, JUMP = range(3)
+MAX_RAMP_SHARE = 0.125  # longest part of a step, relative to its size, that counts as a ramp: steps must end at a ramp
+MIN_SPACINGS = 8.0  # duration of an interval, in spacings of floating-point numbers, at which its bisection ends
+SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in an interval
 
 
 @compiled
 def _sample_rates(f, w, t, q, velocity, begin, end):
-    """Store C_t and b at thirteen times from begin to end in w.rates, at the positions q + velocity (time - t)."""
+    """Store C_t and b at thirteen times from `begin` to `end` in the rows of w.rates, at q + velocity (time - t)."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
@@ -64,7 +64,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean absolute slope, over `length` seconds, and the largest absolute value of the samples of a row."""
+    """Return the mean absolute slope (per s) and largest absolute value of w.rates[:, row], which spans `length` s."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -75,7 +75,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the error of row `row` of G x that the tolerances of x (coordinates or velocities) allow."""
+    """Return the error in row `row` of G x that the tolerances of x (n_q coordinates or velocities) allow."""
     largest = 0.0
     if f.flags[FORM] == STATIC:
         rows, columns, _ = jacobian_of(f.static_program)
@@ -92,7 +92,10 @@ def _allowed_error(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest change of a velocity minus h times its mean acceleration, relative to the tolerance."""
+    """Return the largest |change of a velocity - h times its mean acceleration|, relative to the tolerance.
+
+    The mean acceleration is that of `state` and `new_state`.
+    """
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -103,11 +106,11 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 @compiled
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
-    """Return SMOOTH, RAMP or JUMP for the least smooth row of C_t and b from t to `end`, and two times.
+    """Return SMOOTH, RAMP or JUMP for the least smooth row of C_t and b from t to `end`, and two times (s).
 
-    The times are beginning and end of the jump or ramp, or t and `end` if the row is smooth. A ramp as long as the step
-    is returned as one half as long: accelerations may be zero at both ends of the ramp, and a method that evaluates
-    only there would miss the ramp. (q, v) is the state at t; positions are extrapolated along `velocity`.
+    The times are beginning and end of the jump or ramp, or t and `end` if the row is smooth. If a ramp fills the step,
+    its first half is returned: accelerations may be zero at both ends of the ramp, and a method that evaluates only
+    there would miss the ramp. (q, v) is the state at t; positions are extrapolated along `velocity` (n_q).
     """
     begin = t
     h = end - t
@@ -115,7 +118,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     row, limit, mean, largest = -1, 0.0, 0.0, 1.0
     for i in range(w.Rate.size):
         difference = _twelfth_difference(w, i)
-        if difference == 0.0:  # a row that does not depend on time
+        if difference == 0.0:  # the row does not depend on time
             continue
         slope, size = _slope_and_size(w, i, h)
         allowed_error = max(
@@ -150,41 +153,42 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
             return JUMP, begin, end
     if steepest > STEEPNESS * mean:
         return RAMP, low, high
-    if end - begin < h:  # one half of the step is not smooth either: a ramp as long as the step, or a kink
+    if end - begin < h:  # one half of the step is not smooth either: a ramp fills the step, or the row has a kink
         return RAMP, t, t + 0.5 * h
     return SMOOTH, t, t + h
 
 
-N_SAMPLES = 20  # number of sampling intervals in one set of samples
+N_SAMPLES = 20  # number of intervals between the samples of one set
 LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-SUDDEN_SHARE = 0.1  # smallest ratio of second difference to range at a sudden change: for a bell four spacings wide
+# ratio of second difference to range of the samples above which a change is sudden: that of a bell four spacings wide
+SUDDEN_SHARE = 0.1
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
-# absolute lower bound of the range of samples that matters, whatever the units: squares of smaller values underflow,
-# and subnormal numbers are too coarsely spaced to look smooth
+# smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too
+# coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
-N_IN_STEP = 8.0  # number of samples in a step: a force shorter than a quarter of the step may act between two stages
+N_IN_STEP = 8.0  # least number of samples in a step, because a force that acts for a quarter of it may miss all stages
 RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one below which samples ahead are taken again
 LEAST_APART = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 HALVINGS = 20  # number of bisections that locate the change of a value between two samples
 SAME_CHANGE = 1e-5  # largest time between two changes that count as one, relative to the widest spacing of samples
-# time after the start, relative to GAP, before which changes are not recorded: a force that begins at zero, such as
-# 1 - cos(t), changes at the start by rounding
+# time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
+# at zero, such as 1 - cos(t), look sudden
 SOONEST = 5e-5
-STEEPER = 2.0  # smallest ratio of a sudden change to its neighbouring changes; a smooth slope has smaller ratios
+STEEPER = 2.0  # smallest ratio of a sudden change to its neighbouring changes; on a smooth slope, the ratio is smaller
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_IN_SHORT = 4  # number of samples within a short step
-# largest change of an acceleration, relative to the largest one, in the time in which a velocity changes by its
-# tolerance: accelerations that change more decay, see _acceleration_lasts
+# largest change of an acceleration, relative to the largest acceleration, while a velocity changes by its tolerance: if
+# the change is larger, the acceleration decays, see _acceleration_lasts
 MAX_LASTING_CHANGE = 0.5
-AT_CHANGE = 0.01  # time from a step's beginning, in spacings of samples, within which a change counts as passed
-LARGEST = N_SAMPLES + 1  # index in w.changes of the largest absolute values so far; the rows before are samples
-MIDDLE = N_SAMPLES + 2  # index in w.changes of values between two samples
+AT_CHANGE = 0.01  # time after a step's beginning, in spacings of samples, before which a change counts as passed
+LARGEST = N_SAMPLES + 1  # index of the row of w.changes with the largest absolute values so far; rows above: samples
+MIDDLE = N_SAMPLES + 2  # index of the row of w.changes with values between two samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
 @compiled
 def _sample(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b at `time` in `values`, at the state `elapsed` s after (q, v) with constant a."""
+    """Store forces, C_t and b at `time` in `values`, for the state reached from (q, v) in `elapsed` s at constant a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -195,7 +199,7 @@ def _sample(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _largest(values):
-    """Return the largest of `values`, at least 0: a scale of all components, since single ones may always be zero."""
+    """Return the largest of `values`, or 0 if all are negative: a scale, as single components may always be zero."""
     largest = 0.0
     for x in values:
         largest = max(largest, x)
@@ -204,7 +208,10 @@ def _largest(values):
 
 @compiled
 def _is_smooth(values, k, n):
-    """Return whether second differences of n + 1 values at k and k + 1 (or k - 1) have equal signs, similar sizes."""
+    """Return whether the second differences of `values` at k and k + 1 have the same sign and similar sizes.
+
+    `values` has n + 1 entries; if k + 1 is the last one, k - 1 replaces it.
+    """
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -215,10 +222,10 @@ def _is_smooth(values, k, n):
 
 @compiled
 def _find_bend(values, n, slope, least, within):
-    """Return the first index at which n + 1 values bend suddenly (0: none), and the limit of second differences.
+    """Return the index of the first sudden bend of n + 1 values (0: none), and the limit of second differences.
 
     The limit is SUDDEN_SHARE times the range of the values, after a line of slope `slope` (per sample) is subtracted.
-    No bend is found in a range up to `least`. With `within`, bends of a smooth curve are excluded, see `_is_smooth`.
+    The index is 0 if the range is at most `least`. If `within`, bends of a smooth curve are excluded, see `_is_smooth`.
     """
     low = high = 0.0
     for k in range(1, n + 1):
@@ -237,11 +244,11 @@ def _find_bend(values, n, slope, least, within):
 def _first_sudden_bend(values, n, along, least):
     """Return the index of the first sudden bend of n + 1 samples (0: none), and the limit of its second difference.
 
-    With `along` = 1 the straight line from the first to the last value is subtracted first. The search is repeated
-    among the values before the bend, until it finds no earlier bend. `least`: see `_find_bend`.
+    If `along` is 1, the straight line from the first to the last value is subtracted before the search. The search is
+    repeated among the values before the bend, until it finds no earlier bend. `least`: see `_find_bend`.
     """
     index, limit = _find_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
-    while index > 1:  # a few values of a smooth curve may bend as much: `within` excludes such bends
+    while index > 1:  # few samples of a smooth curve may bend as much: the argument `within` = True excludes such bends
         earlier, earlier_limit = _find_bend(values, index, along * (values[index] - values[0]) / index, least, True)
         if earlier == 0:
             break
@@ -251,7 +258,7 @@ def _first_sudden_bend(values, n, along, least):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return whether the second and third of four samples differ by more than `limit`, and far more than neighbours."""
+    """Return whether two samples differ by more than `limit`, and far more than from `previous` and `following`."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     beside = max(sign * (first_value - previous), sign * (following - second_value))
@@ -260,7 +267,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time just after component j changes between the times low and high, which are samples k and k + 1."""
+    """Return the time just after component j changes between `low` and `high`, the times of samples k and k + 1."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(HALVINGS):
@@ -276,7 +283,7 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 
 @compiled
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
-    """Store in `clock` the time of a sudden change next to the bend at `index`, and the time since the last change.
+    """Update LAST_CHANGE and SHORTEST_CHANGE in `clock` by the sudden changes on both sides of the bend at `index`.
 
     Samples k = 0 to n are at begin + k spacing; `column` is the component that bends, `limit` the smallest change.
     """
@@ -300,8 +307,8 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
     """Return the time of the first sample at which a component changes suddenly (or infinity), and of the last sample.
 
-    (q, v, a) is the state at t. Samples begin at `begin`, and end at `last` or earlier. With `follows_motion` = 1 they
-    follow the motion, with 0 they stay at the state (q, v).
+    (q, v, a) is the state at t. Samples are taken from `begin` on, at most until `last`; with `follows_motion` = 1
+    along the motion, with 0 at the state (q, v).
     """
     changes, n, t_first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -335,7 +342,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Store in `clock` the duration of a change within a short step, which samples ahead of the step have missed."""
+    """Update SHORTEST_CHANGE in `clock` by changes within a short step that samples ahead of the step have missed."""
     changes, spacing, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
@@ -361,9 +368,9 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
-    """Return whether accelerations hardly change (see MAX_LASTING_CHANGE) while a velocity changes by its tolerance.
+    """Return whether accelerations change by at most MAX_LASTING_CHANGE while a velocity changes by its tolerance.
 
-    They change much if stiff friction keeps a body at rest: the acceleration of the body is then a rounding error of
+    They change more if stiff friction keeps a body at rest: the body's acceleration is then a rounding error of
     balanced forces, and a parabola with this acceleration would lead far from the state of rest. (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
@@ -384,7 +391,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample along the motion over a step, or LEAST_DISTANCE spacings if longer; store the next change in `clock`."""
+    """Sample along the motion over a step, or LEAST_DISTANCE spacings if longer; store DISCONTINUITY_OF_MOTION."""
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - AT_CHANGE) * size:
         return
     duration = min(max(size, LEAST_DISTANCE * spacing), last - t)
@@ -398,7 +405,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # if the last samples in time alone found a change, the next ones begin at this change, with their own spacing
+    # close samples along the motion also count as samples in time alone, unless these must continue at a known change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.APART], size / N_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -411,7 +418,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
-    """Return the time of the next sudden change found by samples in time alone, or `next_change` if it is earlier."""
+    """Return the time of the next sudden change that samples in time alone show, or `next_change` if it is earlier."""
     every = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
     # closer samples are not needed in multistep methods (ROUGH = 1), whose error estimates show a jump, and not if C_t
     # or b may jump (DRIVEN = 1), because such steps are checked for jumps
@@ -431,7 +438,10 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return the size of a step, `size` or less, so that it ends at the next sudden change; new_state is scratch."""
+    """Return `size`, or the size (s) of a step from t to the next sudden change if it is smaller.
+
+    `new_state` is scratch; `last` is the last output time.
+    """
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]

@@ -1,4 +1,4 @@
-"""Check, between the steps of a run, the partition and the distance from a singular position."""
+"""Check the partition and the distance from a singular position between the steps of a run."""
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import compiled, merged
@@ -22,7 +22,7 @@ from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, least_pivo
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a singular position is suspected
-COLLAPSED = 0.2  # step size, relative to the longest of the last steps, after which the pivots of C_q are renewed
+COLLAPSED = 0.2  # step size, relative to the longest of the last steps, below which pivots of C_q are computed anew
 # ratio of the smallest pivot of C_q to its largest value so far below which a singular position is near
 SINGULAR_PIVOT = 0.2
 STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
@@ -33,24 +33,27 @@ SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to th
 GIVE_UP_BELOW = 0.001  # smallest step size near a singular position, relative to the longest of the last steps
 # ratio of the smallest pivot to its largest value so far below which rounding determines accelerations, and a run ends
 UNDETERMINED = 1e-6
-CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that steps do not use
-# a partition is checked every k + 1 steps if there are k times this number of freedoms, because T is a full matrix
+CHECK_INTERVAL = 16  # number of accepted steps of generated code, which uses no partition, between two checks of it
+# the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
+# freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
 N_CHECKED = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
 CHECKED_BELOW = 0.5  # pivot at an end of a step, relative to its largest value so far, below which the step is checked
-# the pivot passes through zero in a step if its smallest sample is below this fraction of its largest change between
-# two samples
+# the smallest pivot counts as zero within a step if its smallest sample is below this fraction of its largest change
+# between two samples
 PASSED_SHARE = 0.6
-# constants of near_share: its smallest and largest result, allowed rounding errors in tolerances, unit roundoff
+# NEAR_LEAST, NEAR_MOST: smallest and largest result of near_share; SHARE_OF_NOISE: allowed rounding error, in
+# tolerances; EPS: unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
-END_SHARE = 0.25  # sine at the end of a step, relative to that at its start, below which the step is halved
+END_SHARE = 0.25  # static form: pivot at the end of a step, relative to that at its start, below which it is halved
 
 
 @merged
 def near_singular(f, w, control, clock, t, q):
-    """Return whether BRIDGE is 1 and a singular position was near when the partition was chosen.
+    """Return whether control[BRIDGE] is 1 and a singular position was near when the partition was chosen.
 
-    If steps do not use the partition, it may be old, and is renewed once the run has come near a singular position.
+    Steps of generated code do not use the partition, which may be old. It is renewed first, at (t, q), if the run has
+    come near a singular position before.
     """
     if control[at.BRIDGE] != 1.0:
         return False
@@ -62,9 +65,9 @@ def near_singular(f, w, control, clock, t, q):
 
 @merged
 def ends_at_singular(f, w, control, clock):
-    """Return whether a step of the static form ends too near a singular position to begin the next step there.
+    """Return whether a step of the static form ends so near a singular position that no step should begin there.
 
-    A singular position well between the ends of a step does no harm.
+    A singular position inside a step, away from both ends, does no harm.
     """
     if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0:
         return False
@@ -73,17 +76,17 @@ def ends_at_singular(f, w, control, clock):
 
 @merged
 def fails_at_singular(f, clock, size):
-    """Return whether a failed step of the static form is so short and near a singular position that it is given up."""
+    """Return whether a failed step of the static form, near a singular position, is too short to be repeated."""
     near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
     return f.flags[FORM] == STATIC and near and size < GIVE_UP_BELOW * clock[at.H_LONG]
 
 
 @merged
 def retry_projected(f, w, control, clock, size):
-    """Return whether a rejected step of the static form is repeated with projected stages; store its next size.
+    """Return whether to repeat a rejected step of the static form with projected stages; if so, set clock[H_NEXT].
 
     Near a singular position, accelerations of stages off the constraints have large errors. A long step that ends well
-    beyond the position may succeed where shorter steps fail: the first repetition has H_LONG, the next are shorter.
+    beyond the position may succeed where shorter steps fail: the first repetition has at least the size H_LONG.
     """
     near = clock[at.PIVOT_HERE] < REPEAT_BELOW * clock[at.LARGEST_PIVOT]
     if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
@@ -98,15 +101,15 @@ def retry_projected(f, w, control, clock, size):
 
 @merged
 def near_share(tolerances):
-    """Return the pivot, relative to the largest one, below which rounding errors exceed SHARE_OF_NOISE tolerances."""
+    """Return the ratio of a pivot to the largest one below which rounding errors exceed SHARE_OF_NOISE tolerances."""
     return min(max(NEAR_LEAST, (EPS / (SHARE_OF_NOISE * tolerances[LEAST])) ** (1.0 / 3.0)), NEAR_MOST)
 
 
 @compiled
 def _least_pivot_within(f, w, t, size, before, end, state, new_state):
-    """Return the smallest pivot within a step, and the largest change of the pivot between neighbouring samples.
+    """Return the smallest pivot of C_q within a step, and its largest change between neighbouring samples.
 
-    The samples are on the cubic through the states at the ends of the step, which have the pivots `before` and `end`.
+    The samples are on the cubic through the states at the ends of the step, whose pivots are `before` and `end`.
     """
     n, least, change = w.Q.size, min(before, end), 0.0
     for k in range(1, N_CHECKED):
@@ -125,7 +128,7 @@ def _least_pivot_within(f, w, t, size, before, end, state, new_state):
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
     """Return whether an accepted step comes so near a singular position that a crossing step must replace it.
 
-    Rounding errors of its stages may change the result by more than the tolerances, unseen by error estimates.
+    Rounding errors of its stages may then change the result by more than the tolerances without a large error estimate.
     """
     bridge = control[at.BRIDGE]
     if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
@@ -152,7 +155,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
 
 @merged
 def record_pivot_at_output(f, w, clock, state):
-    """Update the smallest pivot at output times and ends of steps of fixed size, clock[PIVOT_AT_OUTPUT]."""
+    """Update clock[PIVOT_AT_OUTPUT], the smallest pivot at output times and grid times, by the pivot at `state`."""
     pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
     if f.flags[FORM] == STATIC and pivot > 0.0:
         # pivots of the static form are sines of angles, all of them small in large mechanisms: only the ratio to the
@@ -165,8 +168,8 @@ def record_pivot_at_output(f, w, clock, state):
 def check_partition(f, w, control, clock, size, at_output, state):
     """Renew a poor partition, and check how near a singular position is; return CONTINUE or an end code.
 
-    `size` is the size of the last step, s; `at_output` is true if this step ended at an output time. The state contains
-    all coordinates, so that a new partition needs no conversion.
+    `size` is the size of the last step, s; `at_output` is true if this step ended at an output time. `state` contains
+    all coordinates, so that it need not be converted for a new partition.
     """
     short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
     if f.flags[FORM] == STATIC:
@@ -198,13 +201,13 @@ def check_partition(f, w, control, clock, size, at_output, state):
         # the pivots of an old partition may not show that the motion approaches a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.notes[SENSITIVITY] = 1.0  # the value far from singular positions, so that the partition is renewed soon
+        w.notes[SENSITIVITY] = 1.0  # as far from singular positions: then the partition is renewed again soon
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if short and size < GIVE_UP_BELOW * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
-        # the partition may have been chosen far from here: with a new one an implicit method may still continue
+        # the partition may have been chosen at a distant state: with a new one an implicit method may still continue
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
-            return at.RANK_LOST  # no step can cross the position, and rounding would determine velocities
+            return at.RANK_LOST  # no step can cross the singular position, where rounding would determine velocities
     return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

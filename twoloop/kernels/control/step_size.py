@@ -9,9 +9,9 @@ Errors that the embedded formula does not show are measured in two ways:
   both belong to the same assembly of the mechanism, their difference is of the order of the step's error. If the step
   has ended in another assembly, the difference is larger, however smooth the independent coordinates are. For a
   mechanism without independent coordinates (all are prescribed) this is the only error estimate. Where two assemblies
-  come close to one another, a large step may end in the wrong assembly with a small difference. Then det C_qd changes
-  sign, as along a motion only at a singular position. So if the sign changes in a step, the prediction must be nearly
-  exact, as in short steps through a singular position.
+  come close to one another, a large step may end in the wrong assembly with a small difference. But then det C_qd
+  changes sign, which it does along a motion only at a singular position. So if the sign changes in a step, the
+  prediction must be nearly exact, as in short steps through a singular position.
 - `defect_ratio` is the defect of a Taylor step: the difference between the accelerations of the series and those of the
   equations at the same states. A series contains the forces at the beginning of the step, but no later sudden change.
   So the equations are evaluated at the end of the step, and within it at times at most tolerances[LOOK] apart.
@@ -58,13 +58,13 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-# in methods with a trend, a factor between 1 and this one becomes 1, because a new step size needs a new factorization
+# in methods with a trend, a ratio of step sizes from 1 to KEEP_BELOW becomes 1, which saves a factorization
 KEEP_BELOW = 1.2
 
 
 @compiled
 def factor_of(rule, past, h, error):
-    """Return the ratio of the next step size to h by `rule` and history `past`; `error`: in units of the tolerances."""
+    """Return the ratio of the next step size to h by `rule` and history `past`; unit of `error`: the tolerances."""
     if not error > 0.0:
         return rule[FACTOR_MAX]
     follows = error <= 1.0 and rule[LEAST_ERROR] > 0.0
@@ -78,14 +78,17 @@ def factor_of(rule, past, h, error):
 
 @merged
 def record_accepted(rule, past, h, error):
-    """Store size and error of an accepted step in `past`, the history of step-size control."""
+    """Store size h (s) and `error` (in tolerances) of an accepted step in `past`, the history of step-size control."""
     past[H_BEFORE], past[ERROR_BEFORE] = h, max(error, rule[LEAST_ERROR])
 
 
 @compiled
 def evaluate_near(f, w, t, Q, V, A):
-    """Project (Q, V), near the constraints, onto them in place, store its accelerations in A, and return a code."""
-    # with generated code the task PROJECT costs least, and in the static form the task EVALUATE does not project
+    """Project the state (Q, V) onto the constraints in place, and store its accelerations in A; return a code.
+
+    (Q, V), n_q each, must be near the constraints.
+    """
+    # PROJECT is the cheapest task of generated code, and in the static form the task EVALUATE does not project
     if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -101,20 +104,21 @@ EQUAL_SPACINGS = 4.0  # largest difference of times that count as equal, in spac
 
 @merged
 def on_grid(clock, t, h, target, goal):
-    """Return three values for a step on a fixed grid: size, number of completed grid steps, whether it reaches `goal`.
+    """Return the size (s) of a step from t, the number of grid steps that it completes, and whether it reaches `goal`.
 
-    Grid times are T_START plus multiples of h. An output time within a millionth of h counts as equal to a grid point.
+    Grid times are T_START plus multiples of h. `target`: next output time; within a millionth of h of a grid time, it
+    counts as equal to this time. `goal`: `target` or an earlier jump of C_t or b.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     margin = max(1e-6 * h, rounding)
     n_grid_steps = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + margin:
-        n_grid_steps = 0.0  # another output time follows close to the grid point at which the last step ended
+        n_grid_steps = 0.0  # the output time is not after the last counted grid time
     end = clock[at.T_START] + (clock[at.N_FIXED] + n_grid_steps) * h
     reaches_goal = goal <= end + margin
     size = h
     if abs(t + h - end) > rounding:
-        size = end - t  # back to the grid after an output time off the grid
+        size = end - t  # end at a grid time again, after an output time between grid times
     if reaches_goal and goal < target and abs(goal - end) > rounding:
         n_grid_steps = 0.0
     return size, n_grid_steps, reaches_goal
@@ -122,23 +126,23 @@ def on_grid(clock, t, h, target, goal):
 
 @merged
 def off_grid(control, t, h, left, crosses_jump):
-    """Return the size of a step, at most about h, and whether it reaches the goal, which is `left` seconds ahead."""
+    """Return the size of a step, at most about h, and whether it reaches its goal, which is `left` seconds ahead."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:
-        size = 0.5 * left  # two equal steps instead of a long step and a tiny one
+        size = 0.5 * left  # take two equal steps instead of a long step and a tiny one
     size = representable_step(t, size)
     if size > control[at.MAX_STEP]:
         size = representable_step(t, size - np.spacing(abs(t + size)))
     return size, reaches_goal
 
 
-FADING = 0.98  # factor on H_LONG, the longest of the last steps, after each accepted step
+FADING = 0.98  # factor by which H_LONG, the longest of the last steps, decreases in each accepted step
 
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step, update the largest defect and gap in w.notes, and fill the step's row of out_steps."""
+    """Count an accepted step, update largest defect and gap in w.notes, and fill `out_step`, its row of out_steps."""
     w.counters[N_ACCEPTED] += 1
     if w.notes[DEFECT] >= 0.0:
         w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
@@ -159,17 +163,17 @@ def count_step(w, tolerances, control, clock, size, out_step):
     out_step[at.JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
 
 
-# largest allowed error of a predicted position, relative to the largest motion of a coordinate in the step
+# allowed error of a predicted position, relative to the largest motion of a coordinate in the step
 SHARE_OF_MOTION = 0.1
 SHARE_THROUGH_ZERO = 1e-6  # replaces SHARE_OF_MOTION if the sign of det C_qd changes in the step
-LEAST = 1e-300  # lower bound of a divisor, which avoids a division by zero
-# allowed error of a predicted position, in tolerances, in addition to SHARE_OF_MOTION: for steps with hardly any motion
+LEAST = 1e-300  # lower bound of the allowed error, which avoids a division by zero
+# error of a predicted position, in tolerances, that is allowed in addition: for steps with hardly any motion
 FLOOR = 0.01
 
 
 @merged
 def store_prediction(w, q1):
-    """Store the dependent positions of q1, the prediction by the formula, in w.predicted."""
+    """Store the dependent positions of q1 (n_q), as predicted by the formula of the method, in w.predicted."""
     for k in range(w.dependent.size):
         w.predicted[k] = q1[w.dependent[k]]
 
@@ -178,8 +182,8 @@ def store_prediction(w, q1):
 def departure(w, tolerances, h, q, v, q1):
     """Return the largest difference of a dependent position in w.predicted from q1, relative to the allowed difference.
 
-    The allowed difference is the tolerance, or a fraction of the motion in the step if this fraction is smaller. The
-    factors of C_qd in `w` must be those at q1. With steps of fixed size the result is 0.
+    The allowed difference is the smaller one of the tolerance and about SHARE_OF_MOTION times the motion in the step.
+    The factors of C_qd in `w` must be those at q1. With steps of fixed size the result is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -206,15 +210,16 @@ def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
     return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0
 
 
-ROUNDING = 1e-13  # largest defect that counts as a rounding error, relative to the largest acceleration
+ROUNDING = 1e-13  # defect that counts as a rounding error, relative to the largest acceleration
 
 
 @compiled
 def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the defect |predicted - a| at the end of a step of size h, relative to the largest allowed defect.
 
-    The tolerances of q and v determine the allowed defect. The defect of a series of order `order` grows as the highest
-    power of the time: its integral over the step is h / order times its value at the end. NaN counts as infinite.
+    The error that the defect causes in q and v must be below the tolerances. The defect of a series of order `order`
+    grows as the highest power of the time: its integral over the step is h / order times its value at the end. The
+    result is infinite if an acceleration is not finite.
     """
     rtol, duration, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

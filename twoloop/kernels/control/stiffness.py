@@ -67,21 +67,21 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# number of evaluations before the first estimate of rho, and between two estimates, which take about eight evaluations
-# each; these numbers are multiplied by COST_RATIO while the explicit method is used
+# FIRST_ESTIMATE: number of evaluations before the first estimate of rho; BETWEEN_ESTIMATES: number between two
+# estimates, which take about eight evaluations each. The explicit method multiplies both numbers by COST_RATIO
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
-ITERATIONS = 4  # largest number of power iterations for dF/dq in one estimate, and for dF/dv
-NEGLIGIBLE = 1e-3  # product of step size and eigenvalue of dF/dv below which the iterations for dF/dv end
+ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
+NEGLIGIBLE = 1e-3  # product of step size and eigenvalue of dF/dv below which the power iterations for dF/dv end
 SEED = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
-STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability limits the step of the explicit method
+STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limit the step of the explicit method
 # least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
 # needs finite differences, which take about eight evaluations per coordinate
 MIN_COST = 64.0
 TRIAL = 300.0  # approximate cost of a trial of the implicit method, in its evaluations
 AFFORDED = 3.0  # least cost of the run, relative to the cost of a trial, at which a trial that may be in vain can begin
 SHARE_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
-# cost of the run, relative to AFFORDED trials, at which a trial begins whatever the rates are; this number doubles
-# after one trial, triples after two, and so on
+# cost of the run, relative to AFFORDED trials, at which a trial begins whatever the rates are. This number is doubled
+# after one trial, tripled after two, and so on
 COST_OF_ANY_TRIAL = 100.0
 HIDDEN_RATIO = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
 QUIET_FACTOR = 10.0  # largest velocities, in tolerances, of oscillations that steps at the stability limit excite
@@ -90,18 +90,18 @@ DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of
 RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method
 TRIAL_ERROR_FACTOR = 10.0
-MEAN_WEIGHT = 0.8  # weight of the previous mean step size in the new mean step size
+MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
 N_UNTYPICAL = 5.0  # number of accepted steps at the beginning of a trial whose cost is not measured
 WINDOW = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # ratio of costs above which the method on trial replaces the method used before
-PATIENCE = 4.0  # number of estimates from a successful trial to the next trial
+MIN_GAIN = 1.2  # ratio of the costs per second (before to on trial) above which the method on trial replaces the other
+PATIENCE = 4.0  # number of estimates of rho from a successful trial to the next trial
 
-# values of PHASE: explicit method, implicit method on trial, implicit method, explicit method on trial
+# values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
 # indices in `options`. In this order, `options` contains: the N_PAIR options of the pair; for each method its step-size
 # rule (see loop_state.py) and, at REUSE_OF, its value of REUSE; the options of the first method; those of the second.
-# LIMIT: h rho above which the implicit method is tried, if N_ESTIMATES successive estimates exceed LIMIT. MATRIX_COST:
+# LIMIT: value of h rho above which the implicit method is tried, if N_ESTIMATES estimates exceed LIMIT. MATRIX_COST:
 # cost of a Jacobian in evaluations. COST_RATIO: cost of an evaluation of the second method in evaluations of the first.
 # SIZE_1: number of options of the first method
 LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
@@ -110,7 +110,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
 # indices in `memory`, which contains scalars, two directions (n_q each), and the memories of the two methods
 (
-    PHASE,  # which method is used, see above
+    PHASE,  # EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps in this phase
     MAY_ESTIMATE,  # 1: the last attempt was accepted, so that the rate may be estimated
     NEXT_ESTIMATE,  # number of evaluations at which the rate is estimated again
@@ -122,12 +122,12 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     RATE,  # last estimate of rho, 1/s
     FIRST_MEMORY,  # number of entries of the memory of the first method
     H_MEAN,  # mean step size, s
-    HISTORY,  # first index of the history of step-size control in this phase, see loop_state.py
-    _HISTORY_ERROR,  # last index of this history
+    HISTORY,  # first index of the history (2 numbers) of step-size control in this phase, see loop_state.py
+    _HISTORY_ERROR,
     H_TRIED,  # size of the last attempted step, s
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    N_ABOVE_LIMIT,  # number of successive estimates with h rho above LIMIT
+    N_ABOVE_LIMIT,  # number of estimates with h rho above LIMIT since the last one below LIMIT
     N_SCALARS,
 ) = range(19)
 
@@ -135,10 +135,10 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 def switching_options(
     limit: float, estimates: int, matrix_cost: float, ratio: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return `options` of a pair of methods.
+    """Return the array `options` of a pair of methods.
 
-    `limit` to `ratio` are LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO. `each` has one row for each method, with its
-    step-size rule and REUSE_OF; `first` and `second` are the options of each method.
+    `limit` to `ratio` are LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO. `each` has one row for each method: its
+    step-size rule and its value of REUSE. `first` and `second` are the options of the two methods.
     """
     first = np.asarray(first)  # numbers, or expressions in the parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
@@ -146,7 +146,7 @@ def switching_options(
 
 
 def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
-    """Return the initial `memory` of a pair of methods with the initial memories `first` and `second`."""
+    """Return the initial `memory` of a pair of methods whose initial memories are `first` and `second`."""
     first, second = np.asarray(first), np.asarray(second)
     scalars = np.zeros(N_SCALARS)
     scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, PATIENCE, first.size
@@ -172,10 +172,10 @@ def _memories(memory, n):
 
 @compiled
 def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
-    """Multiply `direction` by dF/dq (with `by_v`, by dF/dv), scale it, and return the factor by which it has grown.
+    """Multiply `direction` (n_q) by dF/dq, or dF/dv if `by_v`, and return the factor by which its largest entry grows.
 
-    `direction` is overwritten, with a largest component of 1; only components of independent coordinates are used.
-    (Q, V, A) is scratch. Returns 0, and keeps `direction`, if the product cannot be evaluated.
+    `direction` is then scaled to a largest component of 1. Only components of independent coordinates are used. The
+    result is 0, and `direction` unchanged, if the product cannot be evaluated. (Q, V, A) is scratch.
     """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -204,7 +204,7 @@ def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
 
 @compiled
 def _largest_rate(f, w, memory, t, state, new_state):
-    """Return rho at `state`, 1/s, and improve the two directions in `memory`; `new_state` is scratch."""
+    """Return rho (1/s) at `state` by power iterations of the two directions in `memory`; `new_state` is scratch."""
     n = w.Q.size
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
@@ -229,7 +229,10 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the largest relative rate of change of velocities or accelerations, 1/s; infinity if it is unknown."""
+    """Return the larger relative rate of change (1/s) of velocities and accelerations, or infinity if it is unknown.
+
+    The rate of accelerations is a difference over DIFFERENCE_STEP / `rate`; (Q, V, A) is scratch.
+    """
     n = Q.size
     dt = DIFFERENCE_STEP / rate
     fastest = largest = change = 0.0
@@ -249,7 +252,10 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Return whether velocities of a vibration of angular frequency `rate` are at most QUIET_FACTOR tolerances."""
+    """Return whether a vibration of angular frequency `rate` (1/s) has velocities of at most QUIET_FACTOR tolerances.
+
+    The velocities are computed from the accelerations in `state`.
+    """
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
@@ -266,20 +272,20 @@ def _cost(w, options):
 
 @compiled
 def _cost_per_second(w, options, memory, t):
-    """Return the cost of a second of motion since T_BEGIN, in evaluations of the first method."""
+    """Return the cost of a second of motion since T_BEGIN, in evaluations of the first method; t: present time."""
     cost_per_second = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
     return cost_per_second if _is_explicit(memory) else options[COST_RATIO] * cost_per_second
 
 
 @compiled
 def _evaluations_between_estimates(options, memory):
-    """Return the number of evaluations between two estimates of rho by the method in use, see BETWEEN_ESTIMATES."""
+    """Return the number of evaluations of the active method between two estimates of rho, see BETWEEN_ESTIMATES."""
     return BETWEEN_ESTIMATES * options[COST_RATIO] if _is_explicit(memory) else BETWEEN_ESTIMATES
 
 
 @compiled
 def _begin_phase(w, options, memory, phase, t):
-    """Store in `memory` that `phase` begins at t: with no history of errors, and with the cost measured from t on."""
+    """Update `memory` for a `phase` that begins at t: no history of errors yet, and costs measured from t on."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0
@@ -289,7 +295,7 @@ def _begin_phase(w, options, memory, phase, t):
 
 @compiled
 def _judge_trial(w, options, memory, t):
-    """Return the phase that follows a trial (which of the two methods to use), or -1 while the trial continues."""
+    """Return the phase that follows a trial, EXPLICIT or IMPLICIT, or -1 while the trial continues; t: present time."""
     if memory[STEPS] == N_UNTYPICAL:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
     if memory[STEPS] < N_UNTYPICAL + WINDOW:
@@ -330,8 +336,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         hidden = _is_quiet(w, tolerances, state, memory[RATE])
         if not hidden:
             hidden = memory[RATE] > HIDDEN_RATIO * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a run of high cost starts a trial whatever the rates are: few states show the largest rate if friction is about to
-    # reverse. The condition on `cost` excludes the short steps at the start, after which the expected cost is known
+    # a run of high cost starts a trial whatever the rates are: if friction is about to reverse, few states show the
+    # largest rate. The condition on `cost` excludes the short steps at the start, when the expected cost is unknown
     costs_enough = (
         is_cheap and cost > least_cost and counted_cost > COST_OF_ANY_TRIAL * least_cost * (1.0 + memory[N_TRIALS])
     )
@@ -343,7 +349,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     )
     if is_cheap and h_rho <= 1.0:  # N_ABOVE_LIMIT is not reset while a trial is too expensive
         memory[N_ABOVE_LIMIT] = 0.0
-    expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the previous explicit phase
+    expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than in the previous explicit phase
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0
@@ -377,9 +383,9 @@ def settle_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method, after choosing this method if an estimate or the end of a trial is due.
+    """Attempt a step by the active method, which is chosen anew if an estimate of rho or the end of a trial is due.
 
-    The memory of a method is cleared when this method becomes active. Step-size control is that of the active method.
+    The memory of a method is cleared when this method becomes active. The step-size rule is that of the active method.
     """
     n = w.Q.size
     first, second = _memories(memory, n)
@@ -404,14 +410,14 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.notes[REUSE] = max(rule[REUSE_OF], w.notes[ROUNDED])
     if explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: try the implicit method
+        # a step of fixed size that does not converge cannot be shortened: use the implicit method from now on
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC:
             _begin_phase(w, options, memory, IMPLICIT, t)
             _clear(second)
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only the first method may take steps longer than GAP, because it evaluates the equations within a step, too
+        # only the first method may take steps longer than GAP, because it also evaluates the equations within a step
         ratio = gap_ratio(tolerances, h)
         if ratio > 0.0:
             return Attempt(DONE, ratio, 1.0 / ratio)
