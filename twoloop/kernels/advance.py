@@ -1,6 +1,6 @@
 """Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
-`advance` is the same for all methods: their functions are in `f` (a `Kit`), their data in `options` and `memory`.
+`advance` is the same for all methods: a method's functions are in `f` (a `Kit`), its data in `options` and `memory`.
 """
 
 import numpy as np
@@ -66,13 +66,13 @@ from twoloop.kernels.linalg.dense import copy
 # error of a rejected step, in tolerances, above which a force is assumed to change suddenly within the step
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
-# smallest number of accepted steps after which a short next step ends the trial of a method: the first size is a guess
+# number of accepted steps from which on a short next step ends the trial of a method: the first step size is a guess
 FIRST_JUDGED = 2
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
 def start(f, w, t, state):
-    """Factor the mass matrix, choose the partition, and store a and lam in `state` [q, v, a, lam]; return a code."""
+    """Factor M, choose the partition, and store a and lam in `state` [q, v, a, lam] at time t; return a code."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     w.notes[KINK_BEFORE] = t  # C_t or b of a drive may be discontinuous at the start
@@ -83,7 +83,7 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # repeat, now that the scale of Gamma's errors is known
+    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # repeat: the first evaluation sets the scale of Gamma's errors
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
@@ -104,9 +104,9 @@ def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return its code, its error in tolerances, and the ratio of the next step size to this one.
+    """Attempt a step; return its code, its error in tolerances, and the ratio of the next step size to `size`.
 
-    `crosses_jump`: the step crosses a jump of C_t or b, and the caller has already computed `new_state`.
+    If the step crosses a jump of C_t or b (`crosses_jump`), the caller has already computed `new_state`.
     """
     w.notes[ORIENTATION_NEW] = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -128,10 +128,10 @@ def _attempt(f, w, options, memory, tolerances, control, clock, t, size, crosses
 
 
 @merged
-def _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
+def _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
     """Return whether a step must be repeated because C_t or b jumps, or has a ramp, within the step.
 
-    Stores in `clock` the interval of a jump, so that the repeated step ends where it begins; for a ramp, the next size.
+    For a jump, JUMP_FROM, at which the repeated step ends, and JUMP_TO are stored in `clock`; for a ramp, H_NEXT.
     """
     kind, low, high = _locate_kink(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
@@ -147,10 +147,10 @@ def _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, ne
 
 @merged
 def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
-    """Prepare the repetition of a failed step and return CONTINUE, or return the code that ends the loop.
+    """Prepare the repetition of a failed step and return CONTINUE, or return an end code.
 
     The step is repeated with a smaller size, with a new partition, or with both. A step of fixed size is repeated once,
-    with a new partition; `t_repeated` is the time of the last such repetition.
+    with a new partition; `t_repeated` is the beginning (s) of the last step repeated in this way.
     """
     n = w.Q.size
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
@@ -179,7 +179,10 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
 
 @merged
 def _handle_rejection(f, w, control, clock, t, size, proposal, state):
-    """Reduce the size of a step whose error is too large; return CONTINUE, or an end code near a singular position."""
+    """Store a smaller size than `size` in clock[H_NEXT] after a step with too large an error; return CONTINUE.
+
+    Near a singular position, an end code is returned instead. `proposal`: size (s) that follows from the error.
+    """
     n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
@@ -194,8 +197,8 @@ def _handle_rejection(f, w, control, clock, t, size, proposal, state):
 
 
 @merged
-def _may_take_many(control, clock):
-    """Return whether the method may take many steps in one call, without checks by the loop between them."""
+def _can_take_many(control, clock):
+    """Return whether the method may take many steps in one call, between which the loop checks nothing."""
     if control[at.MAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
@@ -205,7 +208,7 @@ def _may_take_many(control, clock):
 
 @merged
 def _pass_output_time(f, w, clock, outputs, state):
-    """Record the pivot at an output time, and go on to the next output time; return whether this was the last one."""
+    """Record the pivot at an output time, and increment clock[NEXT_OUTPUT]; return whether the time was the last."""
     record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
@@ -218,18 +221,18 @@ _ADVANCE = i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS)
 def advance(
     f, w, options, memory, tolerances, control, clock, state, new_state, outputs, out_t, out_state, out_steps, filled
 ):
-    """Integrate from (clock, state) until every time in `outputs` is reached; return an end code of loop_state.py.
+    """Integrate from clock[T] and `state` until all times in `outputs` are reached; return an end code (loop_state.py).
 
     Steps are shortened to end at output times. A step size is the difference of two floating-point times, so that the
-    sum of the step sizes is exact. `clock` and `state` are updated in place; `new_state` is scratch, but contains the
-    state after a jump if the next step crosses one (APPLIES_JUMP).
-    With STORE_ALL = 1 every accepted state is stored in a row of out_t and out_state, otherwise the states at output
-    times only; out_steps gets one row for each accepted step. On return, filled[0] is the number of rows written to
-    out_t and out_state, and filled[1] the number of rows written to out_steps.
+    sum of the step sizes is exact. `clock` and `state` are updated in place; `new_state` is scratch, except that it
+    contains the state after a jump if the next step crosses one (APPLIES_JUMP).
+    With STORE_ALL = 1, all accepted states are stored in rows of out_t and out_state, otherwise the states at output
+    times only; each accepted step is stored in a row of out_steps. On return, filled[0] is the number of rows stored in
+    out_t and out_state, and filled[1] the number of rows stored in out_steps.
     """
     fixed_size = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
-    t_repeated = np.inf  # time at which a step of fixed size was repeated with a new partition
+    t_repeated = np.inf  # time (s) from which a step of fixed size was last repeated with a new partition
     filled[0] = 0
     filled[1] = 0
     attempts = 0.0
@@ -238,13 +241,13 @@ def advance(
             return at.PAUSED
         if w.counters[N_ACCEPTED] >= control[at.MAX_STEPS]:
             return at.MAX_STEPS_REACHED
-        if _may_take_many(control, clock):
+        if _can_take_many(control, clock):
             first, target = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
             goal = min(target, clock[at.JUMP_FROM])
             if min(out_t.size - first, out_steps.shape[0] - filled[1]) < LANES and first + filled[1] > 0:
                 return at.PAUSED
-            rows = out_t[first:], out_state[first:], out_steps[filled[1] :]
-            n_taken = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *rows)
+            views = out_t[first:], out_state[first:], out_steps[filled[1] :]
+            n_taken = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *views)
             if n_taken > 0:
                 at_output = clock[at.T] == target
                 if control[at.STORE_ALL] == 1.0:
@@ -269,7 +272,7 @@ def advance(
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if crosses_jump else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        n_grid_steps = 1.0  # number of steps of the fixed grid that this step covers
+        n_grid_steps = 1.0  # number of steps of the grid that this step completes
         if fixed_size:
             size, n_grid_steps, reaches_goal = on_grid(clock, t, h, target, goal)
         else:
@@ -278,11 +281,11 @@ def advance(
         at_output = reaches_goal and goal == target
         if reaches_goal:
             size = goal - t
-        may_sample = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
-        if (may_sample or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not crosses_jump:
-            whole, last = size, outputs[outputs.size - 1]
-            size = limit_to_discontinuity(f, w, tolerances, control, clock, t, whole, last, state, new_state)
-            if size < whole:
+        samples_ahead = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
+        if (samples_ahead or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not crosses_jump:
+            full_size, last = size, outputs[outputs.size - 1]
+            size = limit_to_discontinuity(f, w, tolerances, control, clock, t, full_size, last, state, new_state)
+            if size < full_size:
                 reaches_goal, at_output, shortened = False, False, True
         if not reaches_goal and size <= max(EQUAL_SPACINGS * np.spacing(abs(t)), control[at.SHORTEST]):
             return at.STEP_TOO_SMALL
@@ -291,12 +294,12 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        if w.notes[TIME_IS_UP] == 1.0:  # this attempt may lack evaluations: discard it
+        if w.notes[TIME_IS_UP] == 1.0:  # evaluations may be missing in this attempt: discard it
             f.settle(f, w, options, memory, tolerances, False)
             return at.PAUSED
-        # where a force jumps, an error estimate may be small by chance: it is multiplied by `strict` until ROUGH_TO
-        strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
-        accepted = code == DONE and error * strict <= 1.0
+        # where a force jumps, an error estimate may be small by chance: `error_factor` enlarges it until ROUGH_TO
+        error_factor = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
+        accepted = code == DONE and error * error_factor <= 1.0
         if accepted and not reaches_goal and ends_at_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
@@ -312,8 +315,8 @@ def advance(
             w.counters[N_REJECTED_ERROR] += 1
             clock[at.FAILURE_CODE] = SINGULAR
             return at.NEAR_SINGULAR
-        driven = control[at.DRIVEN] == 1.0 and not crosses_jump
-        if driven and _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
+        checks_rates = control[at.DRIVEN] == 1.0 and not crosses_jump
+        if checks_rates and _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             clock[at.FAILURE_CODE] = DONE
@@ -329,10 +332,10 @@ def advance(
             continue
         if error > SUDDEN_ERROR and not accepted:
             clock[at.ROUGH_TO] = t + size
-        error *= strict
+        error *= error_factor
         if factor == 0.0:
             factor = factor_of(control, clock, size, error)
-        elif strict > 1.0 and error > 0.0:  # the method computed `factor` from the error without `strict`
+        elif error_factor > 1.0 and error > 0.0:  # the method did not include `error_factor` in its `factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
@@ -361,7 +364,7 @@ def advance(
             out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
-        # a step that was shortened to end at an output time must not limit the size of the next one
+        # a step that was shortened, such as to end at an output time, must not limit the size of the next step
         clock[at.H_NEXT] = max(proposal, h) if shortened else proposal
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:

@@ -1,12 +1,12 @@
 """Start a run and take its first steps in one compiled call, which stores all results in one array.
 
-`start_and_advance` checks the start, repeats the choices of the previous run (independent rows, dependent coordinates),
+`start_and_advance` checks the start, makes the choices of the previous run (independent rows, dependent coordinates),
 takes steps, and fills one array:
 
     ... | report: N_REPORT numbers, counters | times | steps | states ...
                                                              ^ a fixed index
 `advance` writes states from the fixed index on. The length of the other parts depends on the number of steps: they are
-copied afterwards, and end where the states begin. A result is then contiguous: Python copies it as one slice, and
+copied afterwards, and end where the states begin. The result is then contiguous: Python copies it as one slice, and
 splits the copy when a field of the result is used.
 """
 
@@ -35,15 +35,15 @@ from twoloop.kernels.data.common import (
 from twoloop.kernels.data.indices import FORM, GAP, LONGEST_UNSEEN, LOOK, N_ACCEPTED, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
 
-ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate: smaller corrections are not needed
+ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate: smaller corrections are left out
 
 
 @merged
 def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Reset the workspace `w` in place before a run that starts at the position q.
+    """Reset the workspace `w` in place before a run that starts at the position q (n_q).
 
-    `numbers` and `integers` are the parts of `w` that keep data from step to step, `pattern` is stored in w.pattern,
-    `accuracy` is the value of GAMMA_REQUIRED, and `reuse` the smallest value of REUSE (see data/indices.py).
+    `numbers` and `integers` are the parts of `w` that keep data from step to step. `pattern` is copied to w.pattern;
+    `accuracy` is the value of GAMMA_REQUIRED, `reuse` the smallest value of REUSE (see data/indices.py).
     """
     for k in range(numbers.size):
         numbers[k] = 0.0
@@ -65,22 +65,22 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
 def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Call `prepare_work` from Python."""
+    """Reset the workspace `w` in place by `prepare_work`, which Python cannot call itself."""
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
 FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
-SHORTEST_STEP = 1e-16  # smallest allowed step size, relative to the first step size
+SHORTEST_STEP = 1e-16  # step size, relative to the first step size, at which a run fails
 GAP_TO_LOOK = 10  # ratio of tolerances[GAP] to tolerances[LOOK] if forces may change suddenly with position or velocity
 
 
 @exact
 def _first_step(state, n, t, span, smallest):
-    """Return the first step size, s: FIRST_STEP times the time in which coordinates change by as much as their size.
+    """Return the first step size (s), FIRST_STEP times the time in which coordinates change by max(max|q|, `smallest`).
 
-    The size of the coordinates is max|q|, or `smallest` if this is larger. The result is at most FIRST_STEP times the
-    duration `span` of the run, and at least MIN_FIRST_STEP spacings of floating-point numbers at t.
+    The result is at most FIRST_STEP times the duration `span` (s) of the run, and at least MIN_FIRST_STEP spacings of
+    floating-point numbers at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -91,7 +91,7 @@ def _first_step(state, n, t, span, smallest):
         time_scale = min(time_scale, distance / speed)
     if acceleration > 0.0:
         time_scale = min(time_scale, math.sqrt(distance / acceleration))
-    # the time in which velocities change by their size counts only if the motion is not almost at rest
+    # the time in which velocities change by max|v| is a time scale only if the motion is not almost at rest
     if speed > 0.0 and acceleration > 0.0 and speed / acceleration > FIRST_STEP * time_scale:
         time_scale = min(time_scale, speed / acceleration)
     return max(FIRST_STEP * time_scale, MIN_FIRST_STEP * np.spacing(abs(t)))
@@ -99,10 +99,10 @@ def _first_step(state, n, t, span, smallest):
 
 @exact
 def _limit_steps(control, tolerances, span, longest, within):
-    """Store limits for the time between two evaluations of the equations: LONGEST_UNSEEN of the run's duration `span`.
+    """Store GAP and LOOK in `tolerances`, and MAX_STEP, APART and SPACING in `control`.
 
-    The limits are GAP and LOOK in `tolerances`, and MAX_STEP, APART and SPACING in `control`. `within`: steps evaluate
-    the equations at interior points, too, so that only `longest` (s) limits the step size.
+    These limit the time between two evaluations of the equations to LONGEST_UNSEEN times the run's duration `span`. If
+    `within`, the method also evaluates the equations between its stages, and only `longest` (s) limits the step size.
     """
     gap = LONGEST_UNSEEN * span
     tolerances[GAP], tolerances[LOOK] = gap, gap / (GAP_TO_LOOK if control[at.BY_STATE] > 0.0 else 1.0)
@@ -113,7 +113,7 @@ def _limit_steps(control, tolerances, span, longest, within):
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
 def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longest, within):
-    """Return the first step size from `state` at t, s, by `_first_step`; if `longest` > 0, also call `_limit_steps`."""
+    """Return the first step size (s), see _first_step; if `longest` > 0, also store the limits of `_limit_steps`."""
     if longest > 0.0:
         _limit_steps(control, tolerances, t1 - t, longest, within)
     return _first_step(state, n, t, t1 - t, smallest)
@@ -121,7 +121,7 @@ def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longes
 
 @merged
 def _all_within(t, rows, bounds):
-    """Return whether times t and the first entries of each state in `rows` are between bounds[0] and bounds[1]."""
+    """Return whether (time, first entries of the state) is between bounds[0] and bounds[1] for all t[k], rows[k]."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -133,9 +133,9 @@ def _all_within(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Store step sizes in `h`, changes of the counters in `changes`, and whether Newton's method was used.
+    """Fill `h` with step sizes (s), `changes` with changes of counters, and `used_newton` (Newton's method was used).
 
-    `counts` are the numbers of rejections and partitions: on entry before these steps, on return after them.
+    `steps`: rows of out_steps; `counts`: numbers of rejections and partitions, before (on return: after) these steps.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -145,14 +145,14 @@ def split_steps(steps, counts, h, changes, used_newton):
 
 
 # codes that `start_and_advance` returns instead of a number of steps. REFUSED: the choices of the previous run do not
-# suit this start. IN_DOUBT: the start may be inconsistent and needs a closer check. UNUSUAL: Python must read the
-# report, and may have to continue the run
+# suit this start. IN_DOUBT: the start may violate the constraints and needs a closer check. UNUSUAL: Python must read
+# the report, and may have to continue the run
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
-# arrays of runs that are repeated from different starts: for checking a start, for choosing rows, and for the run.
+# arrays for runs that are repeated from different starts: to check a start, to choose rows, and to run. Among them are
 # - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
 # - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
-# - `last_start`: the last start, see START; `start_rows`: the independent rows at that start
+# - `last_start`: the last start, see START; `start_rows`: indices of the independent rows at the last start
 # - `saved`, `saved_integers`: all data of a run that has just started at `last_start`, saved when a start is repeated
 RUN_ARRAYS = Reference(
     "RunArrays",
@@ -175,23 +175,23 @@ RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INT
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# indices in `constants`. ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w.notes. HAS_ALL_ENTRIES: 1 if rows are
-# nonzero wherever `kinds` is not 0. RANK, WEAK: thresholds for `choose`. SCALE: factor of the rows added to M.
-# CONTRADICTS: tolerance of redundant rows. MASS_FLAG: flag of M (DEFINITE, INDEFINITE or 0). LEAST_PIVOT: smallest
-# pivot of an accepted start. EQUATION_FORM: value of FORM. FIRST: first step size that the user has chosen, s; 0: none.
-# LEAST: argument `smallest` of _first_step. LONGEST, EVALUATES_WITHIN: arguments of _limit_steps. NEAR: pivot below
-# which Python checks the run. MAX_CHANGE_RATIO: largest ratio of the change of velocities in the last step to that by
-# accelerations. MIN_SAMPLES: least time between two sudden changes, in spacings of samples
+# indices in `constants`. ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w.notes. HAS_ALL_ENTRIES: 1 if `rows` is
+# nonzero wherever `kinds` is not 0. RANK, WEAK: thresholds for `choose`. SCALE: factor s in M + s G^T G. CONTRADICTS:
+# relative tolerance of redundant rows. MASS_FLAG: flag of M (DEFINITE, INDEFINITE or 0). LEAST_PIVOT: smallest pivot of
+# an accepted start. EQUATION_FORM: value of FORM. FIRST: first step size that the user has chosen, s; 0: none. LEAST:
+# argument `smallest` of _first_step. LONGEST, EVALUATES_WITHIN: arguments of _limit_steps. NEAR: pivot below which
+# Python checks the run. MAX_CHANGE_RATIO: ratio of the change of velocities in the last step to that by accelerations
+# above which velocities have jumped. MIN_SAMPLES: least time between two sudden changes, in spacings of samples
 ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
 EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
 # indices in `expected`, the choices for which code was generated (empty without generated code). PLACE: result of
-# choose_rows. N_KEPT, N_ADDED: numbers of independent rows and of rows added to M. KEPT: first index of these rows
+# choose_rows. N_KEPT, N_ADDED: numbers of independent rows and of rows added to M. KEPT: index of the first row
 PLACE, N_KEPT, N_ADDED, KEPT = range(4)
 
 
 @merged
 def _has_same_choices(b):
-    """Choose rows and dependent coordinates at the start; return whether the generated code is for the same choices."""
+    """Choose rows and dependent coordinates at a start; return whether these are the choices of the generated code."""
     b.scratch[0] = 0.0
     first_bound = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
@@ -222,7 +222,7 @@ def _copy(source, target):
 
 @merged
 def _redundant_rows_hold(w, b, n):
-    """Return whether the accelerations in b.state satisfy all rows, including redundant rows, up to a tolerance."""
+    """Return whether the accelerations a in b.state satisfy all rows of G a = Gamma within CONTRADICTS."""
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
@@ -244,7 +244,7 @@ def _check_start(checked_kit, b, t, q, v, sizes, shifts):
 
 @merged
 def _has_all_entries(b):
-    """Return whether b.rows is nonzero exactly where b.kinds is: then no entries are sought at positions nearby."""
+    """Return whether b.rows is nonzero exactly where b.kinds is: then positions nearby need not be tried."""
     n, same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         same = same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
@@ -255,14 +255,15 @@ def _has_all_entries(b):
 def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
     """Prepare a run from t to t1 with the choices of the previous run; return 0, REFUSED or IN_DOUBT.
 
-    `checked_kit` has the callbacks that are checked at the start; `is_consistent`: the state satisfies the constraints.
+    `checked_kit` contains the callbacks that the check of the start calls; `is_consistent`: (q, v) is known to satisfy
+    the constraints.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
-    all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
-    flags = _check_start(checked_kit, b, t, q, v, sizes, b.shifts[: 0 if all_entries else len(b.shifts)])
-    if all_entries and not _has_all_entries(b):
+    has_all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
+    flags = _check_start(checked_kit, b, t, q, v, sizes, b.shifts[: 0 if has_all_entries else len(b.shifts)])
+    if has_all_entries and not _has_all_entries(b):
         flags = _check_start(checked_kit, b, t, q, v, sizes, b.shifts)
     if flags & IN_ORDER == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
@@ -309,14 +310,14 @@ def _restore_start(b):
     _copy(b.saved_integers, b.lasting_integers)
 
 
-# indices in `last_start`. N_EQUAL: number of successive runs from this start, at most IS_SAVED. START: [t, t1, q, v]
+# indices in `last_start`. N_EQUAL: number of successive runs from this start, at most 2. START: index of [t, t1, q, v]
 N_EQUAL, START = 0, 1
-NEVER, IS_SAVED = 0.0, 2.0
+NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started; the data of the started run are saved
 
 
 @exact
 def _is_last_start(last_start, t, t1, q, v):
-    """Return whether the start (t, t1, q, v) equals that in `last_start` bit for bit, and store it in `last_start`."""
+    """Return whether the start (t, t1, q, v) equals that in `last_start` bit for bit; store it in `last_start`."""
     n, same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -326,11 +327,11 @@ def _is_last_start(last_start, t, t1, q, v):
     return same
 
 
-# indices in the report. N_STATES: number of states, including the first. NOTHING_TO_CHECK: 1 if nothing in the run
-# needs a check. JUMPED: 1 if velocities changed suddenly in the last step. IN_CHECKED_REGION: 1 if all states are in
-# the region in which callbacks were compared with their traces. DEFECT_KNOWN: 1 if the defect was evaluated in every
-# step. DEFECT: the largest defect. LONGEST_GAP: longest time between two evaluations, s. END_CODE: code that `advance`
-# returned. IS_NEW: 1 if the start differs from the previous one. From N_REPORT on: the counters
+# indices in the report. N_STATES: number of states, including the first. N_STEPS: number of steps. NOTHING_TO_CHECK: 1
+# if Python need not check the run. JUMPED: 1 if velocities changed suddenly in the last step. IN_CHECKED_REGION: 1 if
+# all states are in the region in which callbacks were compared with their traces. DEFECT_KNOWN: 1 if the defect was
+# evaluated in every step. DEFECT: largest defect. LONGEST_GAP: longest time between two evaluations, s. END_CODE: code
+# that `advance` returned. IS_NEW: 1 if the start differs from the previous one. From N_REPORT on: the counters
 N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
 N_HEAD = N_REPORT + N_COUNTERS
@@ -338,7 +339,7 @@ N_HEAD = N_REPORT + N_COUNTERS
 
 @merged
 def _velocities_jumped(b, k, n):
-    """Return whether velocities change from state k - 1 to k by more than the accelerations at both states explain."""
+    """Return whether velocities jump from state k - 1 to state k, see MAX_CHANGE_RATIO; n: number of coordinates."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
         change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
@@ -348,19 +349,19 @@ def _velocities_jumped(b, k, n):
 
 @merged
 def _write_report(w, b, region, n_rows, n_steps, code, is_new):
-    """Store the report, times and steps in b.report; return n_steps if nothing needs a check, else UNUSUAL.
+    """Store the report, times and steps of a run in b.report; return n_steps, or UNUSUAL if Python must read them.
 
-    The run has n_rows states after the first, and n_steps steps; `region` are the bounds for IN_CHECKED_REGION.
+    The run has n_rows states after the first, and n_steps steps; `region` contains the bounds for IN_CHECKED_REGION.
     """
     jumped = n_rows > 0 and _velocities_jumped(b, n_rows, w.Q.size)
-    inside = region.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, region)
+    is_inside = region.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, region)
     near_singular = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
     undersampled = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
     nothing_to_check, width = not (jumped or near_singular or undersampled), b.steps.shape[1]
     begin = b.report.size - N_HEAD - 1 - n_rows - width * n_steps
     report = b.report[begin:]
     report[N_STATES], report[N_STEPS], report[NOTHING_TO_CHECK] = 1 + n_rows, n_steps, nothing_to_check
-    report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = jumped, inside, code, is_new
+    report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = jumped, is_inside, code, is_new
     report[DEFECT_KNOWN] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
     report[DEFECT], report[LONGEST_GAP] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
     for k in range(N_COUNTERS):
@@ -368,30 +369,30 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     _copy(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
     for k in range(n_steps):
         _copy(b.steps[k], report[N_HEAD + 1 + n_rows + k * width : N_HEAD + 1 + n_rows + (k + 1) * width])
-    as_usual = code == at.ALL_OUTPUT_DONE and nothing_to_check and inside and n_rows == n_steps
+    is_usual = code == at.ALL_OUTPUT_DONE and nothing_to_check and is_inside and n_rows == n_steps
     b.filled[0], b.filled[1] = n_rows, n_steps
-    return n_steps if as_usual else UNUSUAL
+    return n_steps if is_usual else UNUSUAL
 
 
 @kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, types.boolean), vectorized=True)
 def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consistent):
     """Start a run from t to t1, and take the first steps; return the number of steps, REFUSED, IN_DOUBT or UNUSUAL.
 
-    If a start is repeated bit for bit, the second run still checks the start, and then saves the data of the started
-    run. From the third run on, these data are restored without a check.
+    If a start is repeated bit for bit, the second run still checks the start, and saves the data of the started run.
+    From the third run on, these data are restored without a check. Arguments: see _start_run and _write_report.
     """
     f.flags[FORM] = int(b.constants[EQUATION_FORM])  # the run before may have changed the form
-    same, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
-    if same and n_equal == IS_SAVED:
+    is_repeated, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
+    if is_repeated and n_equal == IS_SAVED:
         _restore_start(b)
     else:
         b.last_start[N_EQUAL] = NEVER
-        code_of_start = _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent or same)
-        if code_of_start != 0:
-            return code_of_start
-        if same:
+        start_code = _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent or is_repeated)
+        if start_code != 0:
+            return start_code
+        if is_repeated:
             _save_start(b)
-        b.last_start[N_EQUAL] = IS_SAVED if same else 1.0
+        b.last_start[N_EQUAL] = IS_SAVED if is_repeated else 1.0
     for k in range(b.memory.size):
         b.memory[k] = 0.0
     for k in range(b.memory_places.size):
@@ -400,4 +401,4 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consi
     _copy(b.state, b.states[0])
     arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
     code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
-    return _write_report(w, b, region, b.filled[0], b.filled[1], code, not same)
+    return _write_report(w, b, region, b.filled[0], b.filled[1], code, not is_repeated)

@@ -1,7 +1,7 @@
 """Interpolate states within steps by polynomials through neighbouring states, and project the results.
 
 Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. For methods that take long
-steps, `fill` first computes states within an interval, which one polynomial interpolates.
+steps, `fill` first computes states within each interval, through which one polynomial passes.
 """
 
 import numpy as np
@@ -27,45 +27,45 @@ from twoloop.kernels.linalg.dense import copy, largest_of
 TABLE = types.int64[:, ::1]
 CHECKED_AT = (0.3, 0.7)  # times at which polynomials are checked, as fractions of an interval
 N_CHECKED = len(CHECKED_AT)
-EPS = 2.0**-52
+EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # largest ratio of the longest to the shortest of neighbouring steps that count as equally long
-# rounding error of q divided by the size of the interval, in tolerances of v, above which v gets its own polynomial
+# rounding error of q over the duration of the interval, in tolerances of v, above which v gets a polynomial of its own
 MAX_VELOCITY_ROUNDING = 10.0
-# largest pivot of a singular position within an interval, relative to the larger of the pivots at the interval's ends
+# pivot within an interval, relative to the larger one of the pivots at its ends, below which the position is singular
 SINGULAR_RATIO = 0.01
-SINGULAR_PIVOT = 1e-5  # a position with a smaller pivot is singular; for the pivot see least_pivot in partition.py
-# a position with a pivot below WEAK_PIVOT is singular, too, if the polynomials' velocities nearly satisfy the rows:
-# if pivot times change of velocities by the projection, about the violation of the rows, is below RESIDUAL tolerances
+SINGULAR_PIVOT = 1e-5  # pivot below which any position is singular; for pivots see least_pivot in partition.py
+# a position whose pivot is below WEAK_PIVOT is singular, too, if the velocities of the polynomials nearly satisfy the
+# constraints: if their violation, about pivot times change by the projection, is below RESIDUAL tolerances
 RESIDUAL, WEAK_PIVOT = 10.0, 0.05
 
 
 @merged
 def _window(low, high, i, last):
-    """Return the first and last state of the polynomial for the interval from state i: centred, within low and high."""
-    if last > i + 1:  # `fill` has computed interior states of the interval: the polynomial interpolates these alone
+    """Return the first and last state of the polynomial for an interval from state i: centred, in `low` to `high`."""
+    if last > i + 1:  # `fill` has computed interior states of the interval: the polynomial interpolates no others
         return i, last
-    size = min(kinds.WINDOW, high - low + 1)
-    lo = max(low, min(i + 1 - size // 2, high + 1 - size))
-    return lo, lo + size - 1
+    n_states = min(kinds.WINDOW, high - low + 1)
+    lo = max(low, min(i + 1 - n_states // 2, high + 1 - n_states))
+    return lo, lo + n_states - 1
 
 
 @compiled
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
-    """Compute the nodes `z` and coefficients `c` of the Hermite polynomial through rows lo to hi; return their number.
+    """Store nodes in z and coefficients in c of the Hermite polynomial through rows lo to hi; return their number.
 
     The polynomial, in Newton's form, interpolates n columns of `states`, from index `column` on, minus their values in
     row i. Its variable is (time - t[i]) / h. The next n columns are first derivatives, and the n columns after them
-    second derivatives: at each node, `order` of these groups are interpolated.
+    second derivatives: `order` of these three groups of columns are interpolated.
     """
     n = c.shape[1]
-    size = (hi - lo + 1) * order
-    for r in range(size):
+    n_coefficients = (hi - lo + 1) * order
+    for r in range(n_coefficients):
         row = lo + r // order
         z[r] = (t[row] - t[i]) / h
         for m in range(n):
             c[r, m] = states[row, column + m] - states[i, column + m]
-    for j in range(1, size):
-        for r in range(size - 1, j - 1, -1):
+    for j in range(1, n_coefficients):
+        for r in range(n_coefficients - 1, j - 1, -1):
             row, gap = lo + r // order, z[r] - z[r - j]
             if (r - j) // order == r // order:
                 scale = h if j == 1 else 0.5 * h * h
@@ -74,7 +74,7 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
             else:
                 for m in range(n):
                     c[r, m] = (c[r, m] - c[r - 1, m]) / gap
-    return size
+    return n_coefficients
 
 
 @merged
@@ -101,7 +101,7 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
 
 @merged
 def _kind_by_length(kind, tolerances, h, states, i):
-    """Return `kind`, or APART if the interval is so short that rounding of q would spoil velocities."""
+    """Return `kind`, or APART if the interval (duration h) is so short that rounding of q would spoil velocities."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
@@ -123,10 +123,10 @@ def _change(tolerances, v_before, v):
 
 @compiled
 def _is_singular(f, w, t, states, i, last, time, q, change):
-    """Return whether q at `time`, within an interval, is so near a singular position that rounding explains `change`.
+    """Return whether q at `time` is so near a singular position that rounding errors explain `change`.
 
-    `change` is the change of velocities by the projection, in tolerances. Rounding explains it if the smallest pivot at
-    q is very small, in itself or relative to those at the ends of the interval, or if velocities nearly fit the rows.
+    `change` is the change of velocities by the projection, in tolerances. The test of the pivot at q is described at
+    SINGULAR_RATIO and WEAK_PIVOT; i and `last` are the states at the ends of the interval.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):
@@ -141,15 +141,15 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
 def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z, coefficients, out):
     """Store [q, v] at times[p] in row p of `out`; return the number of failed projections.
 
-    A projection fails if dependent coordinates cannot be determined, or if rounding determines the projected velocities
-    near a singular position: row p then has the values of the polynomials. `groups` is the table of intervals described
-    in data/indices.py; `z` (nodes) and `coefficients` are scratch; `tolerance` is that of the projection.
+    A projection fails if dependent coordinates cannot be determined, or if rounding errors determine the projected
+    velocities near a singular position. Row p then gets the values of the polynomials. `groups` is the table of
+    intervals described in data/indices.py; `z` and `coefficients` are scratch; `tolerance` is that of the projection.
     """
     n = w.Q.size
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], coefficients[:half], coefficients[half:]
     q_0, v_0 = coefficients[2 * half - 2], coefficients[2 * half - 1]  # the last two rows, which c_v does not use
-    reduced = f.flags[FORM] == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
+    has_D = f.flags[FORM] == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
     failures = 0
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
@@ -177,9 +177,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
             if code == DONE:
                 code = restore(f, w, times[p], q, v, tolerance)
             has_partition = (
-                code == DONE
-                and not (reduced and partition_is_poor(w))
-                and _change(tolerances, v_0, v) <= REPORTED_ERROR
+                code == DONE and not (has_D and partition_is_poor(w)) and _change(tolerances, v_0, v) <= REPORTED_ERROR
             )
             if not has_partition:
                 copy(q_0, q)
@@ -199,7 +197,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest difference, in tolerances, of q and q_other times scale_q, and v and v_other times scale_v."""
+    """Return the largest of scale_q |q - q_other| and scale_v |v - v_other| in units of the tolerances at state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -211,7 +209,7 @@ def _difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other)
 
 @merged
 def _accelerations_of_polynomials(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """Store in `a` the accelerations of the polynomials at t[i] + s h; for the arguments see `_interpolate`."""
+    """Store the accelerations of the polynomials at t[i] + s h in a (n_q); arguments: see `_interpolate`."""
     for m in range(a.size):
         value, slope, bend = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
@@ -230,7 +228,7 @@ def _accelerations_of_polynomials(kind, h, s, z, c, size, z_v, c_v, size_v, a):
 
 @merged
 def _has_similar_gaps(t, lo, hi):
-    """Return whether the steps between the times t[lo] to t[hi] are about equally long, see MAX_GAP_RATIO."""
+    """Return whether the steps between t[lo] and t[hi] are about equally long, see MAX_GAP_RATIO."""
     shortest, longest = np.inf, 0.0
     for r in range(lo, hi):
         shortest, longest = min(shortest, t[r + 1] - t[r]), max(longest, t[r + 1] - t[r])
@@ -241,12 +239,13 @@ def _has_similar_gaps(t, lo, hi):
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
     """Store in out[g] the estimated error of the polynomials of interval g of `groups`, relative to the tolerances.
 
-    The estimate is 0 for polynomials that do not interpolate accelerations (of kind APART or VELOCITIES) if there are
-    more than two nodes, at about equal distances, and no states inside the interval. In all other cases with more than
-    two nodes, the change that the last node makes is computed first. It is the estimate if it is at most 1, or if the
-    kind is VELOCITIES, as accelerations then contain the noise of stiff modes. Without an estimate so far, positions,
-    velocities and accelerations at CHECKED_AT are compared with the constraints and the equations of motion: the error
-    of accelerations, times h over the number of coefficients, counts as an error of velocities.
+    The estimate is made as follows:
+    - 0 if the polynomials do not interpolate accelerations (kinds APART and VELOCITIES), have more than two nodes, at
+      about equal distances, and have no node inside the interval;
+    - else, with more than two nodes, the change by the last node, if it is at most 1 or if the kind is VELOCITIES,
+      because accelerations then contain the noise of stiff modes;
+    - else the difference of positions, velocities and accelerations at CHECKED_AT from the constraints and the
+      equations of motion; that of accelerations, times h over the number of coefficients, counts as one of velocities.
     """
     n = w.Q.size
     half = z.size // 2
@@ -302,7 +301,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def complete(f, w, times, states, out):
-    """Store [a, lam] at consistent states [q, v] in the rows of `out`; return the number of failures (rows of NaN)."""
+    """Store [a, lam] at consistent states [q, v] in the rows of `out`, NaN after failures; return their number."""
     n = w.Q.size
     code = SINGULAR
     failures = 0
@@ -316,7 +315,7 @@ def complete(f, w, times, states, out):
                 code = find_tangents(f, w, times[p], q)
         if code == DONE:
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
-        if code == GAMMA_INACCURATE:  # use the best available Gamma, because no step depends on these accelerations
+        if code == GAMMA_INACCURATE:  # accept any accuracy of Gamma, because no step depends on these accelerations
             required = w.notes[GAMMA_REQUIRED]
             w.notes[GAMMA_REQUIRED] = np.inf
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
@@ -329,18 +328,18 @@ def complete(f, w, times, states, out):
 
 @kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
 def fill(f, w, options, memory, initial_memory, tolerances, state, new_state, t, states, intervals, out_t, out):
-    """Store states within intervals, computed by equal steps of the method; return the number of intervals that failed.
+    """Store states within intervals, computed by equal steps of the method; return the number of failed intervals.
 
-    `intervals` are the indices of the intervals. `out_t` and `out` have the same number of rows for each interval: the
-    first state, the interior states, and the last state. After a failure the first time of the interval becomes NaN.
-    `initial_memory` is the method's memory at a start.
+    `intervals` are the indices of the intervals. For each interval, `out_t` (times) and `out` (states) get equally many
+    rows: the first state, the interior states, and the last state. If an interval fails, its first time becomes NaN.
+    `initial_memory` is the method's memory at the start of a run.
     """
     n = w.Q.size
-    rows = out_t.size // intervals.size
+    n_rows = out_t.size // intervals.size
     failures = 0
     for g in range(intervals.size):
-        i, first = intervals[g], g * rows
-        last = first + rows - 1
+        i, first = intervals[g], g * n_rows
+        last = first + n_rows - 1
         copy(initial_memory, memory)
         state[:] = 0.0
         copy(states[i], state[: 3 * n])
@@ -350,13 +349,13 @@ def fill(f, w, options, memory, initial_memory, tolerances, state, new_state, t,
         code = renew_partition(f, w, t[i], state[:n])
         for r in range(first + 1, last):
             t_before = out_t[r - 1]
-            out_t[r] = t[i] + (t[i + 1] - t[i]) * (r - first) / (rows - 1)
+            out_t[r] = t[i] + (t[i + 1] - t[i]) * (r - first) / (n_rows - 1)
             if code == DONE:
-                size = out_t[r] - t_before
-                code, _, _ = f.attempt(f, w, options, memory, t_before, size, tolerances, state, new_state)
+                h = out_t[r] - t_before
+                code, _, _ = f.attempt(f, w, options, memory, t_before, h, tolerances, state, new_state)
                 if code != DONE and renew_partition(f, w, t_before, state[:n]) == DONE:
                     copy(initial_memory, memory)
-                    code, _, _ = f.attempt(f, w, options, memory, t_before, size, tolerances, state, new_state)
+                    code, _, _ = f.attempt(f, w, options, memory, t_before, h, tolerances, state, new_state)
                 f.settle(f, w, options, memory, tolerances, True)
             copy(new_state, state)
             copy(new_state[: 3 * n], out[r])

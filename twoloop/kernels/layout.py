@@ -1,4 +1,4 @@
-"""Allocate the workspace of a run, and keep unused workspaces for later runs of the same sizes."""
+"""Allocate the workspaces of runs, and keep unused ones for later runs of the same sizes."""
 
 import math
 from collections.abc import Mapping
@@ -14,9 +14,9 @@ from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-# largest number of unused workspaces that are kept for later runs, and largest number of floats in such a workspace
+# MOST_FREE: largest number of unused workspaces that are kept for later runs; LARGEST_FREE: most floats in one of them
 MOST_FREE, LARGEST_FREE = 32, 100_000
-WORD, LINE = 8, 8  # bytes of a number; numbers in a cache line, at the start of which each array begins
+WORD, LINE = 8, 8  # WORD: bytes in a number; LINE: numbers in a cache line, at the start of which each array begins
 
 
 class Static(NamedTuple):
@@ -29,18 +29,19 @@ class Static(NamedTuple):
     dense_jacobian: bool  # whether a callback fills a full matrix with C_q, from which the entries are copied
 
 
-# n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T is used, whether the augmented matrix is used, number of
-# nodes of the traced programs, sizes of the static form (None: another form), length of the array `matrices`
+# arguments of _layout: n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T is used, whether the augmented
+# matrix is used, number of nodes of the traced programs, sizes of the static form (None: another form), length of
+# `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
 
 class Layout(NamedTuple):
-    """Offsets of the arrays of a workspace: one block of memory contains all numbers, another one all integers.
+    """Offsets of the arrays of a workspace: one block of memory contains all floats, another one all integers.
 
-    A workspace's table of addresses and shapes is `table`, plus `of_numbers` times the address of the numbers, plus
-    `of_integers` times the address of the integers. The first `n_lasting` numbers and `n_lasting_integers` integers
-    keep data from one step to the next; a step fills all others before it reads them.
+    The table of addresses and shapes that a workspace contains is the sum of `table`, `of_numbers` times the address of
+    the floats, and `of_integers` times the address of the integers. The first `n_lasting` floats and
+    `n_lasting_integers` integers keep data from one step to the next; a step fills all others before it reads them.
     """
 
     numbers: ArrayRanges
@@ -55,13 +56,13 @@ class Layout(NamedTuple):
 
 
 def empty(sizes: Sizes) -> Work:
-    """Return a workspace in its initial state: an unused one of these sizes, reset, or else a newly allocated one."""
+    """Return a workspace of `sizes` in its initial state: an unused one, reset, or else a newly allocated one."""
     unused = _take_unused(sizes)
     return _allocate(sizes) if unused is None else cleared(unused)
 
 
 def copy_of(work: Work) -> Work:
-    """Return a copy of a workspace."""
+    """Return a copy of a workspace, of those data that are kept from one step to the next."""
     sizes = work.sizes
     copied = _take_unused(sizes) or _allocate(sizes)
     for target, source in zip(lasting(copied), lasting(work), strict=True):
@@ -71,7 +72,7 @@ def copy_of(work: Work) -> Work:
 
 
 def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return two views of a workspace: the numbers, and the integers, that keep data from one step to the next."""
+    """Return views of the floats and of the integers of a workspace that keep data from one step to the next."""
     layout = _layout(*work.sizes)
     return work.notes.base[: layout.n_lasting], work.counters.base[: layout.n_lasting_integers]
 
@@ -80,7 +81,7 @@ def _take_unused(sizes: Sizes) -> Work | None:
     free = _free.get(sizes)
     try:
         return free.pop() if free else None
-    except IndexError:  # another thread took it
+    except IndexError:  # another thread has taken the last one
         return None
 
 
@@ -95,38 +96,38 @@ def _allocate(sizes: Sizes) -> Work:
 
 
 def give_back(work: Work) -> None:
-    """Store an unused workspace for a later run of the same sizes, unless it is large; drop the oldest if too many."""
+    """Keep an unused workspace for later runs of the same sizes, unless it is large; drop old ones beyond MOST_FREE."""
     free = _free.pop(work.sizes, [])
     if work.notes.base.size <= LARGEST_FREE and len(free) < MOST_FREE:
         free.append(work)
-    _free[work.sizes] = free  # re-insert last: the dictionary begins with the sizes that have not been used for longest
+    _free[work.sizes] = free  # insert at the end, so that the dictionary begins with the sizes used longest ago
     for oldest in list(_free)[:-1]:
         if sum(map(len, list(_free.values()))) <= MOST_FREE:
             break
         _free.pop(oldest, None)
 
 
-_free: dict[Sizes, list[Work]] = {}  # unused workspaces of each combination of sizes
+_free: dict[Sizes, list[Work]] = {}  # unused workspaces, in a list for each combination of sizes
 
 
 def cleared(work: Work) -> Work:
     """Reset a workspace in place to its state after allocation, and return it."""
-    for each in lasting(work):
-        each[:] = 0
+    for view in lasting(work):
+        view[:] = 0
     work.G_of_S[:] = np.nan
     return work
 
 
 @cache
 def cached_run() -> Any:
-    """Import the module `cached_run` at the first call, which compiles it or reads it from the disk; return it."""
+    """Return the module `cached_run`; the first call imports it, and compiles it or reads it from the disk."""
     from twoloop.kernels import cached_run
 
     return cached_run
 
 
 def _static_shapes(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return the shapes of the arrays of numbers, and of integers, that differ in the static form.
+    """Return the shapes, by name, of the arrays of floats and of integers that differ in the static form.
 
     The static form has no partition: all coordinates count as independent, and also as dependent, because all predicted
     positions are compared with the positions on the constraints.
@@ -230,7 +231,7 @@ def _layout(
         integers |= static_shapes[1]
         rows_of_G, side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
         n_entries = rows_of_G * n_q
-    # names of the arrays of positions that also serve velocities, because there are no rows of A
+    # names of the arrays for positions that velocities use, too, if there are no non-holonomic constraints
     of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
     for name in of_positions:
         del integers[f"{name}_v"]
@@ -240,7 +241,7 @@ def _layout(
     of_integers, n_integers = _array_ranges(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
-    # number of integers at the end of `index` that are used only while an order of elimination is chosen
+    # number of integers at the end of `index` that are used only while the order of elimination is chosen
     n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
     n_lasting = of_numbers["matrices"][0], of_integers["index"][1] - n_ordering
     if n_a == 0:
@@ -260,7 +261,10 @@ def _layout(
 
 
 def _array_ranges(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Return (first offset, end, shape) of each array, at the start of a cache line, and the length of the memory."""
+    """Return (first offset, end, shape) of each array by name, and the length of the memory that contains all arrays.
+
+    Each array begins at the start of a cache line.
+    """
     ranges, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
