@@ -133,7 +133,7 @@ def _run_accelerations(
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
-    """Return the name of the function for a program of `equations.accelerations`; write it if the module has none."""
+    """Return the name of the function for program `index` of `equations.accelerations`; write it if it is missing."""
     program, mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
@@ -160,7 +160,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return the pointers to the coefficients: one; in SIMD lanes two, to the varying and to the shared ones."""
+    """Return the pointer to the array of coefficients; in SIMD lanes, to the arrays of varying and of shared ones."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -221,7 +221,7 @@ class SplitFunctions:
             yield program.sizes, list(numbers.structure(program))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
-        """Write the functions that kernels call; return their names. `kinds` returns the types of a function."""
+        """Write the functions that kernels call; return their names. `kinds`: LLVM types of a function, by its name."""
         functions: dict[str, Callable[..., Any]]
         functions = {"own_correct_positions": self.project_position, "own_project": self.project}
         if self.equations.reduced is None:
@@ -233,7 +233,7 @@ class SplitFunctions:
     # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls of parts, pairs (name, arguments); write missing parts; return whether all results are valid."""
+        """Write `calls` (name, arguments) of parts, and missing parts; return a flag: whether all results are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -257,7 +257,7 @@ class SplitFunctions:
         return lowering
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that stores the values of `solution.stored` in argument 4; return whether they are valid."""
+        """Write the part that stores the quantities `solution.stored` in arguments[4]; return whether all are valid."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         places = {i: (stored, place) for i, place in solution.stored.items()}
@@ -268,10 +268,7 @@ class SplitFunctions:
         return lowering.holds(solution.kept, [])
 
     def _part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that stores the arrays of a program; return whether they are valid.
-
-        `stored`: places, in the array that is argument 4, of the quantities that are loaded instead of computed.
-        """
+        """Write the part that computes a program with the quantities `stored`; return whether its arrays are valid."""
         places = {i: (arguments[4], place) for i, place in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)
@@ -293,10 +290,7 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Write code that stores q after a Newton step onto the constraints in `out`, and the change of q in `moved`.
-
-        Returns whether these results are valid.
-        """
+        """Write code that stores q after a Newton step in `out`, its change in `moved`; return whether it is valid."""
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         _write_zeros(emit, self.n, r)
@@ -429,7 +423,7 @@ class SharedCode:
         self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, passes=False)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
-        """Return the GeneratedCode with coefficients for the parameters of one of the systems."""
+        """Return the GeneratedCode of one system, with coefficients for its parameters."""
         return GeneratedCode(
             self, evaluate(self.numbers.formulas), self.equations.traced.of(system, evaluate), evaluate
         )

@@ -91,7 +91,7 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return the derivatives by kind of missing callback ("gamma": both kinds), as expressions by flat array index."""
+    """Return missing C_q and Gamma by kind of callback ("gamma": both kinds), as expressions by flat array index."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -164,7 +164,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with t and q of `states`, and random nonzero v that are about as large as those given."""
+    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v that are about as large as theirs."""
     times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

@@ -51,12 +51,12 @@ RELATIVE_BOUND = 0.01  # smallest allowed pivot of a row of G in a run, relative
 # possible values of `PivotChoice.least`, the smallest allowed pivot of a row of G, relative to its pivot without the
 # other rows; with pivots below the last value, rounding errors would dominate
 LEAST = 10.0 ** np.arange(-2, -9, -1)
-# smallest pivots at the start: LEAST[i] is chosen for pivots from BOUNDS[i] to BOUNDS[i - 1], and its last value below
+# limits of the smallest pivot at the start: LEAST[i] is chosen from BOUNDS[i] on, and LEAST[-1] below BOUNDS[-1]
 BOUNDS = LEAST[:-1] / RELATIVE_BOUND
 N_FEW = 24  # largest number of coordinates for which FEW_FROM applies
-# lowest indices in LEAST of a choice with pivots so small that all rows of G may be added to M. FEW_FROM: for up to
-# N_FEW coordinates (pivots below 1e-3). FEW_SINGULAR_FROM: replaces FEW_FROM if M is singular, as Euler parameters lose
-# two digits in sound models. MANY_FROM: for more than N_FEW coordinates, as added rows make their code much longer.
+# indices in LEAST from which on pivots are so small that all rows of G may be added to M. FEW_FROM: for up to N_FEW
+# coordinates (pivots below 1e-3). FEW_SINGULAR_FROM: replaces FEW_FROM if M is singular, as Euler parameters lose two
+# digits in sound models. MANY_FROM: for more than N_FEW coordinates, as added rows make their code much longer.
 FEW_FROM, FEW_SINGULAR_FROM, MANY_FROM = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
 MIN_GAIN = 2  # smallest decrease of the index in LEAST for which rows are added; else pivots are small with any M
@@ -175,17 +175,11 @@ class PivotChooser:
 
         n_rows = system.n_c + system.n_a
         self.system, self._choose = system, entry_point(choose_rows)
-        self._room, self._chosen = (
-            np.zeros(workspace_size(n_rows, system.n_q)),
-            np.zeros(2 + 3 * n_rows, dtype=np.int64),
-        )
+        self._room, self._chosen = np.zeros(workspace_size(n_rows, system.n_q)), np.zeros(2 + 3 * n_rows, np.int64)
         self._key, self._last = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
 
     def choice(self, mass: Array, G: Array) -> PivotChoice:
-        """Return the PivotChoice, without its blocks, for values of M (n_q, n_q) and G (n_c + n_a, n_q).
-
-        Raises Untraceable as `PivotChoice.at`.
-        """
+        """Return the PivotChoice without blocks for M (n_q, n_q) and G (n_c + n_a, n_q); raise as `PivotChoice.at`."""
         system, scratch, chosen = self.system, self._room, self._chosen
         is_definite = system.constant_mass and system.derived.get("no weak mass", False)
         scratch[0] = 0.0
@@ -350,7 +344,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> list[Affine]:
-        """Solve M a + G^T lam = r, G a = c for a and lam of the independent rows; `c`: one entry for each row of G."""
+        """Return a and lam of the independent rows for M a + G^T lam = r, G a = c; `c`: one entry for each row of G."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -428,14 +422,14 @@ class Elimination:
 
     @cached_property
     def position_projection(self) -> Program:
-        """Return the program for "q", the position after one Newton step towards the constraints, and its change."""
+        """Return the program for "q", the position after a Newton step towards the constraints, and "moved"."""
         moved = self._correction(self.position_errors)
         position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
         return Program(self.graph, position, self.conditions)
 
     @cached_property
     def projection(self) -> Program:
-        """Return the program for projected q and v, and for a and the multipliers of least norm at this velocity."""
+        """Return the program for projected q and v, and a and the multipliers of least norm at this v."""
         arrays = self.basic_projection.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
         lam = multipliers_of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
@@ -444,7 +438,7 @@ class Elimination:
 
     @cached_property
     def basic_projection(self) -> Program:
-        """Return the program for projected q and v, and for a and multipliers, which are 0 for dependent rows."""
+        """Return the program for projected q and v, and a and multipliers at this v, which are 0 for dependent rows."""
         n, position = self.system.n_q, self.position_projection.arrays
         v = [(u + change).value() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
         solution = self._accelerations(v)

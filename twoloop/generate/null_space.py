@@ -57,12 +57,12 @@ class Factors:
         self.blocks: list[Block] = []
         self.conditions: list[tuple[Affine, Affine]] = []
         self.positive: list[Affine] = []
-        alone: dict[int, Any] = {}
+        pivots_alone: dict[int, Any] = {}
         pairs = _pairs_without_conditions(rows, n)
         for places in [*pairs, *_order_rows(rows, n, pairs)]:
             zero = Affine(rows[places[0]][places[0]].graph, 0.0, {})
             pivots = [[rows[i].pop(j, zero).value() for j in places] for i in places]
-            inverse = self._inverse(pivots, [alone.get(i) for i in places])
+            inverse = self._inverse(pivots, [pivots_alone.get(i) for i in places])
             neighbours = dict.fromkeys(j for i in places for j in rows[i])
             entries = [(j, [rows[i].get(j, zero).value() for i in places]) for j in neighbours]
             below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
@@ -70,7 +70,7 @@ class Factors:
                 for k, values in entries[first:]:
                     change = _dot(multiples, values)
                     if j == k >= n > places[0]:
-                        alone[j] = alone.get(j, 0.0) - change
+                        pivots_alone[j] = pivots_alone.get(j, 0.0) - change
                     rows[j][k] = rows[k][j] = rows[j][k] - change if k in rows[j] else -change
                 for i in places:
                     rows[j].pop(i, None)
@@ -136,9 +136,9 @@ def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
             total = total + factor_b.times(factor_a.constant)
             continue
         scale, factor = factor_a.normalised()
-        before = groups.get(factor.key)
+        previous = groups.get(factor.key)
         factor_b = factor_b.times(scale)
-        groups[factor.key] = (factor, factor_b if before is None else before[1] + factor_b)
+        groups[factor.key] = (factor, factor_b if previous is None else previous[1] + factor_b)
     for factor, factor_b in groups.values():
         total = total + factor * factor_b.value()
     return total
@@ -176,20 +176,20 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
         i = min((j for j in remaining if not waiting_for[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
         ready = [j for j in neighbours[i] if not waiting_for[j] and (j < n) == (i < n)]
         same_neighbours = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
-        places = (i, *sorted(same_neighbours)[:1])
-        order.append(places)
-        remaining -= set(places)
-        for j in _eliminate(neighbours, places):
-            waiting_for[j] -= set(places)
+        block = (i, *sorted(same_neighbours)[:1])
+        order.append(block)
+        remaining -= set(block)
+        for j in _eliminate(neighbours, block):
+            waiting_for[j] -= set(block)
             depth[j] = max(depth[j], depth[i] + 1)
     return order
 
 
-def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
-    """Eliminate rows from the elimination graph: connect their neighbours to each other, and return these."""
-    new_neighbours = set().union(*(neighbours[i] for i in places)) - set(places)
+def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
+    """Eliminate rows from the graph of nonzero entries: connect their neighbours, and return these neighbours."""
+    new_neighbours = set().union(*(neighbours[i] for i in rows)) - set(rows)
     for j in new_neighbours:
-        neighbours[j] = (neighbours[j] | new_neighbours) - {*places, j}
+        neighbours[j] = (neighbours[j] | new_neighbours) - {*rows, j}
     return new_neighbours
 
 
@@ -241,8 +241,8 @@ class DependentCoordinates:
         self._graph, self._most = graph, len(graph.operations) + max_added
         self._zero, self._one = Affine(graph, 0.0, {}), Affine(graph, 1.0, {})
         self._rows: list[Terms] = [
-            {j: entry for j, entry in enumerate([*row, right]) if not is_zero(entry)}
-            for row, right in zip(rows, gamma, strict=True)
+            {j: entry for j, entry in enumerate([*row, rhs]) if not is_zero(entry)}
+            for row, rhs in zip(rows, gamma, strict=True)
         ]
         self._columns = list(zip(*rows, strict=True))
         self._left, self._free = set(range(len(rows))), set(range(self._n))
@@ -353,21 +353,21 @@ def reduced_accelerations(
             inertia = _add_products(zero, ((T[i][y], mass_T[i]) for i in range(n) if y in T[i])).value()
             if a == b or not is_zero(inertia):
                 matrix[a, b] = matrix[b, a] = inertia
-    right = [_add_products(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).value() for x in independent]
+    rhs = [_add_products(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).value() for x in independent]
     factors = Factors(matrix, len(independent), len(independent))
-    solution = dict(zip(independent, factors.solve(right), strict=True))
+    solution = dict(zip(independent, factors.solve(rhs), strict=True))
     accelerations = [g[i] + _add_products(zero, ((entry, solution[x]) for x, entry in T[i].items())) for i in range(n)]
     return accelerations, list(_pivot_conditions(matrix, factors))
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield pairs of a pivot of the reduced mass matrix `matrix` and its lower bound, relative to a diagonal entry."""
+    """Yield pairs of a pivot of the reduced mass matrix and its lower bound, a fraction of a diagonal entry."""
     pivots = iter(factors.positive)
     for places, _, _ in factors.blocks:
         first_pivot: Affine | None = None
-        for place in places:
+        for i in places:
             pivot = next(pivots)
-            scale = matrix[place, place] if first_pivot is None else first_pivot * matrix[place, place]
+            scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:
                 yield pivot, scale.times(0.0 if pivot.key == scale.key else MIN_PIVOT_SQUARE)
@@ -420,7 +420,7 @@ def solve_refined(
     r: Sequence[Affine],
     c: Sequence[Affine],
 ) -> list[Affine]:
-    """Solve M a + G^T lam = r, G a = c for a and lam of the independent rows, with refinement if `choice.refined`.
+    """Return a and lam of the independent rows for M a + G^T lam = r, G a = c, with refinement if `choice.refined`.
 
     `solve`: solution of a linear system with the factors of [M + s g^T g, G^T; G 0], where rows g are added to M as in
     PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.

@@ -116,8 +116,8 @@ class ParameterTape(Symbolic):
         """Return a number as a sum of terms: a dict from the Powers of each term to its coefficient."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
-        (place, exponent), *further = number.powers
-        definition = self.atoms[place]
+        (i, exponent), *further = number.powers
+        definition = self.atoms[i]
         if further or exponent != 1.0 or definition is None or definition[0] != "sum":
             return {number.powers: number.scale}
         return {powers: number.scale * c for powers, c in definition[1]}
@@ -137,23 +137,23 @@ class ParameterTape(Symbolic):
 
         def product(powers: Powers) -> Any:
             if powers not in products:
-                *before, (place, exponent) = powers
-                if before:
-                    products[powers] = product(tuple(before)) * product(powers[-1:])
+                *first_powers, (index, exponent) = powers
+                if first_powers:
+                    products[powers] = product(tuple(first_powers)) * product(powers[-1:])
                 else:
-                    products[powers] = atom(place) if exponent == 1.0 else atom(place) ** exponent
+                    products[powers] = atom(index) if exponent == 1.0 else atom(index) ** exponent
             return products[powers]
 
-        def atom(place: int) -> Any:
-            if place not in atoms:
-                definition = self.atoms[place]
+        def atom(index: int) -> Any:
+            if index not in atoms:
+                definition = self.atoms[index]
                 if definition is None:
-                    atoms[place] = parameters.T[place]
+                    atoms[index] = parameters.T[index]
                 elif definition[0] == "sum":
-                    atoms[place] = sum(c * product(powers) for powers, c in definition[1])
+                    atoms[index] = sum(c * product(powers) for powers, c in definition[1])
                 else:
-                    atoms[place] = FUNCTIONS[definition[0]](*(c * product(powers) for powers, c in definition[1]))
-            return atoms[place]
+                    atoms[index] = FUNCTIONS[definition[0]](*(c * product(powers) for powers, c in definition[1]))
+            return atoms[index]
 
         return product
 
@@ -199,7 +199,7 @@ class Parameter(float):
             self.tape.refuse(reason)
 
     def to(self, exponent: float) -> "Parameter":
-        """Return this number raised to a nonzero whole number."""
+        """Return this number to the power `exponent`, a nonzero whole number."""
         powers = tuple([(place, exponent * power) for place, power in self.powers])
         return Parameter(_as_float(self) ** exponent, self.tape, self.scale**exponent, powers)
 
@@ -295,7 +295,7 @@ def apply_function(name: str, *arguments: Any) -> Any:
 
 def _record_function(name: str, *numbers: float) -> Parameter:
     tape = _tape_of(*numbers)
-    arguments = tuple((each.powers, each.scale) if isinstance(each, Parameter) else ((), each) for each in numbers)
+    arguments = tuple((x.powers, x.scale) if isinstance(x, Parameter) else ((), x) for x in numbers)
     with np.errstate(all="ignore"):  # a generic value may be outside the domain of the function
         value = float(FUNCTIONS[name](*map(float, numbers)))
     return Parameter(value, tape, 1.0, tape.atom((name, arguments)))
@@ -350,7 +350,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _operand(value: Any) -> Any:
-    """Return an array, a number or a symbol as an array of objects; not by isinstance(), which symbols refuse."""
+    """Return a value as an array of objects; its type is tested by type(), because symbols refuse isinstance()."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)
@@ -370,6 +370,6 @@ def number(value: Any) -> float:
 
 
 def function_of_number(name: str) -> Callable[[float], float]:
-    """Return the function with a name in `math`, extended to Parameters, for which it returns a Parameter."""
+    """Return a function of `math` by its name; for a Parameter, the function returns a Parameter."""
     function = getattr(math, name)
     return lambda x: apply_function(name, x) if type(x) is Parameter else function(x)

@@ -241,7 +241,7 @@ ROUNDING = 8.0 * 2.0**-52  # largest difference from 1 or -1 at which a coeffici
 
 
 class Coefficient(float):
-    """Coefficient that generated code reads from an array, at index `place`; it equals only itself, not its value.
+    """Coefficient that generated code reads from an array, at index `place`; compared by identity, not by value.
 
     `varies`: whether the array is the one of the coefficients that vary with parameters.
     """

@@ -181,7 +181,7 @@ def series_program(
 
 
 def _sums_of(graph: Graph) -> dict[int, Affine]:
-    """Return the expressions of quantities that are sums, by quantity; they replace it, as sums need no recurrence."""
+    """Return the expressions that replace quantities that are sums, by quantity: sums need no recurrence."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -245,8 +245,8 @@ def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float,
 
 
 def _collect(groups: dict[Any, tuple[Affine, Affine]], factor: Affine, multiplier: Affine) -> None:
-    before = groups.get(factor.key)
-    groups[factor.key] = (factor, multiplier if before is None else before[1] + multiplier)
+    previous = groups.get(factor.key)
+    groups[factor.key] = (factor, multiplier if previous is None else previous[1] + multiplier)
 
 
 def _assemble(
@@ -297,7 +297,7 @@ def _assemble(
 
 
 def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
-    """Return the operations that `forms` need, as (quantity, operation); a sine needs the cosine and vice versa."""
+    """Return the operations that `forms` need, as (quantity, operation), each sine with the cosine of its angle."""
     needed = set(graph.needed_by(forms))
     trigonometric = (SINE, COSINE)
     angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trigonometric}
@@ -312,8 +312,8 @@ def _nonzero_sums(forms: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Int
     """Return the nonzero ones of `forms` as Sums, and their indices in `forms`; `nodes`: node of each quantity."""
     indices = [k for k, form in enumerate(forms) if form.terms or form.constant]
     sums = _sums([forms[k] for k in indices], nodes)
-    places = np.array(indices, dtype=np.int64)
-    return sums._replace(row=places[sums.row]), places
+    index_array = np.array(indices, dtype=np.int64)
+    return sums._replace(row=index_array[sums.row]), index_array
 
 
 def _without(form: Affine, inputs: Container[int]) -> Affine:
@@ -327,8 +327,8 @@ def _groups(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     level: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}
     for node, kind, first, second in operations:  # arguments come before the operations that use them
-        used = [i for form in (first, second) if form is not None for i in form.terms if i in nodes]
-        level[node] = 1 + max((level[i] for i in used), default=0)
+        arguments = [i for form in (first, second) if form is not None for i in form.terms if i in nodes]
+        level[node] = 1 + max((level[i] for i in arguments), default=0)
         if second is None:
             second = Affine(first.graph, 0.0, {})
         groups.setdefault((level[node], kind), []).append((node, first, second))

@@ -103,9 +103,7 @@ def _analyse(system: ConstrainedSystem) -> Any:
 
         graph = equations.graph
         by_state = needed(BY_STATE)
-        short = ShortForces(
-            _has_pulses_in_time(graph, needed(BY_TIME)), _has_pulses_in_state(graph, by_state, system.n_q)
-        )
+        short = ShortForces(_has_time_pulses(graph, needed(BY_TIME)), _has_state_pulses(graph, by_state, system.n_q))
         steep = _is_steep(graph, sorted({*by_state, *needed(BY_TIME)}))
         return Dependence(short, steep, frozenset(graph.traced))
 
@@ -185,14 +183,14 @@ class Rates(Degrees):
         )
 
 
-def _has_pulses_in_time(graph: Graph, needed: list[int]) -> bool:
+def _has_time_pulses(graph: Graph, needed: list[int]) -> bool:
     dependent = [i for i in needed if graph.inputs_of[i] & TIME]
     degrees = Degrees([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
     degrees.run(graph, dependent)
     return any(graph.kind(i) not in SMOOTH or degrees.values[i] > MAX_DEGREE for i in dependent)
 
 
-def _has_pulses_in_state(graph: Graph, needed: list[int], n_q: int) -> bool:
+def _has_state_pulses(graph: Graph, needed: list[int], n_q: int) -> bool:
     dependent = [i for i in needed if graph.inputs_of[i] & ~TIME]
     inputs = range(1, 2 * n_q + 1)
     degrees, vibrations, growth = Degrees(inputs), Vibrations(), Growth(inputs)

@@ -332,7 +332,7 @@ class Equations:
         return self._forms[kind].copy()
 
     def derived(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return C_q, C_t or gamma by differentiation, as an array of expressions, whether it has a callback or not."""
+        """Return C_q, C_t or gamma by differentiation, as an array of expressions, even if it has a callback."""
         if kind == "jacobian":
             return self._jacobian()
         return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
@@ -380,10 +380,8 @@ class Equations:
 
     def _rate(self) -> Any:
         """Return C_t (n_c,), the derivatives of C with respect to t."""
-        constraint, by_t = (
-            self.of("constraint"),
-            Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {})}),
-        )
+        constraint, unit = self.of("constraint"), Affine(self.graph, 1.0, {})
+        by_t = Derivative(self.graph, {only_quantity(self.t): unit})
         return symbols(by_t.of(form) for form in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
@@ -417,8 +415,8 @@ def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bo
 
 def only_quantity(form: Affine) -> int:
     """Return the index of the quantity in an expression with a single term."""
-    (place,) = form.terms
-    return place
+    (quantity,) = form.terms
+    return quantity
 
 
 Array = NDArray[np.float64]
@@ -461,10 +459,10 @@ class TraceCache:
         self._first = first[self._classes[first] != 0]  # index of the first parameter of each class
         self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
-        for place in np.flatnonzero(self._classes).tolist():
-            signed = int(self._classes[place])
-            parameter = self._tape.parameters[abs(signed) - 1]
-            self.parameters[place] = parameter if signed > 0 else -parameter
+        for i in np.flatnonzero(self._classes).tolist():
+            signed_class = int(self._classes[i])
+            parameter = self._tape.parameters[abs(signed_class) - 1]
+            self.parameters[i] = parameter if signed_class > 0 else -parameter
         self.traced: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
@@ -488,7 +486,7 @@ class TraceCache:
         return self._tape.products(self.numbers(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions, to be left unchanged, for `parameters` (n_p,)."""
+        """Return a function that evaluates arrays of expressions, which must not change, for `parameters` (n_p,)."""
         product = self.products(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -508,7 +506,7 @@ class TraceCache:
         entry = self._arrays.get(id(array))
         if entry is None:
             powers = [each.powers if type(each) is Parameter else () for each in array.ravel()]
-            products = {each: place for place, each in enumerate(dict.fromkeys(powers))}
+            products = {each: k for k, each in enumerate(dict.fromkeys(powers))}
             scales = np.array(
                 [each.scale if type(each) is Parameter else each for each in array.ravel()], dtype=np.float64
             )
@@ -605,11 +603,11 @@ def _classes(parameters: Array) -> NDArray[np.int64]:
     """Return the class of each parameter, see `TraceCache`; classes are numbered in the order of the parameters."""
     magnitudes = np.abs(parameters)
     varies = (magnitudes > EXTREME) & (magnitudes < 1.0 / EXTREME) & (magnitudes != np.floor(magnitudes))
-    _, first, which = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[first.argsort()] = np.arange(1, len(first) + 1)
     classes = np.zeros(len(magnitudes), dtype=np.int64)
-    classes[varies] = np.copysign(rank[which], parameters[varies])
+    classes[varies] = np.copysign(rank[inverse], parameters[varies])
     return classes
 
 
@@ -627,7 +625,7 @@ class ParameterArrays:
         self._gathered: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, expressions: Any) -> Array:
-        """Return the array of numbers, to be filled by `write`, for an array of expressions; one array per object.
+        """Return the array of numbers that `write` fills for an array of expressions: one for each array object.
 
         If the entries are plain numbers, return the given array.
         """
@@ -639,13 +637,13 @@ class ParameterArrays:
 
     def _numbers_for(self, expressions: Any) -> Array:
         entries, begin = expressions.ravel().tolist(), len(self._scales)
-        where = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
-        for k in where:
+        varying = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
+        for k in varying:
             self._scales.append(entries[k].scale)
             self._product_of.append(self._products.setdefault(entries[k].powers, len(self._products)))
             entries[k] = 0.0
         numbers = np.array(entries, dtype=np.float64)
-        self._places.append((numbers, np.array(where, dtype=np.int64), slice(begin, len(self._scales))))
+        self._places.append((numbers, np.array(varying, dtype=np.int64), slice(begin, len(self._scales))))
         self._gathered = list(self._products), np.array(self._scales), np.array(self._product_of, dtype=np.int64)
         return numbers.reshape(expressions.shape)
 
@@ -656,5 +654,5 @@ class ParameterArrays:
         products, scales, product_of = self._gathered
         with np.errstate(all="ignore"):
             values = scales * np.array(list(map(product, products)), dtype=np.float64)[product_of]
-        for numbers, where, part in self._places:
-            numbers[where] = values[part]
+        for numbers, varying, values_slice in self._places:
+            numbers[varying] = values[values_slice]

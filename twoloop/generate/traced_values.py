@@ -37,10 +37,10 @@ MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of entries compared at all states of a run: large systems have fewer
 # largest difference between call and trace that counts as a rounding error, relative to the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-CLEAR_DIFFERENCE = 1e-6  # smallest relative difference that proves a wrong trace without a test of neighbouring states
+CLEAR_DIFFERENCE = 1e-6  # largest relative difference that needs a test at neighbouring states to prove a trace wrong
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
-MARGIN = 0.01  # margin of a CheckedRegion, relative to its sides: small compared with the steps of a run
-MARGIN_AT_REST = 1e-9  # added margin, relative to the longest side except time: sides of coordinates at rest are 0
+MARGIN = 0.01  # margin of a CheckedRegion, relative to its ranges: small compared with the steps of a run
+MARGIN_AT_REST = 1e-9  # margin added for coordinates at rest, whose range is 0, relative to the largest range
 
 
 class Traced:
@@ -59,14 +59,14 @@ class Traced:
         if forms is None:
             forms = {kind: results for kind, results in graph.traced.items() if kind in system.given}
         kinds = [kind for kind in KINDS if kind in forms and forms[kind].size]
-        self.places = [(kind, place) for kind in kinds for place in np.ndindex(forms[kind].shape)]
+        self.places = [(kind, index) for kind in kinds for index in np.ndindex(forms[kind].shape)]
         self.n_entries = np.array([forms[kind].size for kind in kinds], dtype=np.int64)
         self.is_compared = np.array([kind in kinds for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
         self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, compared or not
         self.trusted = False
-        entries = (forms[kind][place] for kind, place in self.places)
+        entries = (forms[kind][index] for kind, index in self.places)
         # the table computes no entries that are always zero
         results = {k: form for k, form in enumerate(entries) if form.terms or form.constant}
         self.nonzero_kinds = frozenset(self.places[k][0] for k in results)
@@ -154,17 +154,17 @@ class Traced:
 
     def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
         """Return whether an entry differs by about the same amount at neighbouring states; rounding errors do not."""
-        parts = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
-        _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * parts))
-        gaps = (called - traced)[:, entry]
-        return bool(np.abs(gaps).min() > 0.5 * np.abs(gaps).max() and np.abs(gaps.sum()) == np.abs(gaps).sum())
+        directions = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
+        _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * directions))
+        errors = (called - traced)[:, entry]
+        return bool(np.abs(errors).min() > 0.5 * np.abs(errors).max() and np.abs(errors.sum()) == np.abs(errors).sum())
 
     def _message(self, state: Array, entry: int, called: float, traced: float) -> str:
-        kind, place = self.places[entry]
-        where = place[0] if len(place) == 1 else tuple(place)
+        kind, index = self.places[entry]
+        shown = index[0] if len(index) == 1 else tuple(index)
         return (
             f"{kind} of {self.name!r} does not give what its operations give, which were recorded once: at t = "
-            f"{state[0]:.10g} entry {where} is {called:.9g}, and by these {traced:.9g}. It depends on more than its "
+            f"{state[0]:.10g} entry {shown} is {called:.9g}, and by these {traced:.9g}. It depends on more than its "
             "arguments (a variable outside that changed after numba compiled it, random numbers, what it keeps from "
             "call to call), or branches unseen"
         )
@@ -181,10 +181,10 @@ class Sample:
         """Add states of a chunk of steps, `rows` [q, v, ...] at times `t`, and its last one, `state` at time `end`."""
         stride = 1 + len(t) // MAX_OF_CHUNK
         times = t[::stride]
-        part = np.empty((len(times) + 1, 1 + self._n))
-        part[0, 0], part[0, 1:] = end, state[: self._n]
-        part[:0:-1, 0], part[:0:-1, 1:] = times, rows[::stride, : self._n]
-        self._parts.insert(0, part)
+        states = np.empty((len(times) + 1, 1 + self._n))
+        states[0, 0], states[0, 1:] = end, state[: self._n]
+        states[:0:-1, 0], states[:0:-1, 1:] = times, rows[::stride, : self._n]
+        self._parts.insert(0, states)
         if len(self._parts) > MAX_STATES:
             self._parts = self._parts[::2]
 
@@ -200,7 +200,7 @@ class Sample:
 
 
 def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-    """Compare traces that are not trusted yet with calls at random states near the start, at times of the run.
+    """Compare traces that are not trusted yet with calls at states near the start, at times spread over the run.
 
     Raises
     ------
@@ -221,19 +221,19 @@ Check = Callable[[Traced], None]  # raises Untraceable if traces are wrong
 
 
 def unchecked(traced: Traced) -> None:
-    """Do nothing, which accepts any traces: a `Check` for results that no run uses."""
+    """Accept any traces: a `Check` for results that no run uses."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
     """Return rows [t, q, v]: the start, and N_NEARBY random states near it, at times spread over the run."""
     scales = sizes(q)
     speed = np.maximum(scales, np.abs(v))
-    n, parts = len(q), _random_directions(len(q))
+    n, directions = len(q), _random_directions(len(q))
     states = np.empty((1 + N_NEARBY, 1 + 2 * n))
     states[0, 0], states[0, 1 : 1 + n], states[0, 1 + n :] = t0, q, v
     states[1:, 0] = t0 + (t1 - t0) * TIMES
-    states[1:, 1 : 1 + n] = q + DISTANCE * scales * parts[0]
-    states[1:, 1 + n :] = speed * parts[1]
+    states[1:, 1 : 1 + n] = q + DISTANCE * scales * directions[0]
+    states[1:, 1 + n :] = speed * directions[1]
     return states
 
 
@@ -276,28 +276,28 @@ class CheckedRegion:
         """Return those of `states` (rows [t, q, v]) that are outside `bounds`; all of them if there are no bounds."""
         if not self._box.size:
             return states
-        least, largest = self.bounds
-        outside = (states < least) | (states > largest)
+        smallest, largest = self.bounds
+        outside = (states < smallest) | (states > largest)
         return states[outside.any(axis=1)] if outside.any() else states[:0]
 
     def contains_parameters(self, parameters: Array) -> bool:
         """Return whether all parameters are within the ranges of parameters or the margin of these."""
         if self._parameters is None:
             return False
-        least, largest = self._parameters
-        margin = MARGIN * (largest - least)
-        return bool((least - margin <= parameters).all() and (parameters <= largest + margin).all())
+        smallest, largest = self._parameters
+        margin = MARGIN * (largest - smallest)
+        return bool((smallest - margin <= parameters).all() and (parameters <= largest + margin).all())
 
     def add_parameters(self, parameters: Array) -> None:
         """Extend the ranges of parameters to those of a run in which calls and traces agreed."""
-        least, largest = self._parameters or (parameters, parameters)
-        self._parameters = np.minimum(least, parameters), np.maximum(largest, parameters)
+        smallest, largest = self._parameters or (parameters, parameters)
+        self._parameters = np.minimum(smallest, parameters), np.maximum(largest, parameters)
 
     def add(self, states: Array) -> None:
         """Extend the ranges of states, and `bounds`, to states at which calls and traces agreed."""
         if len(states) == 0:
             return
         checked = np.concatenate([states, self._box]) if self._box.size else states
-        least, largest = self._box = np.array([checked.min(axis=0), checked.max(axis=0)])
-        margin = MARGIN * (largest - least) + MARGIN_AT_REST * float((largest - least)[1:].max())
-        self.bounds = np.array([least - margin, largest + margin])
+        smallest, largest = self._box = np.array([checked.min(axis=0), checked.max(axis=0)])
+        margin = MARGIN * (largest - smallest) + MARGIN_AT_REST * float((largest - smallest)[1:].max())
+        self.bounds = np.array([smallest - margin, largest + margin])

@@ -53,7 +53,7 @@ class Adams:
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         return "Adams"
 
     def takes_code(self, fixed: bool) -> bool:
@@ -61,7 +61,7 @@ class Adams:
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates.
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control.
 
         Raises
         ------

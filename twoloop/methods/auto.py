@@ -20,7 +20,7 @@ CONSTRAINED = 0.25
 TIGHT_MANY = 1e-10  # tolerance below which Adams replaces DOP853 for MANY coordinates with any number of constraints
 VERY_MANY = 64  # number of coordinates from which on Adams replaces DOP853 in any case, except with sparse matrices
 HUGE = 1000  # number of coordinates above which Newton's method, whose matrices are full, is not tried
-LONG_STEPS = 1e-9  # a series that pays at this tolerance begins runs at looser ones, too, if other steps must be short
+LONG_STEPS = 1e-9  # a series that pays at this tolerance is used at looser ones, too, if other methods need short steps
 SERIES = 1e-6  # tolerance below which a Taylor series may cost less than DOP853
 SOME_OPERATIONS = 12  # largest number of operations per coordinate at which a Taylor series costs less than DOP853
 # replaces SOME_OPERATIONS with fewer than FEW coordinates, and for MANY coordinates at tolerances of at least SERIES
@@ -160,7 +160,7 @@ class Auto:
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         return "auto"
 
     @property
@@ -191,7 +191,7 @@ class Auto:
         """Return whether a step of the series costs less than the steps of the explicit method that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
-        if self.cost_ratio is not None:  # generated code: the series runs only near singular positions, more exactly
+        if self.cost_ratio is not None:  # generated code: a series runs near singular positions, as it is more exact
             return tolerance < (SERIES if n_q < MANY else SERIES_OF_MANY)
         if tolerance < SERIES:
             return operations <= (SOME_OPERATIONS if n_q >= FEW else FEW_OPERATIONS)
@@ -202,7 +202,7 @@ class Auto:
         return not fixed
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         if fixed:
             return self.fixed.plan(n_q, rtol, atol, True)
         fallback = self._without_lanes(n_q, rtol, atol)

@@ -100,8 +100,8 @@ class DOP853:
         loop restores the dependent ones at every stage. With nonholonomic constraints, the state at the end of a step
         is always restored in this way.
     inner_tol : float, optional
-        With "restored", Newton on the positions stops when its largest correction, just made, is at most this (unit of
-        q). None: 1e-8.
+        Tolerance of Newton's method for the positions, unit of q, with "restored": it stops when its last correction is
+        at most this. None: 1e-8.
 
     Raises
     ------
@@ -136,7 +136,7 @@ class DOP853:
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
 
     def takes_code(self, fixed: bool) -> bool:
@@ -144,7 +144,7 @@ class DOP853:
         return self.stages == "free"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         from twoloop.kernels.steps import explicit_step as kernels
 
         s, free = len(B), self.stages == "free"

@@ -79,7 +79,7 @@ class Lobatto16:
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         from twoloop.kernels.steps import lobatto_step as kernels
 
         if self.code is None:

@@ -16,7 +16,7 @@ OUTER_TO_ERROR_TOL = 1e-3
 
 @dataclass(frozen=True)
 class Newmark:
-    """Two-loop procedure with Newmark's method, the outer loop by fixed point on the independent accelerations.
+    """Two-loop procedure with Newmark's method; the outer loop is a fixed-point iteration on independent accelerations.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class Newmark:
         acceleration, so far would change a coordinate by the largest value so far. r is not in the paper; it does not
         become zero, whatever the origin of the coordinates.
     inner_tol : float, optional
-        Newton on the positions stops when its largest correction, just made, is at most this. None: 1e-8.
+        Newton's method for the positions stops when its last correction is at most this (unit of q). None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position would change by more than this, relative to
         max(|value|, 1). None: 1e-3 error_tol or 0.01 min(rtol, atol); with fixed steps 1e-14.
@@ -67,11 +67,11 @@ class Newmark:
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         return f"Newmark(beta={self.beta:g}, gamma={self.gamma:g})"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         from twoloop.kernels.paper import newmark_step as kernels
 
         if not fixed and (abs(self.beta - 1.0 / 6.0) < MIN_DISTANCE or self.gamma != 0.5):
@@ -132,7 +132,7 @@ class BDF:
     max_order : int
         Highest order, 1 to 5.
     inner_tol : float, optional
-        Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
+        Newton's method for the positions stops when its last correction is at most this (unit of q). None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position would change by more than this, relative to
         max(|value|, 1), but not before one correction. None: 0.01 min(rtol, atol); with fixed steps 1e-14.
@@ -174,11 +174,11 @@ class BDF:
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         return f"BDF(max_order={self.max_order})"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         from twoloop.kernels.paper import bdf_step as kernels
 
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol

@@ -30,14 +30,14 @@ class Plan:
     """Method prepared for one run: the compiled step, its parameters, its memory and its step-size control."""
 
     step: Any  # a Step of kernels/data/common.py, or its name
-    options: Array
-    memory: Array
-    exponent: float
+    options: Array  # parameters of the step
+    memory: Array  # data that the step keeps from attempt to attempt
+    exponent: float  # the next step size is this one times safety error**-exponent
     first: Any = None  # the two steps between which `step` switches
     second: Any = None
-    safety: float = 0.9
-    factor_min: float = 0.2
-    factor_max: float = 5.0
+    safety: float = 0.9  # safety factor of the step size
+    factor_min: float = 0.2  # smallest ratio of the next step size to this one
+    factor_max: float = 5.0  # largest ratio of the next step size to this one
     limit_start: float = np.inf  # largest step size, s, unless a step has failed recently
     limit_factor: float = 0.7  # largest step size after a failed step, relative to this step
     limit_memory: int = 10  # number of accepted steps after a failed step for which `limit_factor` applies
@@ -63,7 +63,7 @@ class Plan:
     looks_within: bool = False
     unseen: float = 1.0  # longest part of a step without an evaluation of the equations, relative to the step
     substitute: "Plan | None" = None  # plan that continues the run if values of this one are not finite
-    provisional: bool = False  # whether the substitute also takes over if steps are not longer than it could take
+    provisional: bool = False  # whether the substitute also takes over if this plan's steps are not longer than its own
     traced: tuple[Any, ...] = ()  # traces of the callbacks on which steps rely, see traced_values.py
     # plan of the `parts` of Newton steps, for the solution between their ends; None: these steps are not divided
     within_newton: "Plan | None" = None
@@ -75,7 +75,7 @@ class Plan:
 
     @property
     def substitutes(self) -> list["Plan"]:
-        """Return the substitute, its own substitute, and so on."""
+        """Return the substitute, the substitute of the substitute, and so on."""
         return [] if self.substitute is None else [self.substitute, *self.substitute.substitutes]
 
     def fresh(self) -> "Plan":
@@ -115,11 +115,11 @@ class Method(Protocol):
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         ...
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         ...
 
 

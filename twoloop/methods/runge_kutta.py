@@ -20,8 +20,7 @@ from twoloop.methods.plan import (
 )
 from twoloop.methods.tableaux import Tableau
 
-# outer tolerance of fixed steps by Newton's method; a smaller one may be unreachable, as stiff forces magnify rounding
-NEWTON_TOL_FIXED = 1e-12
+NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps with Newton's method: stiff forces magnify rounding errors
 # h rho from which on fixed-point iteration converges so slowly that Newton's method is tried; rho: largest rate
 LIMIT_OF_FIXED_POINT = 1.5
 # largest condition number of the eigenvectors of A that count as a basis; its inverse: smallest nonzero eigenvalue
@@ -63,7 +62,7 @@ class RungeKutta:
         compared with the polynomial through those of the stages. This finds a jump of the force between an end and its
         nearest stage, which no stage sees.
     inner_tol : float, optional
-        Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
+        Newton's method for the positions stops when its last correction is at most this (unit of q). None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position changes by more than this, relative to
         max(|value|, 1). None: 0.01 min(rtol, atol); with fixed steps 1e-14.
@@ -132,13 +131,13 @@ class RungeKutta:
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         usual = {"partition": "lasting", "tested": "all", "outer_test": "all"}
         changed = [getattr(self, option) for option, value in usual.items() if getattr(self, option) != value]
         return ", ".join([self.tableau.name, self.outer, self.error, *changed])
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         from twoloop.kernels.paper import iterations
         from twoloop.kernels.steps.stages import LazyStep, options_array
 
@@ -285,8 +284,8 @@ class ESDIRK:
     formula : {"TRBDF2", "ESDIRK4"}
         Order 2 with two implicit stages, or order 4 with five.
     inner_tol : float, optional
-        Newton on the dependent positions stops when its largest correction, just made, is at most this (unit of q).
-        None: 1e-8.
+        Newton's method for the dependent positions stops when its last correction is at most this (unit of q). None:
+        1e-8.
     outer_tol : float, optional
         The outer loop stops when the last correction changes no independent position by more than this, relative to
         max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3; below tolerances of 1e-3 less, in proportion to the
@@ -328,11 +327,11 @@ class ESDIRK:
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         return self.formula if self.tested == "positions" else f"{self.formula}, velocities tested"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         from twoloop.kernels.steps.stages import LazyStep, diagonal_memory, diagonal_options, n_matrices
 
         coefficients, order = FORMULAS[self.formula]

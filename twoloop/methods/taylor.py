@@ -88,7 +88,7 @@ class Taylor:
 
     @property
     def name(self) -> str:
-        """Return the name for messages and tables."""
+        """Return the name of the method for messages and tables."""
         return "Taylor" if self.order is None else f"Taylor(order={self.order})"
 
     def for_system(
@@ -114,7 +114,7 @@ class Taylor:
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of the method for a run of n_q coordinates."""
+        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
         from twoloop.kernels.steps import taylor_step as kernels
 
         program = self.program
