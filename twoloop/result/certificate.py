@@ -127,16 +127,16 @@ def _certify(result: Record, rtol: float | None, atol: ArrayLike | None, handler
     if t_grown < np.inf:  # the growth of a tolerance at the start explains the error: the steps may be right
         unseen = [*((start, end) for start, end in unseen if end <= t_grown), (t_grown, float(checker.t[-1]))]
     end = end_of_run(result)
-    last = max(float(result.t[-1]), *(float(t[-1]) for t in result.t_events or () if len(t)), -np.inf)
-    if result.success and end > last + NEAR * abs(end - checker.t[0]):
-        unseen.append((last, end))
+    last_time = max(float(result.t[-1]), *(float(t[-1]) for t in result.t_events or () if len(t)), -np.inf)
+    if result.success and end > last_time + NEAR * abs(end - checker.t[0]):
+        unseen.append((last_time, end))
     gap = max([checker.gap, *(end - start for start, end in unseen)])
-    wrong = defect > LIMIT or (error > LIMIT and t_grown == np.inf)
+    is_wrong = defect > LIMIT or (error > LIMIT and t_grown == np.inf)
     t_worst = t_worst if defect > LIMIT else t_error
-    passed = not wrong and error <= LIMIT and not unseen and not faults
+    passed = not is_wrong and error <= LIMIT and not unseen and not faults
     certificate = Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, "", error, faults)
-    certificate = replace(certificate, message=_message(certificate, wrong, result))
-    if wrong or faults:
+    certificate = replace(certificate, message=_message(certificate, is_wrong, result))
+    if is_wrong or faults:
         warnings.warn(certificate.message, CertificateWarning, stacklevel=4)
     return certificate
 
@@ -189,8 +189,8 @@ class _Checker:
         self.states = self.every_state[first]
         self.n_steps, self.untested = self._steps(result)
         self.longest = float(self.t[-1] - self.t[0]) / PIECES
-        blocks = np.nan_to_num(np.abs(self.states), posinf=0.0).reshape(len(self.t), 2, len(atol))
-        self.rounding = ROUNDING * np.repeat(blocks.max(axis=(0, 2)), len(atol))
+        magnitudes = np.nan_to_num(np.abs(self.states), posinf=0.0).reshape(len(self.t), 2, len(atol))
+        self.rounding = ROUNDING * np.repeat(magnitudes.max(axis=(0, 2)), len(atol))
         self.gap = 0.0
         self.reruns: dict[tuple[str, float], IndependentRerun] = {}
 
@@ -203,10 +203,10 @@ class _Checker:
         tolerance = 1e-9 * (self.t[-1] - self.t[0])
         if m == 0 or (result.success and abs(ends[-1] - self.t[-1]) > tolerance):  # it is unknown where the steps end
             return np.full(n, -(-m // n) + 1), np.full(n, untested.any())
-        first = np.minimum(np.searchsorted(ends, self.t[:-1] + tolerance), m - 1)
-        last = np.minimum(np.searchsorted(ends, self.t[1:] - tolerance), m - 1)
+        first_step = np.minimum(np.searchsorted(ends, self.t[:-1] + tolerance), m - 1)
+        last_step = np.minimum(np.searchsorted(ends, self.t[1:] - tolerance), m - 1)
         n_untested = np.append(0, np.cumsum(untested))
-        return last - first + 1, n_untested[last + 1] > n_untested[first]
+        return last_step - first_step + 1, n_untested[last_step + 1] > n_untested[first_step]
 
     def pieces(self) -> Iterator[tuple[int, int, float]]:
         """Yield indices of first and last state, and defect, of each interval; inf if reintegration fails."""
@@ -246,12 +246,12 @@ class _Checker:
             return float(largest.max()), float(self.t[self.place[largest.argmax()]]), np.inf
         perturbed, _ = self._second_run(self._perturbed(0))
         growth = np.maximum.accumulate((np.abs(perturbed - reference) / self._allowed(reference)).max(axis=1))
-        explained = largest <= CHAOTIC * growth[self.place]
+        is_explained = largest <= CHAOTIC * growth[self.place]
         t = self.t[self.place]
-        worst = largest.argmax()
-        if (explained | (largest <= LIMIT)).all():
-            return float(largest.max()), float(t[worst]), float(t[largest > LIMIT].min())
-        return float(largest.max()), float(t[worst]), np.inf
+        worst_index = largest.argmax()
+        if (is_explained | (largest <= LIMIT)).all():
+            return float(largest.max()), float(t[worst_index]), float(t[largest > LIMIT].min())
+        return float(largest.max()), float(t[worst_index]), np.inf
 
     def _second_run(self, start: Array) -> tuple[Array, Array]:
         """Return the states (n, 2 n_q) of a second run from `start`, and the weights (n,) of its errors of velocities.
@@ -260,7 +260,7 @@ class _Checker:
         """
         states, weights = np.empty_like(self.states), np.full(len(self.t), 1.0 / self._rate())
         states[0] = start
-        newton = bool(self.result.stats.n_jacobians)
+        uses_newton = bool(self.result.stats.n_jacobians)
         for i, j in self._intervals():
             stiff = "positions" if self.untested[i] else "all"
             pairs = [(method, factor) for factor in (SECOND_RUN_FACTOR, 1.0, *LOOSER) for method in ("explicit", stiff)]
@@ -269,7 +269,7 @@ class _Checker:
                 if rerun is not None:
                     break
             states[i + 1 : j + 1] = self.states[i + 1 : j + 1] if rerun is None else rerun.states
-            if self.untested[i] and newton:
+            if self.untested[i] and uses_newton:
                 max_steps = STIFF * max(j - i, int(self.n_steps[i:j].sum()))
                 resolved = rerun is not None and method == "explicit" and rerun.n_steps <= max_steps
                 weights[i + 1 : j + 1] = 1.0 / FASTEST if resolved else 0.0
@@ -295,9 +295,9 @@ class _Checker:
 
     def _defect(self, i: int, j: int) -> float:
         """Return the defect from state i to j by one method; if it is too large, the smaller defect by two methods."""
-        newton = bool(self.result.stats.n_jacobians) and (self.result.untested is None or self.untested[i])
+        uses_newton = bool(self.result.stats.n_jacobians) and (self.result.untested is None or self.untested[i])
         stiff = "positions" if self.untested[i] else "all"
-        order = (stiff, "explicit") if newton else ("explicit", stiff)
+        order = (stiff, "explicit") if uses_newton else ("explicit", stiff)
         defects = [(np.inf, "")]
         for method in order:
             defects.append((self._defect_by(method, 1.0, i, j), method))
@@ -390,41 +390,41 @@ class _Checker:
         return float(0.5 * (self.t[k] + self.t[k + 1]))
 
 
-def _message(certificate: Certificate, wrong: bool, result: Record) -> str:
-    """Return the outcome in words; `wrong`: the defect or the error shows that the run is wrong."""
+def _message(certificate: Certificate, is_wrong: bool, result: Record) -> str:
+    """Return the outcome in words; `is_wrong`: the defect or the error shows that the run is wrong."""
     method, defect, error = result.method or "the run", certificate.defect, certificate.error
-    parts = []
+    sentences = []
     if defect > LIMIT:
-        parts.append(
+        sentences.append(
             f"Not passed: the step of {method} that starts at t = {certificate.t:.6g} ends {defect:.2g} times its "
             f"tolerance away from the solution of the equations (limit: {LIMIT:g}). It missed a feature, or the "
             "tolerance is not met: limit max_step, or use another method."
         )
-    elif wrong:
-        parts.append(
+    elif is_wrong:
+        sentences.append(
             f"Not passed: at t = {certificate.t:.6g} the state is {error:.2g} times the tolerance away from a second "
             f"run from the same start (limit: {LIMIT:g}), although no step deviates more than {defect:.2g} "
             "times: small errors add up. Use smaller tolerances or another method."
         )
     elif certificate.faults:
-        parts.append("Not passed.")
+        sentences.append("Not passed.")
     else:
-        parts.append(
+        sentences.append(
             f"{'Passed' if not certificate.unseen else 'Passed in part'}: reintegrated from the stored states, no part "
             f"of the run ends more than {defect:.2g} times the tolerance of a step away from the next stored "
             f"state, and a second run from the first state ends at most {min(error, LIMIT):.2g} tolerances "
             f"away (limit of both: {LIMIT:g})."
         )
-    parts.extend(f"{fault[0].upper()}{fault[1:]}." for fault in certificate.faults)
+    sentences.extend(f"{fault[0].upper()}{fault[1:]}." for fault in certificate.faults)
     if certificate.unseen:
         spans = [f"{start:.6g} to {end:.6g}" for start, end in certificate.unseen[:3]]
         spans += ["..."] * (len(certificate.unseen) > 3)
-        parts.append(
+        sentences.append(
             f"Not verified: t = {', '.join(spans)}, where reintegration failed, errors of a tolerance grow beyond "
             "the limit, or the result has no states."
         )
-    parts.append(
+    sentences.append(
         f"The equations were evaluated every {certificate.gap:.2g} s or closer: shorter features may be missed. The "
         "model is not certified."
     )
-    return " ".join(parts)
+    return " ".join(sentences)

@@ -118,31 +118,31 @@ def _acceleration_faults(
     interpolator = Interpolator(system, float(t[0]), row, rtol, atol, ranks)
     interpolator.warns = False
 
-    def evaluated(times: Array, rows: Array) -> Array:
+    def evaluate(times: Array, rows: Array) -> Array:
         out = np.full(stored.shape, np.nan)
         interpolator.complete(times, rows, out)
         return out
 
-    exact = evaluated(t, states)
+    exact = evaluate(t, states)
     change = np.tile(atol, 2) + rtol * np.abs(states)
     effect = rtol * np.abs(exact)
-    span = NEAR * float(t[-1] - t[0])
+    shift = NEAR * float(t[-1] - t[0])
     for k in range(PATTERNS):
         signs = np.where((np.arange(2 * n) * (2 * k + 1)) % (k + 3) < (k + 3) / 2, 1.0, -1.0)
         for sign in (1.0, -1.0):
             with np.errstate(invalid="ignore"):
-                effect = np.fmax(effect, np.abs(evaluated(t + sign * span, states + sign * signs * change) - exact))
+                effect = np.fmax(effect, np.abs(evaluate(t + sign * shift, states + sign * signs * change) - exact))
     largest = np.nanmax(np.abs(exact), axis=0, initial=0.0)
-    sizes = np.concatenate(
+    magnitudes = np.concatenate(
         [np.full(n, largest[:n].max(initial=0.0)), np.full(len(largest) - n, largest[n:].max(initial=0.0))]
     )
-    allowed = limit * effect + ROUNDING * sizes
+    allowed = limit * effect + ROUNDING * magnitudes
     with np.errstate(invalid="ignore"):
         deviation = np.abs(stored - exact)
-        wrong = np.isfinite(exact) & ~(deviation <= allowed)
+        is_wrong = np.isfinite(exact) & ~(deviation <= allowed)
     for name, part in (("a", slice(0, n)), ("lam", slice(n, None))):
-        if wrong[:, part].any():
-            i, k = np.argwhere(wrong[:, part])[0]
+        if is_wrong[:, part].any():
+            i, k = np.argwhere(is_wrong[:, part])[0]
             values = stored[i, part][k], exact[i, part][k]
             yield (
                 f"{name}[{k}] is {values[0]:.6g} at t = {t[i]:.6g}, where the equations give {values[1]:.6g} at the "

@@ -147,9 +147,9 @@ class Interpolator:
 
     def _allocate(self) -> None:
         """Allocate scratch arrays for the coefficients of two polynomials."""
-        half = 3 * max(indices.WINDOW, self.parts + 1)
+        n_nodes = 3 * max(indices.WINDOW, self.parts + 1)
         n = self.system.n_q
-        self.nodes, self.scratch, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
+        self.nodes, self.scratch, self.rows = np.zeros(2 * n_nodes), np.zeros((2 * n_nodes, n)), np.zeros((3, 2 * n))
 
     def __reduce__(self) -> tuple[Any, ...]:  # for copies and pickles
         *arguments, plans = self.arguments
@@ -206,12 +206,12 @@ class Interpolator:
 
     def _interpolate(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
         """Store rows [q, v] at the times of the groups in `out` (n, 2 n_q); return the number of failed projections."""
-        states = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
+        inputs = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.scratch, out)
-        failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *states, *rest))
+        failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
         if failures > 0 and self.static is not None:
             self._become_dense()
-            failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *states, *rest))
+            failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
         return failures
 
     def _divide_where_needed(self, table: Table, groups: Groups) -> None:
@@ -288,8 +288,8 @@ class Interpolator:
         tolerances[[indices.ESTIMATE, indices.GAP]] = 1.0, np.inf
         tolerances[indices.LEAST] = tolerances[[RTOL, *range(ATOL, ATOL + n)]].min()
         state = np.concatenate([table.states[i], np.zeros(self.system.n_c + self.system.n_a)])
-        attempt = entry_point(kernels.crossing_step)
-        attempt(self.kit, self.work, plan.options, plan.memory, begin, end - begin, tolerances, state, state.copy())
+        take_step = entry_point(kernels.crossing_step)
+        take_step(self.kit, self.work, plan.options, plan.memory, begin, end - begin, tolerances, state, state.copy())
         succeeded = plan.memory[-kernels.N_STORED :][kernels.END] > begin
         return self._states_of_crossing(table, i, plan.memory) if succeeded else None
 

@@ -128,8 +128,8 @@ def may_cross(run: Run, code: int) -> bool:
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
 
-        near = notes[indices.NEARLY_SINGULAR] == notes[indices.NEAR_NOW] == 1.0
-        return bool(near and run.control[a.BRIDGE] == 1.0 and run.tolerances[indices.LEAST] >= TIGHT_TOLERANCE)
+        is_near = notes[indices.NEARLY_SINGULAR] == notes[indices.NEAR_NOW] == 1.0
+        return bool(is_near and run.control[a.BRIDGE] == 1.0 and run.tolerances[indices.LEAST] >= TIGHT_TOLERANCE)
     return code == a.NEAR_SINGULAR
 
 
@@ -236,8 +236,8 @@ def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
     singular_value = least_singular_value(run.system, t, run.state[:n], run.rank)
-    farthest = present = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
-    scale = present / singular_value if singular_value > 0.0 else np.inf
+    farthest = distance_now = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
+    scale = distance_now / singular_value if singular_value > 0.0 else np.inf
     base: Place | None = None
     step_size, max_age = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
     for time, state in reversed(past):
@@ -245,7 +245,7 @@ def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
         if (farthest >= FAR and step_size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > max_age:
             break
         if distance > farthest:
-            step_size = 2.0 * present * (t - time) / (distance - present)
+            step_size = 2.0 * distance_now * (t - time) / (distance - distance_now)
             max_age = max(max_age, FARTHEST * step_size)
             if farthest < FAR:
                 farthest, base, step_size = distance, (time, state.copy()), step_size + t - time
@@ -310,10 +310,10 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
             _prepare_next_origin(run, plan, control)
             return plan, control, code
     if code == a.PAUSED and n_accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * clock[a.LARGEST_PIVOT]):
-        proposal = min(float(clock[a.H_NEXT]), run.t1 - float(clock[a.T]))
+        proposed_size = min(float(clock[a.H_NEXT]), run.t1 - float(clock[a.T]))
         run.origins = [Origin(float(clock[a.T]), None, limits) for limits in (STRICT, WIDER, LOOSER)]
         _prepare_next_origin(run, plan, control)
-        clock[a.H_NEXT] = run.crossed = proposal
+        clock[a.H_NEXT] = run.crossed = proposed_size
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
@@ -331,18 +331,18 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
 def apply_jump(run: Run, t1: float) -> bool:
     """Store the state after a jump of C_t or b in `run.new_state`, and restart the method; return whether it exists."""
     a, clock, n = run.a, run.clock, run.system.n_q
-    end = float(clock[a.JUMP_TO])
-    state = state_after_jump(run.system, end, run.state[:n], run.state[n : 2 * n])
+    t_after = float(clock[a.JUMP_TO])
+    state = state_after_jump(run.system, t_after, run.state[:n], run.state[n : 2 * n])
     if state is None:
         return False
     run.new_state[: 2 * n] = state
     run.work.notes[indices.KINK_AFTER] = t1
-    if entry_point(run.kernels.start)(run.kit, run.work, end, run.new_state) != indices.DONE:
+    if entry_point(run.kernels.start)(run.kit, run.work, t_after, run.new_state) != indices.DONE:
         return False
-    run.jumps.append(end)
+    run.jumps.append(t_after)
     run.plan.memory[:] = run.memory
     clock[a.APPLIES_JUMP] = 1.0
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = run.plan.limit_start, 0.0
-    if end < t1:
-        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(end, t1, run.new_state))
+    if t_after < t1:
+        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(t_after, t1, run.new_state))
     return True

@@ -211,8 +211,8 @@ class IntegrationLoop:
             self.outputs = np.append(request.times[(request.times > run.t0) & (request.times < t1)], t1)
         run.control[run.a.STORE_ALL] = request.every_step
         self.largest_chunk = BUFFER_STEPS
-        to_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
-        if to_event:
+        has_terminal = request.events is not None and any(event.terminal < np.inf for event in request.events)
+        if has_terminal:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
         # number of attempts from one check of progress to the next, and total number of attempts at the next check
         self.check_interval = self.next_check = run.chunk
@@ -223,7 +223,7 @@ class IntegrationLoop:
         if self.request.store.finished:
             self._store_step_fields()
         self.filled = np.zeros(2, dtype=np.int64)
-        may_end_before_t1 = to_event or time_limit is not None  # users of such runs may choose t1 arbitrarily late
+        may_end_before_t1 = has_terminal or time_limit is not None  # users of such runs may choose a very late t1
         self.stall = StallDetector(run.t0, np.inf if may_end_before_t1 else OUT_OF_REACH)
         self.stiffness = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
@@ -244,15 +244,15 @@ class IntegrationLoop:
         if run.starts_singular and self.code == a.PAUSED:
             self.code = a.NEAR_SINGULAR if run.branch_known else a.ROWS_VIOLATED
             self._choose_method(False, 0)
-        buffers, copied = self._buffers(), True
+        buffers, is_copied = self._buffers(), True
         while self.code == a.PAUSED:
             across, over_jump = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
             began = time.process_time()
             self._advance(buffers)
             n_rows, n_steps = self.filled.tolist()
             t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
-            copied = 2 * n_rows < len(buffers[0])  # a copy of a buffer that is less than half full saves memory
-            if copied:
+            is_copied = 2 * n_rows < len(buffers[0])  # a copy of a buffer that is less than half full saves memory
+            if is_copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             if across and n_steps and self.request.between_steps:
                 self.recorder.store_crossing(self.plan.memory)
@@ -262,9 +262,9 @@ class IntegrationLoop:
             if recorder.ended is not None:
                 break
             self._handle_code(steps, across, spent)
-            if not copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
+            if not is_copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
                 buffers = self._buffers()
-        if copied and buffers[1].size <= MAX_SPARE_FLOATS:
+        if is_copied and buffers[1].size <= MAX_SPARE_FLOATS:
             _spare[buffers[0].size, buffers[1].size, len(buffers[2])] = buffers
             for oldest in list(_spare)[:-MAX_SPARE]:
                 _spare.pop(oldest, None)
@@ -364,8 +364,8 @@ class IntegrationLoop:
                 self.code = STAGNATED
         if spent < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
-        goes_on = self.code in (a.PAUSED, a.NEEDS_COMPILATION, a.NEEDS_DENSE, a.SWITCH_METHOD, a.NEAR_SINGULAR)
-        if goes_on and time.monotonic() > self.deadline:
+        may_continue = self.code in (a.PAUSED, a.NEEDS_COMPILATION, a.NEEDS_DENSE, a.SWITCH_METHOD, a.NEAR_SINGULAR)
+        if may_continue and time.monotonic() > self.deadline:
             self.code = OUT_OF_TIME
         if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and (self.interrupts.n_signals or self.recorder.interrupted):
             self.code = INTERRUPTED
@@ -420,15 +420,15 @@ class IntegrationLoop:
     def _is_stalled(self, across: bool) -> bool:
         """Return whether a method with a substitute plan cannot take a step, and no singular position is near."""
         run, a = self.run, self.run.a
-        stalls = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
-        return stalls and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
+        is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
+        return is_too_small and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
 
     def _record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
         t, table = recorder.output()
         stats, store = statistics(run.work.counters, self.cpu), self.request.store
         self._store_step_fields()
-        reached = float(run.clock[run.a.T])
+        time_reached = float(run.clock[run.a.T])
         if recorder.ended is not None or recorder.interrupted_at is not None:
             for name in OF_STEPS:
                 store.cut(name, recorder.n_steps)
@@ -440,16 +440,16 @@ class IntegrationLoop:
                 store.add("h", np.array([recorder.last_step]))
             status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
         if recorder.interrupted_at is not None:
-            reached = recorder.interrupted_at
+            time_reached = recorder.interrupted_at
         try:
             if recorder.ended is None:
                 status, message = outcome(run, code, self.t1, self.stall)
             if status >= 0:
-                end = reached if recorder.ended is None else recorder.ended[1]
+                end = time_reached if recorder.ended is None else recorder.ended[1]
                 places = self._suspicious_last_step(t, table), self._suspicious_outputs(t, table)
                 status, message = reject_turned_velocities(run, *places, end, status, message)
             if code != INTERRUPTED:
-                end = reached
+                end = time_reached
                 if recorder.last is not None:
                     self.sample.end(*recorder.last)
                     end = recorder.last[0]
@@ -463,7 +463,7 @@ class IntegrationLoop:
         except KeyboardInterrupt:
             code = INTERRUPTED
         if self.interrupts.n_signals or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
-            status, message = Status.INTERRUPTED, describe_interrupt(reached, table)
+            status, message = Status.INTERRUPTED, describe_interrupt(time_reached, table)
         t_events, q_events, v_events = recorder.events()
         fields = fields_of_run(run, t, table) | {name: store.array(name) for name in OF_STEPS}
         fields |= message_of(run, message + failure_link(status), self.system)
@@ -492,9 +492,9 @@ class IntegrationLoop:
         """Return buffers for the times, states and steps of a chunk; each attempt fills at most one row of each."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
-        spare = _spare.pop((n_rows, n_rows * width, n_steps), None)
-        if spare is not None:
-            return spare
+        spare_buffers = _spare.pop((n_rows, n_rows * width, n_steps), None)
+        if spare_buffers is not None:
+            return spare_buffers
         return np.empty(n_rows), np.empty((n_rows, width)), np.empty((n_steps, self.run.a.N_STEP_COLUMNS))
 
     def _recorder(self) -> Recorder:
@@ -502,8 +502,8 @@ class IntegrationLoop:
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
         spacing = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
-        every = float(run.tolerances[indices.LOOK]) if run.short_forces.by_state else spacing
-        return Recorder(self.request, interpolator, n, run.t0, self.start, every)
+        max_spacing = float(run.tolerances[indices.LOOK]) if run.short_forces.by_state else spacing
+        return Recorder(self.request, interpolator, n, run.t0, self.start, max_spacing)
 
     def _interval_kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:
         """Return the kind of interval, for the dense solution, of each accepted step."""

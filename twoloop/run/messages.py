@@ -136,12 +136,12 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
     """Return a sentence if stability limited the steps, else ""; it overwrites the arrays in `work`."""
     if not monitor.samples or monitor.n_steps < MIN_STEPS:
         return ""
-    start = initial_direction(work.Q.size)
-    directions = [np.zeros_like(start), np.zeros_like(start)]
+    initial = initial_direction(work.Q.size)
+    directions = [np.zeros_like(initial), np.zeros_like(initial)]
     samples = []
     for sample in monitor.samples:
         for direction in directions:  # eigenvectors at the previous sample
-            direction += INITIAL_FACTOR * start
+            direction += INITIAL_FACTOR * initial
         try:
             vibration, decay = _fastest_rates(kit, work, sample, directions)
         except Exception:  # raised by a callback at a displaced state, which the run did not visit
@@ -210,7 +210,7 @@ CROSSINGS = "\0"  # placeholder in a message, to be replaced by the description 
 # time left, relative to the duration of the run, up to which a message mentions that the end is near
 NEAR_END = 1e-3
 
-_REASONS = {
+_FAILURE_REASONS = {
     indices.DONE: "the error estimate stayed above the tolerances",
     indices.OUTER_DIVERGED: "the outer loop (stages) did not converge",
     indices.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
@@ -289,8 +289,8 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
     """Return the status and the message of a run, given the code of its end (of `advance`, or of this module)."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
-        reached = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
-        return Status.REACHED_END, reached + _describe_jumps_and_crossings(run) + warn_of_singular_end(run)
+        arrival = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
+        return Status.REACHED_END, arrival + _describe_jumps_and_crossings(run) + warn_of_singular_end(run)
     stopped = f"Stopped at t = {t:.10g}"
     failure = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:
@@ -333,7 +333,7 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
             f"{stopped}: gamma by differences of C_q and C_t is good to a relative error of {reached:.1g} there, "
             f"and rtol asks for {required:.1g}. Give gamma, or loosen rtol.",
         )
-    reason = _REASONS[failure]
+    reason = _FAILURE_REASONS[failure]
     if code == a.FIXED_STEP_FAILED:
         return (
             Status.NOT_CONVERGED,

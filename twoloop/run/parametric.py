@@ -69,8 +69,8 @@ class SharedSetup:
         share_checked_bounds(system)
         if not self.family.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
-        evaluated = ParametricRun(self, run.copy()).run
-        if (code is None) is not (symbolic_code is None) or _plan_values(evaluated) != _plan_values(run):
+        evaluated_run = ParametricRun(self, run.copy()).run
+        if (code is None) is not (symbolic_code is None) or _plan_values(evaluated_run) != _plan_values(run):
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:

@@ -286,17 +286,17 @@ def _consistent_state(
     reason = not_finite(system, t, guess, speeds)
     if reason is not None:
         raise ValueError(f"q and v cannot be projected: {reason} at t = {t:g}")
-    large = None if kept else project_sparsely(system, t, guess, speeds, check_assembly)
-    if large is not None:
-        return _state_of_large(system, t, guess, speeds, *large)
+    sparse_result = None if kept else project_sparsely(system, t, guess, speeds, check_assembly)
+    if sparse_result is not None:
+        return _state_of_large(system, t, guess, speeds, *sparse_result)
     position = _projected_position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
     jacobian = system.rows(t, position)
     change = _least_change(jacobian, free, -system.velocity_constraint(t, position, speeds))
     velocity = speeds + change
     scales = scales_of(system, t, position, jacobian)
-    wrong = Violation.of_velocity(system, t, position, velocity, jacobian, scales) if len(jacobian) > 0 else None
-    if wrong is not None and wrong.excess > 1.0:
-        why = f"max|C_q v + C_t| stays at {_format_largest(wrong.values)}"
+    violation = Violation.of_velocity(system, t, position, velocity, jacobian, scales) if len(jacobian) > 0 else None
+    if violation is not None and violation.excess > 1.0:
+        why = f"max|C_q v + C_t| stays at {_format_largest(violation.values)}"
         raise ValueError(_describe_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
     state = ConsistentState((position, velocity))
     state.moved_q, state.moved_v = _largest_move(position - guess), _largest_move(velocity - speeds)
@@ -336,33 +336,33 @@ def _projected_position(
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
-    start = Violation.of_position(system, t, guess, jacobian, scales)
-    if start.excess > CONVERGED and _rank(scaled[:, free]) < _rank(scaled):
-        why = f"max|C| stays at {_format_largest(start.values)}"
+    violation = Violation.of_position(system, t, guess, jacobian, scales)
+    if violation.excess > CONVERGED and _rank(scaled[:, free]) < _rank(scaled):
+        why = f"max|C| stays at {_format_largest(violation.values)}"
         raise ValueError(_describe_no_freedom(system, t, scaled, free, kept, why))
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     redundant = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
-    cut = WEAK if redundant else NEGLIGIBLE
+    cutoff = WEAK if redundant else NEGLIGIBLE
     if redundant:  # beside the constraints, redundant rows are only nearly dependent: project again with WEAK
-        position, excess, iterations = _gauss_newton(system, t, guess, free, cut)
+        position, excess, iterations = _gauss_newton(system, t, guess, free, cutoff)
     if position is None or not excess <= 1.0:
-        diverged = position is None
-        worst = _format_largest(system.constraint(t, guess if diverged else position))
-        outcome = f"the iteration diverges; at q max|C| is {worst}"
-        if not diverged:
-            outcome = f"after {iterations} iterations max|C| is {worst}"
+        has_diverged = position is None
+        largest = _format_largest(system.constraint(t, guess if has_diverged else position))
+        outcome = f"the iteration diverges; at q max|C| is {largest}"
+        if not has_diverged:
+            outcome = f"after {iterations} iterations max|C| is {largest}"
         raise ValueError(
             f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: {outcome}. Give a guess that "
             f"is nearer to an assembled position{_describe_rank_loss(scales, jacobian, free, kept)}"
         )
     shift = float((np.abs(position - guess) / scales.columns).max())
-    if check_assembly and (start.excess > 1.0 or shift > CONSISTENT):  # next to a dead centre a small error moves far
-        where = _another_assembly(system, t, position, guess, free, scales, cut)
-        if where is not None:
+    if check_assembly and (violation.excess > 1.0 or shift > CONSISTENT):  # near a dead centre small errors move far
+        ending = _describe_other_assembly(system, t, position, guess, free, scales, cutoff)
+        if ending is not None:
             jacobian_there = system.jacobian(t, position)
             raise ValueError(
                 f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
-                f"{_describe_change(guess, position, scales)}, and that of another guess as far away {where}. Give a "
+                f"{_describe_change(guess, position, scales)}, and that of another guess as far away {ending}. Give a "
                 "guess that is nearer to the assembly that is meant, or farther from a dead centre; "
                 f"twoloop.consistent_state(..., check_assembly=False) takes the one found"
                 f"{_describe_rank_loss(scales, jacobian_there, free, kept)}"
@@ -370,14 +370,14 @@ def _projected_position(
     return position
 
 
-def _another_assembly(
+def _describe_other_assembly(
     system: ConstrainedSystem,
     t: float,
     position: Array,
     guess: Array,
     free: NDArray[np.intp],
     scales: Scales,
-    cut: float,
+    cutoff: float,
 ) -> str | None:
     """Describe where other guesses, about as far from `position` as `guess`, are projected; None: same assembly.
 
@@ -397,13 +397,13 @@ def _another_assembly(
         block = scales.scaled(system.jacobian(t, q))[:, dependent_columns]
         return int(np.linalg.slogdet(block)[0]) if sign != 0 else 0
 
-    weakest = largest_move * _weakest_direction(scales.scaled(jacobian), free)
-    for direction in (-2.0 * scaled_move, weakest, -weakest):
+    weakest_move = largest_move * _weakest_direction(scales.scaled(jacobian), free)
+    for direction in (-2.0 * scaled_move, weakest_move, -weakest_move):
         displacement = direction * scales.columns
-        projected, excess, _ = _gauss_newton(system, t, position + displacement, free, cut)
+        projected, excess, _ = _gauss_newton(system, t, position + displacement, free, cutoff)
         if projected is None or not excess <= 1.0:
             return "does not converge"
-        expected = position + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cut)
+        expected = position + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if (
             distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(direction).max())
             and sign_at(projected) == sign
@@ -412,7 +412,7 @@ def _another_assembly(
         # curvature may explain the distance: project a guess with the new dependent and the old other coordinates
         mixed = position.copy()
         mixed[dependent_columns] = projected[dependent_columns]
-        mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cut)
+        mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
         if mixed_projected is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
         if distance(mixed_projected, position) > SAME_POSITION * largest_move or sign_at(mixed_projected) != sign:
@@ -429,7 +429,7 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 
 
 def _gauss_newton(
-    system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
+    system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
     """Return the projected q (None: diverged), its violation over the allowed violation, and the iteration count."""
     best, nearest, guess = np.inf, q, q
@@ -440,7 +440,7 @@ def _gauss_newton(
             return None, np.inf, iteration
         if not (np.isfinite(jacobian).all() and np.isfinite(values).all()):
             return None, np.inf, iteration
-        step = _least_change(jacobian, free, -values, cut)
+        step = _least_change(jacobian, free, -values, cutoff)
         scales = scales_of(system, t, q, jacobian)
         excess = Violation.of_position(system, t, q, jacobian, scales).excess
         if excess == 0.0 or (excess <= CONVERGED and excess >= 0.5 * best):
@@ -453,12 +453,12 @@ def _gauss_newton(
     return nearest if best <= 1.0 else q, best, MAX_ITERATIONS  # rounding may keep the violation above CONVERGED
 
 
-def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
+def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff: float = NEGLIGIBLE) -> Array:
     """Return the smallest change (n_q,) of q in its `free` coordinates with C_q times the change equal to `values`."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
     change = np.zeros(jacobian.shape[1])
-    change[free] = np.linalg.lstsq(jacobian[:, free] / norms[:, None], values / norms, rcond=cut)[0]
+    change[free] = np.linalg.lstsq(jacobian[:, free] / norms[:, None], values / norms, rcond=cutoff)[0]
     return change
 
 

@@ -630,5 +630,5 @@ def interval_kinds(run: "Run", steps: Array) -> Integers:
     """Return the kind of interval, for the dense solution, of each step of the run's plan; `steps`: rows of steps."""
     if run.plan.apart:
         return np.full(len(steps), indices.APART)
-    explicit = indices.ACROSS if run.substituted else indices.ACCELERATIONS
-    return np.where(steps[:, run.a.JACOBIANS] > 0.0, indices.VELOCITIES, explicit)
+    explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS
+    return np.where(steps[:, run.a.JACOBIANS] > 0.0, indices.VELOCITIES, explicit_kind)

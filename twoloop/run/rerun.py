@@ -100,15 +100,15 @@ def _check_derivatives(run: Run, states: Array, first_state: Array, status: Stat
     `first_state`: the first state [t, q, v] of the run.
     """
     n = run.system.n_q
-    chosen = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
-    compared = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
+    chosen_states = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
+    compared = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen_states]
     exact = exact_derivatives(run.system)
     agrees = exact is not None and exact.difference(run.system, generic_states(compared)) is None
     difference = run_inconsistency(run.system, compared, float(first_state[0]), first_state[1 : 1 + n])
     for t, q, v in () if agrees or difference is not None else compared:
-        wrong = wrong_derivative(run.system, t, q, v)
-        if wrong is not None:
-            difference = t, wrong
+        mistake = wrong_derivative(run.system, t, q, v)
+        if mistake is not None:
+            difference = t, mistake
             break
     if difference is None:
         return status, message
@@ -131,7 +131,7 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
     if not differences.max() > CLEAR_DIFFERENCE * np.abs(first_forces[comparable]).max(initial=0.0):
         return None
     k, entry = np.unravel_index(differences.argmax(), differences.shape)
-    return _changed_value(system.name, float(states[k, 0]), int(entry), first_forces[k, entry], second_forces[k, entry])
+    return _change_text(system.name, float(states[k, 0]), int(entry), first_forces[k, entry], second_forces[k, entry])
 
 
 def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
@@ -173,12 +173,12 @@ def describe_changed_force(run: Run) -> str | None:
             if differences.max(initial=0.0) > CLEAR_DIFFERENCE * np.abs(value[comparable]).max(initial=0.0):
                 entry = int(differences.argmax())
                 return (
-                    f"In the run {_changed_value(system.name, float(arguments[0]), entry, value[entry], later[entry])}."
+                    f"In the run {_change_text(system.name, float(arguments[0]), entry, value[entry], later[entry])}."
                 )
     return None
 
 
-def _changed_value(name: str, t: float, entry: int, first_value: float, second_value: float) -> str:
+def _change_text(name: str, t: float, entry: int, first_value: float, second_value: float) -> str:
     return (
         f"force of {name!r} gives something else when it is called again with the same t, q and v: at "
         f"t = {t:.10g} entry {entry} is {first_value:.9g}, and then {second_value:.9g}. It must "

@@ -327,10 +327,10 @@ class Run:
             self.work = self._workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
         if code == indices.GAMMA_INACCURATE:  # the first step will report this, so that the run has a result
-            required = self.work.notes[indices.GAMMA_REQUIRED]
+            required_accuracy = self.work.notes[indices.GAMMA_REQUIRED]
             self.work.notes[indices.GAMMA_REQUIRED] = np.inf
             code = start(self.kit, self.work, self.t0, self.state)
-            self.work.notes[indices.GAMMA_REQUIRED] = required
+            self.work.notes[indices.GAMMA_REQUIRED] = required_accuracy
         if code == indices.DONE:
             return
         n = self.system.n_q
@@ -411,8 +411,8 @@ class Run:
         """Set the first step size and the limits of step sizes, s; first_step None: an estimate."""
         self.max_step = max_step
         self.limit_steps()
-        proposed = self.first_step(self.t0, t1, self.state, max_step)
-        first_size = min(first_step or proposed, t1 - self.t0)
+        proposed_size = self.first_step(self.t0, t1, self.state, max_step)
+        first_size = min(first_step or proposed_size, t1 - self.t0)
         self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first_size, float(first_step is not None)
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
 
@@ -434,8 +434,8 @@ class Run:
     def defect(self) -> float | None:
         """Return the largest defect of the steps, or None if the defect was not evaluated in all steps."""
         notes = self.work.notes
-        checked = self.work.counters[indices.N_ACCEPTED] > 0 and notes[indices.UNCHECKED] == 0.0
-        return float(notes[indices.LARGEST_DEFECT]) if checked else None
+        is_checked = self.work.counters[indices.N_ACCEPTED] > 0 and notes[indices.UNCHECKED] == 0.0
+        return float(notes[indices.LARGEST_DEFECT]) if is_checked else None
 
     def passed_near_singular(self) -> bool:
         """Return whether a step ended so near a singular position that rounding may have changed its velocities."""

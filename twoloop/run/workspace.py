@@ -62,10 +62,10 @@ def newton_form(
     """
     entries: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
-    size, lam = max(1.0, float(np.abs(q0).max())), rng.uniform(0.5, 1.5, system.n_c)
+    magnitude, lam = max(1.0, float(np.abs(q0).max())), rng.uniform(0.5, 1.5, system.n_c)
     max_entries = MAX_NEWTON_SHARE * system.n_q**2
     for scale in NEARBY[:2]:
-        q = q0 + scale * size * rng.uniform(-1.0, 1.0, system.n_q)
+        q = q0 + scale * magnitude * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
         except Exception:  # q is outside the domain of the callbacks; entries missed here are found during the run
@@ -100,9 +100,9 @@ def _derivative_entries(
         changed_q, changed_v = q.copy(), v.copy()
         changed_q[j] += DISPLACEMENT * max(1.0, abs(q[j]))
         changed_v[j] += DISPLACEMENT * max(1.0, abs(v[j]))
-        differs = (system.force(t, changed_q, v) != force) | (reaction(changed_q) != undisplaced_reaction)
-        differs |= system.force(t, q, changed_v) != force
-        for i in np.flatnonzero(differs).tolist():
+        is_changed = (system.force(t, changed_q, v) != force) | (reaction(changed_q) != undisplaced_reaction)
+        is_changed |= system.force(t, q, changed_v) != force
+        for i in np.flatnonzero(is_changed).tolist():
             entries |= {(i, j), (j, i)}
         if len(entries) > max_entries:
             break
@@ -199,8 +199,8 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
     A joint refers to only one of its two bodies. So there may be bodies, at ends of chains, to which no joint refers.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
-    layouts = {tuple(j - own[0] for j in own) for own in coordinates_by_joint}
-    if layouts != {tuple(range(7))} or system.n_q % 7 > 0 or any(own[0] % 7 > 0 for own in coordinates_by_joint):
+    layouts = {tuple(j - body[0] for j in body) for body in coordinates_by_joint}
+    if layouts != {tuple(range(7))} or system.n_q % 7 > 0 or any(body[0] % 7 > 0 for body in coordinates_by_joint):
         return coordinates_by_joint
     body_of = bodies_of(system.n_q, mass, ())
     expected = [7 * k + (j if j < 3 else 3) for k in range(system.n_q // 7) for j in range(7)]
@@ -273,11 +273,11 @@ def _entries_of(pattern: Array) -> Entries:
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     """Return a matrix with 1 at entries of M that are not zero at q0 or, if M is variable, at positions near q0."""
     pattern = np.zeros((system.n_q, system.n_q))
-    size = np.maximum(np.abs(q0), np.abs(q0).max())
+    magnitudes = np.maximum(np.abs(q0), np.abs(q0).max())
     directions = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
     for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
-            mass = system.mass(t0, q0 + scale * size * direction)
+            mass = system.mass(t0, q0 + scale * magnitudes * direction)
         except Exception:  # outside the domain of the callbacks; entries missed here are found during the run
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
@@ -343,8 +343,8 @@ def _dense_flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
         flags[DIAGONAL_MASS] = is_diagonal(system.mass(t0, q0))
-    reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
-    flags[FORM] = NULL_SPACE if reduced else MULTIPLIERS
+    uses_null_space = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
+    flags[FORM] = NULL_SPACE if uses_null_space else MULTIPLIERS
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
         flags[BANDWIDTH], flags[FORM] = bandwidth, MULTIPLIERS
@@ -414,13 +414,13 @@ def workspace(
     `pattern`: 1 at the entries of [C_q; A], else 0. `matrices`: number of dense matrices that the plan needs.
     """
     flags = kit.flags
-    reduced, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
+    uses_null_space, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
     programs = [each for each in (kit.jacobian_program, kit.gamma_program) if each.size]
     n_nodes = max((int(each[N_NODES]) for each in programs), default=0)
     n_q, n_c, n_a = system.n_q, system.n_c, system.n_a
-    full = min(n_c, n_q), min(n_c + n_a, n_q)
-    rank, rank_v = (rank if rank is not None else highest for rank, highest in zip(ranks, full, strict=True))
-    sizes = n_q, n_c, n_a, rank, rank_v, bool(reduced and n_q > rank_v), bool(augmented), n_nodes
+    full_ranks = min(n_c, n_q), min(n_c + n_a, n_q)
+    rank, rank_v = (rank if rank is not None else highest for rank, highest in zip(ranks, full_ranks, strict=True))
+    sizes = n_q, n_c, n_a, rank, rank_v, bool(uses_null_space and n_q > rank_v), bool(augmented), n_nodes
     n_matrices = matrices * n_q**2 if static is None else static.n_matrices(matrices)
     work = empty((*sizes, None if static is None else static.static, n_matrices))
     return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, static)
