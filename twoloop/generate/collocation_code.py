@@ -613,7 +613,7 @@ class CollocationCode:
         one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, at.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project the positions at the ends of eight steps in place; store FINE (success) and MOVED (changes)."""
+        """Project positions at the ends of eight steps in place; store FINE (success) and MOVED (largest changes)."""
         if self.parts is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:

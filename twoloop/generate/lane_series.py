@@ -39,7 +39,7 @@ LARGEST_POWER, SMALLEST = 1000.0, 1e-300  # largest |x| in 2^x, and smallest arg
 class LaneEmitter(Emitter):
     """Emitter of operations on vectors with one number for each lane; array indices count vectors."""
 
-    constants: Value  # pointer to the numbers that all lanes share
+    constants: Value  # pointer to the coefficients that have the same value in all lanes
 
     def __init__(self, builder: Builder, lanes: int = LANES):
         super().__init__(builder)
@@ -82,12 +82,12 @@ class LaneEmitter(Emitter):
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Return vector `place` of the array at `base`, loaded from memory."""
+        """Return vector number `place` of the array at `base`, loaded from memory."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*")
         return self.builder.load(pointer, constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Store a vector as vector `place` of the array at `base`."""
+        """Store `value` as vector number `place` of the array at `base`."""
         self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*"))
 
     def function(self, name: str, x: Value) -> Value:
@@ -219,7 +219,7 @@ class LaneSeries:
         self.late = self._operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._rows(program.rows, program.row_places)
         self.balance = self._rows(program.balance, program.balance_places)
-        # factors of the sums that are carried over, by product; empty while `_shared_sums` calls `_factors`
+        # factors of the sums that are carried over, by product; `_factors`, which `_shared_sums` calls, reads this dict
         self._carried: dict[int, tuple[int, int]] = {}
         self._carried |= self._shared_sums()
         self.sums_ahead = sorted(set(self._carried.values()))
@@ -373,7 +373,7 @@ class LaneSeries:
     def _begin(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for the results of operations at order 0; store their factors in `row`, except unknown ones."""
+        """Write code for the results of operations at order 0; store those of their factors in `row` that are known."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -448,7 +448,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write code for the results of operations at order k > 0, without terms whose factor of order k is unknown."""
+        """Write code for the results of operations at order k > 0; leave out terms with a factor not known yet."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:

@@ -328,7 +328,7 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     return results[0], results[1]
 
 
-# names of functions by kinds of operations
+# names of mathematical functions, by kinds of operations
 FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
 
 Place = tuple[Value, int]  # memory location: pointer to an array, and an index in this array

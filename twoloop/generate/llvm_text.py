@@ -250,7 +250,7 @@ class Builder:
         return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
     def run(self, name: str, arguments: Sequence[Value]) -> None:
-        """Write a call of a function of the module that returns no value."""
+        """Write a call of the function `name` of the module, which returns no value."""
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:

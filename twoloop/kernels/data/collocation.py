@@ -4,7 +4,7 @@ An offset is the index of a number in this memory, which begins at an aligned ad
 numbers: one number for each unknown node, or one for each of eight steps that are projected together.
 """
 
-LANES = 8  # numbers in a group of lanes
+LANES = 8  # number of lanes: numbers in a group that is computed at once
 ORDER = 12.0  # the error estimate is proportional to this power of the step size
 NOISE = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
 # codes: how the iteration of the stages ended. REFUSED: the step is rejected. GUESSED: the step size was a guess, and
@@ -18,11 +18,11 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: accelerations are predicted by a polynomial; 0: they are predicted to be constant
     CURRENT,  # index (0 or 1) of the polynomial of the last accepted step
-    TRIED,  # 1: the other polynomial is that of the step just attempted
+    TRIED,  # 1: the polynomial that is not CURRENT is that of the attempted step
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     KEPT_DEGREE,  # value of DEGREE before a step was rejected, which a later step restores; 0: no step was rejected
     MAY_GUESS,  # 1: the step size is a guess, to be replaced by another one if the contraction is far from its target
-    CAREFUL,  # number of next steps that use the elimination that begins with M
+    CAREFUL,  # number of coming steps that use the elimination that begins with M
     STARTS,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
     LIMITED,  # number of steps whose size was limited by the convergence, minus the number of other steps; at least 0

@@ -294,8 +294,8 @@ def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
-# forceinline is always set explicitly, because a callee inherits the flags of its caller: all helpers that a merged
-# helper calls would be merged, too
+# forceinline is always set explicitly, because a callee inherits the flags of its caller: otherwise, all helpers that a
+# merged helper calls would be merged, too
 exact = _helper(fastmath=False, forceinline=False)  # keeps the order of floating-point operations as in the source
 compiled = _helper(forceinline=False)  # compiled as one function, which LLVM inlines only if it is short
 inlined = _helper(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays

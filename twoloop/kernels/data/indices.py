@@ -17,7 +17,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
     GAMMA_INACCURATE,
     RANK_DIFFERS,
     ROWS_CONTRADICT,
-    NEEDS_DENSE,  # the static form cannot decide whether rows are independent: the caller continues with a dense one
+    NEEDS_DENSE,  # the static form cannot decide whether rows are independent: the caller continues with a dense form
     NOT_LOADED,  # the caller has to load the machine code of the step
     UNSUITED,  # the method does not suit the motion: the caller continues with another method
     STOPPED,  # the time limit of the run has passed, see TIME_IS_UP
@@ -29,7 +29,8 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
 # STRAIGHT: 1 if the inner loop is code generated for the mechanism. FIRST_GIVEN: first index of the flags in GIVEN
 CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; for STATIC see sparse_inner_loop.py
-GIVEN = {name: index for index, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # indices of flags: 1 if a callback is given
+# indices of the flags of optional callbacks: 1 if the callback is given
+GIVEN = {name: index for index, name in enumerate(OPTIONAL, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
     GIVEN[name] for name in ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q", "kinematics")

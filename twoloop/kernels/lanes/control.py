@@ -178,7 +178,7 @@ def _accept_or_shorten(options, work, k):
         work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[LIMIT_AGE * LANES + k] = 0.0
         return False
-    # at a jump of a force, the error estimate may be small by chance: before ROUGH_TO, it is multiplied by ROUGH
+    # at a jump of a force, the error estimate may be small by chance: before ROUGH_TO, multiply the estimate by ROUGH
     error_factor = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
     is_accepted = error * error_factor <= 1.0
     if error > SUDDEN_ERROR and not is_accepted:

@@ -16,7 +16,8 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, inlined, merged
 
-# status of a run: not ended, ended at t1, or (negative) the reason why the run has to be repeated outside the lanes
+# status of a run: not ended, ended at t1, or (negative) the reason why the run has to be repeated outside the lanes,
+# for example UNLIKE: callbacks disagree with the generated code
 UNDECIDED, ENDED = 0, 1
 NO_START, NO_STATE, NO_VALUES, OFTEN_REFUSED, MANY_STEPS, UNLIKE = range(-6, 0)
 

@@ -63,7 +63,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 (
     ITERATING,  # 1 in lanes whose iteration has not ended
     DONE,  # 1 in lanes whose iteration has converged
-    CHANGE_BEFORE,  # previous correction, relative to the scales, see _end_iteration
+    CHANGE_BEFORE,  # correction by the previous iteration, relative to SCALE_Q and SCALE_V, see _end_iteration
     SCALE_Q,  # largest absolute position at the stages, at least 1
     SCALE_V,  # largest absolute velocity at the stages, at least 1
     LARGEST_Q,  # largest correction of positions, over the square of the step size
@@ -210,7 +210,7 @@ def predict_stages(settings, c, work, begins):
     """Store predicted stage accelerations in STAGES: values of the polynomial through PREVIOUS.
 
     If the step is longer than MAX_STEP_RATIO steps of PREVIOUS, the prediction is constant. `begins`: beginning of the
-    step in units of the step of PREVIOUS: 1 if PREVIOUS is of the last step, 0 if it is of this step.
+    step in units of the step of PREVIOUS: 1 if PREVIOUS belongs to the last step, 0 if it belongs to this step.
     """
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
@@ -316,7 +316,7 @@ def _store_largest(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store LARGEST_Q and LARGEST_V, the largest corrections of q and v by CHANGES at the stages, for a step size 1."""
+    """Store LARGEST_Q and LARGEST_V, the largest changes of q and v that CHANGES causes at the stages if X is 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = A.shape[0]
@@ -488,7 +488,7 @@ def _velocity_error(control, work, n, error_v, duration, state, new, k):
 
 @merged
 def _motion_time(control, work, n, memory, k):
-    """Return the ratio (s) of the largest velocity to the largest acceleration in lane k, at most LONGEST_GAPS gaps."""
+    """Return the ratio (s) of the largest velocity to the largest acceleration in lane k, at most LONGEST_GAPS GAP."""
     begin = vector_at(memory, n, BEGIN_V)
     largest_v = largest_a = 0.0
     for j in range(n):
@@ -526,7 +526,7 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
     solve_lanes(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[error_field * LANES + k]
-        if work[FINE * LANES + k] == 1.0:  # in unstable motion the filtered error may be larger: the smaller one counts
+        if work[FINE * LANES + k] == 1.0:  # in unstable motion, the filter may enlarge the error: use the smaller error
             motion_time = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, motion_time, state, new, k))
         work[FINE * LANES + k] = work[fine_copy * LANES + k]
