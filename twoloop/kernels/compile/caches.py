@@ -169,7 +169,7 @@ def _warn_first(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-MAX_ON_DISK = 500  # largest number of files on disk for each kind of function generated for single mechanisms
+MAX_ON_DISK = 500  # largest number of files on disk for each kind of functions that are generated for mechanisms
 CHECKSUM_SIZE = hashlib.sha256().digest_size  # length of the checksum at the beginning of a file, bytes
 
 

@@ -354,7 +354,7 @@ class FunctionCopier:
         self.known: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value, or the value itself; `names` are the attributes replaced in a module."""
+        """Return the replacement of a value, or the value itself; `names`: attributes to replace in a module."""
         if self.is_copied(value):
             if id(value) not in self.known:
                 self._add_copy(value)

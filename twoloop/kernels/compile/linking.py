@@ -53,7 +53,7 @@ def jitable_templates(function: Any) -> list[Any]:
     context.refresh()  # include functions registered since numba last compiled
     try:
         templates = list(getattr(context.resolve_value_type(function), "templates", ()))
-    except ValueError:  # no function that numba supports
+    except ValueError:  # numba does not support this function
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     is_own = [any(cell.cell_contents is function for cell in source or ()) for source in closures]

@@ -87,7 +87,7 @@ class Work(NamedTuple):
     independent_v: Any  # (n_dof) indices of the independent velocities
     index_v: Any  # program that factors G_d
     values_v: Any  # the factors of G_d
-    index_a: Any  # program that factors the augmented matrix; its SIZE is 0 while the program is not written
+    index_a: Any  # program that factors the augmented matrix; its SIZE is 0 until the program is written
     values_a: Any  # the factors of the augmented matrix; empty in other forms
     right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix, and scratch
     order: Any  # (n_q) scratch: column order of the full pivoting

@@ -66,8 +66,8 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     CHANGE_BEFORE,  # correction by the previous iteration, relative to SCALE_Q and SCALE_V, see _end_iteration
     SCALE_Q,  # largest absolute position at the stages, at least 1
     SCALE_V,  # largest absolute velocity at the stages, at least 1
-    LARGEST_Q,  # largest correction of positions, over the square of the step size
-    LARGEST_V,  # largest correction of velocities, over the step size
+    LARGEST_Q,  # largest correction of positions, divided by the square of the step size
+    LARGEST_V,  # largest correction of velocities, divided by the step size
     H_PREVIOUS,  # size of the step with the accelerations PREVIOUS, s; 0 if there is no such step
     CONSTANT,  # 1: the predicted accelerations of all stages are those at the beginning of the step; else 0
     DURATION,  # duration of an error of the velocities, s, see velocity_errors.py; 0: not known
