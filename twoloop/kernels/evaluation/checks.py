@@ -154,10 +154,10 @@ def _set_to_zero(A):
 @exact
 def _has_empty_row(rows):
     """Return whether one of the rows contains only zeros."""
-    empty = False
+    has_empty = False
     for i in range(len(rows)):
-        empty = empty or largest_of(rows[i]) == 0.0
-    return empty
+        has_empty = has_empty or largest_of(rows[i]) == 0.0
+    return has_empty
 
 
 @exact
@@ -189,7 +189,7 @@ def _is_rounding(value, row, state, sizes, least, rate, allowed):
 
 @exact
 def _is_near(q, sizes, stored_q):
-    """Return whether q is so near `stored_q` that the `sizes` of the coordinates at stored_q apply to q, too."""
+    """Return whether each coordinate in q differs from `stored_q` by at most NEAR_SHARE times its entry in `sizes`."""
     is_near = True
     for j in range(q.size):
         is_near = is_near and abs(q[j] - stored_q[j]) <= NEAR_SHARE * sizes[j]
@@ -198,7 +198,7 @@ def _is_near(q, sizes, stored_q):
 
 @exact
 def _has_same_entries(rows, entries):
-    """Return whether `rows` is nonzero exactly where `entries`, stored row by row, is: then stored sizes may apply."""
+    """Return whether `rows` is nonzero exactly where `entries`, a matrix stored row by row, is nonzero."""
     is_same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])
@@ -209,7 +209,7 @@ def _has_same_entries(rows, entries):
 
 @exact
 def _find_stored_sizes(q, rows, n_c, sizes):
-    """Return the index in `sizes` at which the data of a stored position near q begin; -1 if there is none."""
+    """Return the index in `sizes` at which the data of a stored position near q begin; -1 if no such data exist."""
     n = q.size
     stride = 2 * n + n_c * n
     for k in range(0, sizes.size, stride):
@@ -281,7 +281,7 @@ def _is_definite(mass, min_eigenvalue, factors):
 
 @kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern, roundings):
-    """Evaluate all callbacks at (t, q, v), and store their results; return the sum of the flags above that hold.
+    """Evaluate all callbacks at (t, q, v), and store their results; return the flags IN_ORDER to INDEFINITE that hold.
 
     Arguments:
 
@@ -414,25 +414,25 @@ def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
 
 
 @exact
-def _operation_with_bound(kind, x, dx, y, dy):
-    """Return the result of an operation on x and y, and its error bound; dx and dy are the error bounds of x and y."""
+def _operation_with_bound(kind, x, bound_x, y, bound_y):
+    """Return the result of an operation on x and y, and its error bound, from the error bounds of x and y."""
     z = operation(kind, x, y)
     if kind == op.PRODUCT:
-        dz = abs(x) * dy + abs(y) * dx
+        bound = abs(x) * bound_y + abs(y) * bound_x
     elif kind == op.RECIPROCAL:
-        dz = dx * z * z
+        bound = bound_x * z * z
     elif kind == op.SQUARE_ROOT:
-        dz = min(0.5 * dx / z, math.sqrt(dx / EPS)) if dx > 0.0 else 0.0
+        bound = min(0.5 * bound_x / z, math.sqrt(bound_x / EPS)) if bound_x > 0.0 else 0.0
     elif kind == op.EXPONENTIAL:
-        dz = dx * z
+        bound = bound_x * z
     elif kind == op.LOGARITHM:
-        dz = dx / abs(x)
+        bound = bound_x / abs(x)
     elif kind == op.ARCTANGENT:
-        dz = dx / (1.0 + x * x)
+        bound = bound_x / (1.0 + x * x)
     else:
-        dz = dx
-    dz += abs(z)
-    return z, 0.0 if math.isnan(dz) else dz
+        bound = bound_x
+    bound += abs(z)
+    return z, 0.0 if math.isnan(bound) else bound
 
 
 @exact
@@ -440,13 +440,13 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
     """Store results of a traced program in `values`, their error bounds in `bounds`; `nodes` begins with the inputs."""
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
-        x, dx = _sum_with_bound(columns, coefficients, constants[i, 0], nodes, first, second)
+        x, bound_x = _sum_with_bound(columns, coefficients, constants[i, 0], nodes, first, second)
         if program[i, op.KIND] == op.RESULT:
-            values[program[i, op.NODE]], bounds[program[i, op.NODE]] = x, dx
+            values[program[i, op.NODE]], bounds[program[i, op.NODE]] = x, bound_x
         else:
-            y, dy = _sum_with_bound(columns, coefficients, constants[i, 1], nodes, second, end)
-            z, dz = _operation_with_bound(program[i, op.KIND], x, dx, y, dy)
-            nodes[VALUE, program[i, op.NODE]], nodes[BOUND, program[i, op.NODE]] = z, dz
+            y, bound_y = _sum_with_bound(columns, coefficients, constants[i, 1], nodes, second, end)
+            z, bound = _operation_with_bound(program[i, op.KIND], x, bound_x, y, bound_y)
+            nodes[VALUE, program[i, op.NODE]], nodes[BOUND, program[i, op.NODE]] = z, bound
 
 
 @exact

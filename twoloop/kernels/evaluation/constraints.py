@@ -46,7 +46,7 @@ def _clear_recorded_entries(w):
 
 @merged
 def clear_rows(f, w):
-    """Set w.G to zero; in the augmented form only the recorded entries (VERIFY_PATTERN detects others after a step)."""
+    """Set w.G to zero; in the augmented form only the entries in w.places (VERIFY_PATTERN detects others later)."""
     if f.flags[FORM] == AUGMENTED:
         _clear_recorded_entries(w)
     else:
@@ -106,12 +106,12 @@ def gather_independent_columns(G, rate, rows, independent, D):
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
 ROUNDING_DISAGREEMENT = 1e-9  # disagreement of the two differences, relative to Gamma, that rounding alone may cause
-# the difference step is doubled, which reduces rounding errors, if the two differences disagree by less, relative to
-# Gamma
+# disagreement of the two differences, relative to Gamma, below which the difference step is doubled, because a larger
+# step reduces rounding errors
 ENLARGE_BELOW = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2: with the step e, and with the step 2 e
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-# step of one-sided differences, relative to that of central ones: it is smaller, because their order is lower
+# step of one-sided differences, relative to the step of central differences: smaller, because their order is lower
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0
 # rounding error of Gamma if the terms of G v cancel, relative to the largest term divided by largest_difference_step
 ROUNDING_OF_TERMS = 1e-14
@@ -138,7 +138,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(notes, t, e):
-    """Return on which side of t to take differences: 1 after, -1 before, if C_t or b jumps close to t; else 0, both."""
+    """Return the side of t for differences: 1, after t, or -1, before t, if C_t or b jumps near t; else 0, both."""
     before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(before, after) >= 2.0 * e:
         return 0.0
@@ -192,15 +192,16 @@ def _differences(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(notes):
-    """Return the largest accepted disagreement of the two differences; their combination has a much smaller error."""
+    """Return the largest accepted disagreement of the two differences, much larger than the error of Gamma."""
     return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
 
 
 @compiled
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
-    """Store Gamma[first:last] in w.Gamma, by the difference step at which Gamma changes least when the step decreases.
+    """Store Gamma[first:last] in w.Gamma, by ever smaller difference steps until Gamma changes little; return a code.
 
-    Stores this step as GAMMA_STEP_RATIO. Returns GAMMA_INACCURATE if the change at this step is too large, else DONE.
+    Uses the step at which Gamma changes least, and stores it as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if even
+    this change is too large, else DONE.
     """
     least_change = np.inf
     step_ratio = 1.0
@@ -229,7 +230,7 @@ def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
 
 @compiled
 def gamma_by_differences(f, w, t, q, v, first, last):
-    """Store Gamma[first:last] in w.Gamma, by differences; return GAMMA_INACCURATE if no step is accurate, else DONE.
+    """Store Gamma[first:last] in w.Gamma, by differences; return DONE, or GAMMA_INACCURATE if no step is accurate.
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 

@@ -114,7 +114,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_at(f, w, t, q):
-    """Factor the equations of accelerations at (t, q), with the rows at q, their factors and w.D; return a code."""
+    """Factor the equations of accelerations at (t, q), from the rows, their factors and w.D in w; return a code."""
     if f.flags[CONSTANT_MASS] == 0:
         w.notes[FACTORED] = 0.0
         mass_matrix(f, w, t, q)
@@ -138,8 +138,8 @@ def accelerate(f, w, t, q, v, a):
     solve(f, w, w.Q, w.Gamma, a)
     for j in range(a.size):
         if not np.isfinite(a[j]):
-            source = faulty_callback(w)
-            return not_finite(w.notes, source if source >= 0 or finite(w.M) else MASS, t, q)
+            callback = faulty_callback(w)
+            return not_finite(w.notes, callback if callback >= 0 or finite(w.M) else MASS, t, q)
     if f.flags[GAMMA_GIVEN] == 0 or w.Rate.size > w.C.size:
         _record_gamma_scale(w, a)
     return DONE
@@ -291,7 +291,7 @@ def _do_other_task(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task`, a number of tasks.py, at (t, q, v); return a code. The functions below explain the tasks."""
+    """Do `task`, one of the numbers in tasks.py, at (t, q, v); return a code. Functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
         return _do_other_task(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN) and w.notes[TIME_IS_UP] == 1.0:
@@ -320,7 +320,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 
 @merged
 def evaluate(f, w, t, q, v, tolerance, a):
-    """Store the dependent entries of q and v, from the independent ones, and the accelerations `a`; return a code.
+    """Compute from the independent entries of q and v the dependent ones, and the accelerations `a`; return a code.
 
     Velocities and accelerations are computed with the Jacobian that was factored last, at a position that differs from
     the final q by at most w.notes[REUSE].
@@ -330,7 +330,7 @@ def evaluate(f, w, t, q, v, tolerance, a):
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Evaluate a state that may be accepted: as `evaluate`, but up to rounding, and store lam, too; return a code."""
+    """Do what `evaluate` does, but up to rounding, for a state that may be accepted; also store lam; return a code."""
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
@@ -351,7 +351,7 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore(f, w, t, q, v, tolerance):
-    """Store the dependent entries of q and v, from the independent ones, up to rounding; return a code."""
+    """Compute from the independent entries of q and v the dependent ones, up to rounding; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
@@ -399,7 +399,7 @@ def check_redundant(f, w, t, q, v):
 
 @merged
 def rounding_floor(q):
-    """Return the largest change, due to rounding of q, at which a stagnant fixed-point iteration has converged."""
+    """Return the change in a fixed-point iteration that rounding of q may cause: a stagnant iteration has converged."""
     return max(ROUNDING_OF_CORRECTIONS, ROUNDING_OF_Q * largest_of(q))
 
 

@@ -82,10 +82,10 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 
 @exact
-def _results(program):
-    """Return the number of results, the index of the first result in the nodes, and where `program` has array indices.
+def _result_indices(program):
+    """Return the number of results, the index of the first result in the nodes, and where a list begins in `program`.
 
-    The array indices, one for each result, are the places of the results in the array that the program fills.
+    The list has, for each result, its index in the array that the program fills.
     """
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
@@ -95,13 +95,13 @@ def _results(program):
 def gamma_by_program(f, w, t, q, v):
     """Store in w.Gamma, by a program, the entries that no callback computes; return whether all values are finite.
 
-    Returns False if there is no program, too.
+    Also returns False if there is no program.
     """
     program = f.gamma_program
     if program.size == 0:
         return False
     _run_program(program, f.gamma_numbers, w.nodes, t, q, v)
-    n, first, indices = _results(program)
+    n, first, indices = _result_indices(program)
     for k in range(n):
         if not math.isfinite(w.nodes[first + k]):
             return False
@@ -113,13 +113,13 @@ def gamma_by_program(f, w, t, q, v):
 def jacobian_by_program(f, w, t, q, G):
     """Store C_q in the first rows of G, zero on entry, by a program; return whether all values are finite.
 
-    Returns False if there is no program, too.
+    Also returns False if there is no program.
     """
     program = f.jacobian_program
     if program.size == 0:
         return False
     _run_program(program, f.jacobian_numbers, w.nodes, t, q, q)
-    n, first, indices = _results(program)
+    n, first, indices = _result_indices(program)
     for k in range(n):
         if not math.isfinite(w.nodes[first + k]):
             return False

@@ -93,24 +93,24 @@ def full_pivoting(A, order, row_order, largest, first, last, max_rank):
     for i in range(k, last):
         largest[i] = _max_abs_from(A[i], k)
     while k < min(last, n_q) and k < max_rank:
-        r = k
+        pivot_row = k
         for i in range(k + 1, last):
-            if largest[i] > largest[r]:
-                r = i
-        if not largest[r] > RANK_TOLERANCE:
+            if largest[i] > largest[pivot_row]:
+                pivot_row = i
+        if not largest[pivot_row] > RANK_TOLERANCE:
             return k
-        s = k
-        while abs(A[r, s]) != largest[r]:
-            s += 1
-        if r != k:
-            row_order[k], row_order[r] = row_order[r], row_order[k]
-            largest[r] = largest[k]
+        pivot_column = k
+        while abs(A[pivot_row, pivot_column]) != largest[pivot_row]:
+            pivot_column += 1
+        if pivot_row != k:
+            row_order[k], row_order[pivot_row] = row_order[pivot_row], row_order[k]
+            largest[pivot_row] = largest[k]
             for j in range(n_q):
-                A[k, j], A[r, j] = A[r, j], A[k, j]
-        if s != k:
-            order[k], order[s] = order[s], order[k]
+                A[k, j], A[pivot_row, j] = A[pivot_row, j], A[k, j]
+        if pivot_column != k:
+            order[k], order[pivot_column] = order[pivot_column], order[k]
             for i in range(A.shape[0]):
-                A[i, k], A[i, s] = A[i, s], A[i, k]
+                A[i, k], A[i, pivot_column] = A[i, pivot_column], A[i, k]
         for i in range(k + 1, A.shape[0]):
             factor = A[i, k] / A[k, k]
             if factor != 0.0:
@@ -206,7 +206,7 @@ def _copy_sorted(source, target):
 
 @compiled
 def _adopt_order(w):
-    """Store the partition by the pivot order in w, and write its programs; return False if C_qd is singular."""
+    """Store the partition with the pivot order in w, and write its programs; return False if C_qd is singular."""
     rank, rank_v = w.rows.size, w.rows_v.size
     # indices are stored in ascending order, so that equal sets of coordinates are equal partitions
     _copy_sorted(w.row_order[:rank], w.rows)
@@ -287,7 +287,7 @@ def choose_partition(f, w, t, q):
 
 @compiled
 def partition_of_midpoint(f, w, t_mid, state, new_state):
-    """Adopt the partition that full pivoting chooses in the middle of a step; return CHANGED, or DONE if unchanged.
+    """Adopt the partition that full pivoting chooses at the middle of a step; return CHANGED, DONE or SINGULAR.
 
     The reversed step has the same middle, so that the partition, and with it the step by a symmetric tableau, is
     symmetric in time. A partition that is used until it is poor would depend on the direction of time.
@@ -348,9 +348,9 @@ def _largest_coefficient(w):
             continue
         row_scale = _max_abs_from(w.G[row], 0)
         for k in range(rows.size):
-            scaled = abs(w.minimum[begin + k]) * _max_abs_from(w.G[rows[k]], 0)
-            if scaled > largest * row_scale:
-                largest = scaled / row_scale
+            scaled_coefficient = abs(w.minimum[begin + k]) * _max_abs_from(w.G[rows[k]], 0)
+            if scaled_coefficient > largest * row_scale:
+                largest = scaled_coefficient / row_scale
         begin += rows.size
     return largest
 
@@ -496,7 +496,7 @@ def find_null_space(f, w, t, q):
 def restore_velocities(f, w, t, q, v, reuse):
     """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, with rows and factors in w.
 
-    If no velocity changes by more than `reuse`, w.Gamma stays valid if the fused callback has computed it (KNOWN).
+    If no velocity changes by more than `reuse`, w.Gamma by the fused callback stays valid (KNOWN).
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size

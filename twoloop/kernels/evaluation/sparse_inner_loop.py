@@ -156,7 +156,7 @@ def factor_at(f, w, t, q):
 
 @compiled
 def solve_values(f, w, n_corrections):
-    """Replace the right-hand side in w.unknowns by the solution, with `n_corrections`; see `solve_refined`."""
+    """Replace the right-hand side in w.unknowns by the solution, corrected `n_corrections` times by refinement."""
     n = f.static_program[N_PIVOTS]
     scratch = w.solutions
     return solve_refined(
@@ -209,7 +209,7 @@ def _count_independent(counts):
 def _choose_rows(f, w, t, q):
     """Choose independent rows, store the choice (1 or 0) in w.counts, and factor with these rows; return a code.
 
-    Rows with small pivots are left out at first, then added one by one if independent of the rows chosen so far.
+    Rows with small pivots are left out at first, then added one by one if they are independent of the chosen rows.
     """
     w.counts[:] = 1.0
     if not _factor(f, w, SUSPECT_PIVOT) > 0.0:
@@ -233,7 +233,7 @@ def _choose_rows(f, w, t, q):
 
 @compiled
 def _adopt_rows(w):
-    """Store the indices of the rows with w.counts = 1 in w.rows_v; return SINGULAR if their number differs, or DONE."""
+    """Store the indices of the rows with w.counts = 1 in w.rows_v; return DONE, or SINGULAR if their number differs."""
     if _count_independent(w.counts) != w.rows_v.size:
         return SINGULAR
     position = 0
@@ -429,7 +429,7 @@ def _rows_hold(f, w, q):
 
 @compiled
 def _project(f, w, t, q, v, theta):
-    """Project (q, v) onto the constraints in place; the last correction does not renew the factors; return a code."""
+    """Project (q, v) onto the constraints in place; return a code. The final factors precede the last correction."""
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):
@@ -469,7 +469,7 @@ def _project(f, w, t, q, v, theta):
 
 @compiled
 def _mass_pattern_holds(w):
-    """Return whether w.M has entries only where the program expects them; True if w.M is empty, and not used."""
+    """Return whether w.M is empty, or has nonzero entries only where the program expects them."""
     return w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern)
 
 
@@ -494,7 +494,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 
 @compiled
-def _solve_task(f, w, r, c, a, lam):
+def _solve_system(f, w, r, c, a, lam):
     """Store in `a` and lam the accelerations and multipliers for the right-hand side (r, c); return DONE."""
     n = r.size
     copy(r, w.unknowns[:n])
@@ -517,7 +517,7 @@ def _do_other_task(f, w, task, t, q, v, a, lam):
     if task == tasks.CHECK_REDUNDANT:
         return _check_redundant_rows(f, w, t, q, v)
     if task == tasks.SOLVE:
-        return _solve_task(f, w, q, v, a, lam)
+        return _solve_system(f, w, q, v, a, lam)
     return NEEDS_DENSE
 
 

@@ -14,5 +14,5 @@
     ADOPT_MIDPOINT,
     VERIFY_PATTERN,
     CHECK_REDUNDANT,
-    SOLVE,  # only in large systems, see sparse_inner_loop.py
+    SOLVE,  # this task exists only for large systems, see sparse_inner_loop.py
 ) = range(14)

@@ -158,7 +158,7 @@ def _border(numbers, n, n_c, b):
 
 
 @inlined
-def _complement(numbers, n, n_c, b):
+def _schur_complement(numbers, n, n_c, b):
     start = n * (3 * b + 1) + n_c * n
     return numbers[start : start + n_c * n_c].reshape((n_c, n_c))
 
@@ -185,7 +185,7 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
         for j in range(n):
             border[i, j] = Cq[i, j]
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, n_c, band, 3 * b + 1, exchanges, border, n))
-    S = _complement(numbers, n, n_c, b)
+    S = _schur_complement(numbers, n, n_c, b)
     for i in range(n_c):
         for k in range(n_c):
             S[i, k] = 0.0
@@ -205,7 +205,7 @@ def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
         mu[i] = 0.0
         for j in range(n):
             mu[i] += Cq[i, j] * x[j]
-    lu_solve(_complement(numbers, n, n_c, b), pivots[n - n_c :], mu)
+    lu_solve(_schur_complement(numbers, n, n_c, b), pivots[n - n_c :], mu)
     border = _border(numbers, n, n_c, b)
     for i in range(n_c):
         for j in range(n):

@@ -55,21 +55,21 @@ def lu_factor(A, pivots):
     smallest = 1e300
     largest = 0.0
     for k in range(n):
-        p = k
+        pivot_row = k
         pivot_size = _magnitude(A[k, k])
         for i in range(k + 1, n):
             magnitude = _magnitude(A[i, k])
             if magnitude > pivot_size:
                 pivot_size = magnitude
-                p = i
-        pivots[k] = p
+                pivot_row = i
+        pivots[k] = pivot_row
         if not pivot_size > 0.0:  # also true for NaN
             return 0.0
         smallest = min(smallest, pivot_size)
         largest = max(largest, pivot_size)
-        if p != k:
+        if pivot_row != k:
             for j in range(n):
-                A[k, j], A[p, j] = A[p, j], A[k, j]
+                A[k, j], A[pivot_row, j] = A[pivot_row, j], A[k, j]
         inverse = 1.0 / A[k, k]
         A[k, k] = inverse
         for i in range(k + 1, n):
@@ -83,7 +83,7 @@ def lu_factor(A, pivots):
 
 @merged
 def lu_sign(A, pivots):
-    """Return the sign of the determinant of a real matrix, from its factors A and `pivots` by `lu_factor`."""
+    """Return the sign of the determinant of a real matrix, from its factors A and `pivots` from `lu_factor`."""
     sign = 1.0
     for k in range(A.shape[0]):
         if (A[k, k] < 0.0) != (pivots[k] != k):
@@ -93,12 +93,12 @@ def lu_sign(A, pivots):
 
 @merged
 def lu_solve(A, pivots, x):
-    """Replace the right-hand side x by the solution, with the factors A and `pivots` by `lu_factor`."""
+    """Replace the right-hand side x by the solution, with the factors A and `pivots` from `lu_factor`."""
     n = A.shape[0]
     for k in range(n):
-        p = pivots[k]
-        if p != k:
-            x[k], x[p] = x[p], x[k]
+        pivot_row = pivots[k]
+        if pivot_row != k:
+            x[k], x[pivot_row] = x[pivot_row], x[k]
     for i in range(1, n):
         total = x[i]
         for j in range(i):
@@ -156,7 +156,7 @@ def invert_definite(A):
 
 @merged
 def ldl_solve(A, x):
-    """Replace the right-hand side x by the solution, with the factors A by `ldl_factor`."""
+    """Replace the right-hand side x by the solution, with the factors A from `ldl_factor`."""
     n = A.shape[0]
     for k in range(n):
         if x[k] != 0.0:
@@ -172,7 +172,7 @@ def ldl_solve(A, x):
 
 @merged
 def ldl_solve_rows(A, B):
-    """Replace the right-hand sides, the columns of B, by the solutions, with the factors A by `ldl_factor`."""
+    """Replace the right-hand sides, the columns of B, by the solutions, with the factors A from `ldl_factor`."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):

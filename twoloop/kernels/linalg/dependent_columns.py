@@ -46,7 +46,7 @@ def _find_constant_pivot(R, K, row_active, row_sizes, column_sizes):
 
 @compiled
 def _is_pivot_block(R, column_active, squared_norms, i, k, j, l, max_squares, min_sine_square):
-    """Return whether rows i and k with columns j and l may be a pivot block; i == k and j == l: a single pivot."""
+    """Return whether rows i, k and columns j, l may be a pivot block; a single pivot has i == k and j == l."""
     n, total = R.shape[1], 0.0
     if i == k:
         square = R[i, j] * R[i, j]
@@ -143,7 +143,7 @@ def _subtract_multiple(R, K, column_active, row_sizes, column_sizes, r, j, i):
 
 @compiled
 def _eliminate(R, K, row_active, column_active, row_sizes, column_sizes, i, k, j, l):
-    """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate them in other rows.
+    """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate these columns.
 
     `row_sizes` and `column_sizes` are the numbers of entries left in each row and column. They stay correct only while
     single rows are eliminated (i == k), not after a block of two rows.

@@ -41,7 +41,7 @@ SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
 # ROW_POSITION, COLUMN_POSITION: positions in the order so far. WHERE: scratch, for 1 + the index of a row in the list
 # of a column, or for the slot of the entry in a column
 ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_POSITION, COLUMN_POSITION, WHERE, N_COUNTS = range(7)
-# indices of lists. COLUMNS, SOURCES: of the entries of each row. ROWS: of the entries of each column
+# indices of lists. COLUMNS, SOURCES: columns and sources of a row's entries. ROWS: rows of a column's entries
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
@@ -92,7 +92,7 @@ def end_upper(r):
 
 @merged
 def begin_lower(r):
-    """Return the position in `index` of the list of the first entries of the rows of L, then of the last row's end."""
+    """Return the position in `index` of the list of the first entries of the rows of L; it ends with the end of L."""
     return N_HEAD + 5 * r
 
 
@@ -138,9 +138,10 @@ def put_entry(matrix, i, j, number, source):
 
 @compiled
 def _choose_pivot(matrix, rows, columns, k):
-    """Return row and column of pivot k, the large enough entry that causes the least fill-in; (-1, -1): there is none.
+    """Return row and column of pivot k; (-1, -1) if no entry is large enough.
 
-    Of entries with equal fill-in, the largest is chosen; of equally large ones, the first in the order so far.
+    The pivot is the entry that causes the least fill-in among those large enough, see THRESHOLD. Of entries with equal
+    fill-in, the largest is chosen; of equally large ones, the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -169,7 +170,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Bring the index `chosen` to position k of `order` by an exchange; return -1, or 1 if it is there already."""
+    """Exchange two indices so that `chosen` is at position k of `order`; return the sign of this permutation."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -262,11 +263,11 @@ def _sort_and_count(rows, counts, lists):
         i = rows[k]
         _sort_row(lists[COLUMNS, i], lists[SOURCES, i], counts[ROW_SIZE, i], position)
         entries += counts[ROW_SIZE, i]
-        lower = 0
-        while position[lists[COLUMNS, i, lower]] < k:
-            subtractions += counts[ROW_LEFT, position[lists[COLUMNS, i, lower]]]
-            lower += 1
-        counts[ROW_LEFT, k] = counts[ROW_SIZE, i] - lower - 1
+        n_lower = 0
+        while position[lists[COLUMNS, i, n_lower]] < k:
+            subtractions += counts[ROW_LEFT, position[lists[COLUMNS, i, n_lower]]]
+            n_lower += 1
+        counts[ROW_LEFT, k] = counts[ROW_SIZE, i] - n_lower - 1
     return entries, subtractions
 
 
@@ -347,11 +348,10 @@ def make_program(G, pattern, rows, columns, index, values):
 
 @merged
 def factor(entries, index, values):
-    """Store in `values` the factors of G[rows][:, columns], with 1/pivot on the diagonal.
+    """Store in `values` the factors of G[rows][:, columns], 1/pivot on the diagonal; return min|pivot| / max|pivot|.
 
-    `entries` is G, with a last row of zeros, as a vector. Returns the ratio of the smallest to the largest pivot. A
-    negative result (0 from dense factors) means that a pivot is zero or not finite, or that a multiplier exceeds
-    MAX_MULTIPLIER: the order of elimination must be chosen again.
+    `entries` is G, with a last row of zeros, as a vector. A negative result (0 from dense factors) means that a pivot
+    is zero or not finite, or that a multiplier exceeds MAX_MULTIPLIER: another order of elimination must be chosen.
     """
     r = index[SIZE]
     if index[DENSE] == 1:

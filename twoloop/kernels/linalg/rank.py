@@ -23,7 +23,7 @@ def _dot(x, y):
 
 @compiled
 def _orthogonalise(basis, n, rest, parts):
-    """Subtract from `rest` its components along n orthonormal rows, add these to `parts`; return the squared norm."""
+    """Subtract from `rest` its components along n orthonormal rows, and add them to `parts`; return |rest|^2."""
     for i in range(n):
         part = _dot(basis[i], rest)
         if part != 0.0:
@@ -66,13 +66,13 @@ def select_rows(G, min_sine, basis, factors, kept):
 
 @kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
 def independent_rows(G, min_sine, basis, factors, kept):
-    """Return the result of `select_rows`, for calls from Python."""
+    """Return the result of `select_rows`, as a kernel that Python can call."""
     return select_rows(G, min_sine, basis, factors, kept)
 
 
 @merged
-def _find_coefficients(n, basis, factors, row, coefficients):
-    """Store the `coefficients` (n) of the n selected rows in `row`, by least squares."""
+def _fill_coefficients(n, basis, factors, row, coefficients):
+    """Store the `coefficients` (n) of that combination of the n selected rows which is nearest to `row`."""
     for k in range(n):
         coefficients[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -100,7 +100,7 @@ def norm_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept, coefficients, norms):
-    """Return whether the first n rows in `order` are independent; if so, express all other rows by them.
+    """Return whether the first n rows in `order` are independent; if so, express the other rows as their combinations.
 
     n is the number of rows of `chosen_rows`, in which the first n rows are stored. Row i of `coefficients` receives the
     coefficients, by least squares, with which row order[n + i] is a combination of the first n rows; `norms` receives
@@ -115,7 +115,7 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
     if select_rows(chosen_rows, min_sine, basis, factors, kept) < n:
         return False
     for i in range(len(coefficients)):
-        _find_coefficients(n, basis, factors, rows[order[n + i]], coefficients[i])
+        _fill_coefficients(n, basis, factors, rows[order[n + i]], coefficients[i])
     return True
 
 
@@ -133,7 +133,7 @@ def least_solution(rows, values, min_sine, basis, factors, kept, coefficients, g
         if i - n_others < n and kept[i - n_others] == i:
             y[i - n_others] = values[i]
             continue
-        _find_coefficients(n, basis, factors, rows[i], coefficients[n_others])
+        _fill_coefficients(n, basis, factors, rows[i], coefficients[n_others])
         z[n_others] = values[i]
         n_others += 1
     for i in range(n_others):
@@ -255,7 +255,7 @@ def _scale_of_added_rows(mass, G):
 
 
 @merged
-def _sort_by_entries(G, order, counts):
+def _sort_rows_by_entries(G, order, counts):
     """Sort the rows of G by their numbers of entries: store their indices in `order`, the numbers in `counts`."""
     for k in range(len(G)):
         count, i = 0.0, k
@@ -321,7 +321,7 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_ke
             if position < n_kept and kept[position] == i:
                 position += 1
                 continue
-            _find_coefficients(n_kept, basis, factors, G[i], coefficients)
+            _fill_coefficients(n_kept, basis, factors, G[i], coefficients)
             row_square = _dot(G[i], G[i])
             for k in range(n_kept):
                 kept_square = _dot(G[kept[k]], G[kept[k]])
@@ -417,7 +417,7 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
     n_added, scale = 0, 1.0
     if n_kept > 0 and weak_ratio > 0.0 and _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
         scale = _scale_of_added_rows(mass, G)
-        _sort_by_entries(G, order, sizes)
+        _sort_rows_by_entries(G, order, sizes)
         n_added = _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added)
     chosen[0], chosen[1], first_bound = n_kept, max(n_added, 0), n_added
     if n_added >= 0:

@@ -248,7 +248,7 @@ def solve_schur(f, w, r, c, a):
             a[j] -= solved[i, j] * w.z[i]
 
 
-# smallest number of rows, and of degrees of freedom, with which the augmented form is the fastest (7 on chains)
+# smallest number of rows, and of degrees of freedom, with which the augmented form is the fastest (on chains: 7)
 MIN_ROWS = 8
 # smallest number of coordinates with which the augmented form is the fastest even with fewer degrees of freedom, unless
 # M is diagonal (measured: about 30)
@@ -357,7 +357,7 @@ def _factor_sparse_or_dense(f, w):
 
 @merged
 def factor(f, w):
-    """Factor the equations of accelerations, with w.M, the rows, their factors and w.D, in form FORM; return a code."""
+    """Factor the equations of accelerations, from w.M, the rows, their factors and w.D in w; return a code."""
     if w.notes[FACTORED] == 1.0:
         return DONE
     code = _factor_sparse_or_dense(f, w) if f.flags[FORM] == AUGMENTED else DONE

@@ -28,7 +28,7 @@ NOT_DEFINITE = -1.0  # value that `factor` returns instead of the smallest squar
 
 
 @compiled
-def _find_stiffness(program, mass, jacobian, stiffness, scratch):
+def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
     """Store in `stiffness`, for each row g that stiffens M, s = largest diagonal entry of M in columns of g / |g|^2."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
@@ -66,7 +66,7 @@ def load(program, mass, jacobian, values, stiffness, scratch):
         values[slots[k]] += jacobian[k]
     product_rows, first, second, slots = stiffened_of(program)
     if product_rows.size > 0:
-        _find_stiffness(program, mass, jacobian, stiffness, scratch)
+        _fill_stiffness(program, mass, jacobian, stiffness, scratch)
         for u in range(product_rows.size):
             values[slots[u]] += stiffness[product_rows[u]] * jacobian[first[u]] * jacobian[second[u]]
 
@@ -161,7 +161,7 @@ def add_redundant_stiffness(program, jacobian, counts, stiffness, c, right):
 
 @compiled
 def subtract_product(program, mass, jacobian, counts, x, b):
-    """Subtract [M x_q + G^T x_c, G x_q] from b in place; entries of redundant rows become zero."""
+    """Subtract [M x_q + G^T x_c, G x_q] from b in place, for x = [x_q, x_c]; set entries of redundant rows to zero."""
     n_q = program[N_COORDINATES]
     rows, columns, _ = mass_of(program)
     for k in range(rows.size):
@@ -178,7 +178,7 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 
 @compiled
 def solve_refined(program, mass, jacobian, counts, values, stiffness, x, n_corrections, right, residual, y):
-    """Replace the right-hand side x = [r, c] by the solution [a, lam], refined by `n_corrections` corrections.
+    """Replace the right-hand side x = [r, c] by the solution [a, lam], corrected `n_corrections` times by refinement.
 
     Returns max|a| of the last correction over max|a|; 0 without corrections. The last three arguments are scratch.
     """

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MAX_JOINTS = 4  # largest number of joints of a body that is eliminated before its joints; with more, the body is a hub
+MAX_JOINTS = 4  # a body with at most this number of joints is eliminated before them; a body with more joints is a hub
 
 Integers = NDArray[np.int64]
 
@@ -113,9 +113,9 @@ def elimination_order(
     mass_entries, jacobian_entries : (rows, columns)
         Entries of M and of G.
     together : iterable of sequence of int
-        Coordinates that form one body although M does not couple them.
+        Groups of coordinates that form one body each, even if M does not couple them.
     first : sequence of int
-        Rows of single bodies that are eliminated before all joints, unless the body is a hub, and so are independent.
+        Rows of single bodies; they are eliminated before all joints, and so are independent, unless the body is a hub.
     couplings : (rows, columns), optional
         Entries of K and D, which couple bodies as springs do. All bodies are then hubs, each with its rows in `first`.
     """
@@ -216,7 +216,7 @@ def _minimum_degree(
         if done[node] or degree_on_heap != degree(node):
             continue  # a newer entry of the heap replaces this one
         if node < n_joints and not supports.may_eliminate(node):
-            continue  # the hub that supports its parts is a neighbour: its elimination puts the joint on the heap again
+            continue  # a hub that supports its parts is a neighbour: when this hub is eliminated, the joint is pushed again
         done[node] = True
         order.append(node)
         affected = neighbours[node]
@@ -232,13 +232,12 @@ def _minimum_degree(
     return order
 
 
-Entries = tuple[Integers, Integers]  # rows and columns
+Entries = tuple[Integers, Integers]  # row indices and column indices of the nonzero entries of a matrix
 
 # indices of the sizes with which a program begins; the functions below return the sections that follow
 N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # largest number of updates (multiplications) with which a program is always written
-# larger programs are written only if they are faster than dense factors: largest number of updates, relative to n^3 for
-# n pivots
+# largest number of updates of a longer program, relative to n^3 for n pivots: with more, dense factors are faster
 MAX_UPDATE_RATIO = 1e-3
 MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer one takes too much memory
 
@@ -251,7 +250,7 @@ def factorization_program(
     together: Iterable[Sequence[int]] = (),
     stiff_rows: Sequence[int] = (),
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors M and G; None if it would have too many updates.
+    """Return the program that factors M and G; None if the program would have too many updates.
 
     Parameters
     ----------
@@ -300,16 +299,16 @@ def program_in_order(
         seconds.append(rows_in_column[j])
     first_of, second_of = np.concatenate(firsts), np.concatenate(seconds)
     runs = _runs(slots(first_of, second_of), first_of == second_of)
-    source = slots(low, high)
+    entry_slots = slots(low, high)
     n_mass = len(mass[0])
     # entries of M above the diagonal get slots of U, or, with symmetric factors, a slot that is never read
-    above = rows[:n_mass] < columns[:n_mass]
-    source[:n_mass][above] = source[:n_mass][above] + len(keys) if unsymmetric else n + len(keys)
+    is_above = rows[:n_mass] < columns[:n_mass]
+    entry_slots[:n_mass][is_above] = entry_slots[:n_mass][is_above] + len(keys) if unsymmetric else n + len(keys)
     product_rows, first, second = _products_of_entries(jacobian[0], stiff_rows)
     one, other = (position[jacobian[1][indices]] for indices in (first, second))
     stiffened = [product_rows, first, second, slots(np.minimum(one, other), np.maximum(one, other))]
     head = [n_q, n, len(keys), len(first_of), len(runs), n_mass, len(jacobian[0]), len(product_rows)]
-    parts = [order, begin, row_of, runs, *mass, source[:n_mass], *jacobian, source[n_mass:], *stiffened]
+    parts = [order, begin, row_of, runs, *mass, entry_slots[:n_mass], *jacobian, entry_slots[n_mass:], *stiffened]
     return np.concatenate([np.array(head), *parts]).astype(np.int32)
 
 
@@ -376,7 +375,7 @@ def end_of_sections(program):
 
 @inlined
 def order_of(program):
-    """Return the index of each pivot: j for coordinate j, n_q + i for row i of G."""
+    """Return the indices of the pivots in the order of elimination: j for coordinate j, n_q + i for row i of G."""
     return program[N_HEAD : N_HEAD + program[N_PIVOTS]]
 
 
@@ -397,7 +396,7 @@ def runs_of(program):
 
 @inlined
 def mass_of(program):
-    """Return rows, columns and slots of the values of M."""
+    """Return the rows, columns and slots of the entries of M."""
     n = program[N_OF_MASS]
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
@@ -405,7 +404,7 @@ def mass_of(program):
 
 @inlined
 def jacobian_of(program):
-    """Return rows, columns and slots of the values of G."""
+    """Return the rows, columns and slots of the entries of G."""
     n = program[N_OF_JACOBIAN]
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS] + 3 * program[N_OF_MASS]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]

@@ -27,7 +27,7 @@ LEAST_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or a s
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
 STEP_SIZE_FACTOR = 6.0  # second factor on the error estimate, for the next step size only, as in VODE: fewer rejections
 ORDER_FACTOR = 1.4  # factor on the error estimates of other orders, so that the order rarely changes to and fro
-KEEP_BELOW = 1.2  # smallest factor by which the step size is increased; by a smaller factor it is kept
+KEEP_BELOW = 1.2  # smallest factor by which the step size is increased; with a smaller factor, the step size is kept
 GROWTH = 2.0  # largest ratio of successive step sizes
 
 # indices in `options` of the scalars; the options of the Gauss steps follow

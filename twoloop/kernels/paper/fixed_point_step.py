@@ -82,16 +82,16 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(v1, v_full)
         for j in range(s):
             interpolate(c, 0.5 * c[j], trial, weights, half[j])
-        g = 0.5 * h
+        h_half = 0.5 * h
         code, distance_mid = iterate_accelerations(
-            f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid, rounding
+            f, w, options, tolerances, t, h_half, q, v, half, Q_stage, V_stage, q_mid, v_mid, rounding
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
         code, distance = iterate_accelerations(
-            f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rounding
+            f, w, options, tolerances, t + h_half, h_half, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rounding
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
@@ -138,14 +138,16 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(v1, v_full)
         for j in range(s):
             copy(A_stage[j], A_full[j])
-        g = 0.5 * h
-        code = iterate_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
+        h_half = 0.5 * h
+        code = iterate_first_order(
+            f, w, options, t, h_half, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid
+        )
         if code == DONE:
-            code = accelerations(f, w, t + g, q_mid, v_mid, a_mid, w.lam)
+            code = accelerations(f, w, t + h_half, q_mid, v_mid, a_mid, w.lam)
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         code = iterate_first_order(
-            f, w, options, t + g, g, q_mid, v_mid, a_mid, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1
+            f, w, options, t + h_half, h_half, q_mid, v_mid, a_mid, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)

@@ -104,7 +104,7 @@ def _clear_rounding_errors(coordinates, rounding):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
-    """Take a step of size h from (q, v) by fixed-point iteration on the stage accelerations; return code, departure.
+    """Take a step of size h from (q, v) by iteration on the stage accelerations; return a code and the departure.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
     the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
@@ -171,7 +171,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
 @merged
 def _largest_change(coordinates, q, v, q_old, v_old):
-    """Return the largest change of `coordinates` and their velocities since (q_old, v_old), over max(1, |value|)."""
+    """Return the largest change of `coordinates` and their velocities since (q_old, v_old), per max(1, |value|)."""
     change = 0.0
     for m in coordinates:
         change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
@@ -231,13 +231,13 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
         change = _largest_change(w.independent, q1, v1, q_old, v_old)
         if options[OUTER_TEST] == 1.0:
             change = max(change, _largest_change(w.dependent, q1, v1, q_old, v_old))
-        if change <= options[OUTER_TOL]:  # (32)
+        if change <= options[OUTER_TOL]:  # test (32) of the paper
             return DONE
         norm = 0.0
         for m in range(n):
             norm += (q1[m] - q_old[m]) ** 2 + (v1[m] - v_old[m]) ** 2
         norm = np.sqrt(norm)
-        if not norm <= norm_before:  # (33)
+        if not norm <= norm_before:  # test (33) of the paper
             return OUTER_DIVERGED
         norm_before = norm
     return OUTER_DIVERGED
@@ -254,10 +254,10 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
     largest_component = 0.0
     for m in range(q.size):
         atol = tolerances[ATOL + m]
-        sum_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
-        sum_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
-        total += sum_q * sum_q + sum_v * sum_v
-        largest_component = max(largest_component, abs(sum_q), abs(sum_v))
+        component_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
+        component_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
+        total += component_q * component_q + component_v * component_v
+        largest_component = max(largest_component, abs(component_q), abs(component_v))
     return largest_component if largest else np.sqrt(total / (2 * q.size))
 
 

@@ -9,8 +9,8 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# factor: if a step increases the largest |coordinate| so far by more, _motion_rate attributes the coordinates to this
-# step, as after rest at the origin
+# _motion_rate treats a step as a start from rest at the origin if the step increases the largest |coordinate| so far by
+# more than this factor
 GROWTH_AFTER_REST = 2.0
 TINY = 1e-300  # added to the tolerance, which is zero for a mechanism at rest at the origin
 
@@ -18,7 +18,7 @@ TINY = 1e-300  # added to the tolerance, which is zero for a mechanism at rest a
 # (n_q) follow
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
-# indices in `options`
+# indices in `options` of newmark_step
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
@@ -32,7 +32,7 @@ def _largest_abs(x, at_least):
 
 @compiled
 def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
-    """Return the rate of the motion, 1/s: the reciprocal of the time in which the largest coordinate changes by itself.
+    """Return the rate of the motion, 1/s: one over the time in which the largest coordinate changes by its own value.
 
     The time follows from the largest absolute coordinate, velocity and acceleration so far, because all coordinates may
     be near zero at a single time, depending on the origin. If the largest coordinate is mainly caused by this step, as
@@ -97,7 +97,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
                 error = _error(options, tolerances, rate, h, q, v, a, a1)
-                if options[ERROR_TOL] == 0.0:  # not in the paper
+                if options[ERROR_TOL] == 0.0:  # the paper does not have the estimate `departure`
                     for k in range(w.dependent.size):
                         m = w.dependent[k]
                         w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
