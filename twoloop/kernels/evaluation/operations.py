@@ -83,20 +83,14 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, the index of the first result in the nodes, and where a list begins in `program`.
-
-    The list has, for each result, its index in the array that the program fills.
-    """
+    """Return the number of results, the first node that is a result, and where `program` lists the results' indices."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Store in w.Gamma, by a program, the entries that no callback computes; return whether all values are finite.
-
-    Also returns False if there is no program.
-    """
+    """Store entries of Gamma without a callback; return False if there is no program, or a value is not finite."""
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -111,10 +105,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in the first rows of G, zero on entry, by a program; return whether all values are finite.
-
-    Also returns False if there is no program.
-    """
+    """Store C_q in rows of G, zero on entry; return False if there is no program, or a value is not finite."""
     program = f.jacobian_program
     if program.size == 0:
         return False

@@ -171,10 +171,7 @@ def _scratch(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the bordered system in `numbers` by the routines `factorize` (xGBTRF) and `substitute` (xGBTRS).
-
-    Returns DONE, or SINGULAR if a matrix is singular.
-    """
+    """Factor the bordered system in `numbers` by xGBTRF (`factorize`) and xGBTRS (`substitute`); return a code."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     exchanges = pivots[: n - n_c].view(np.int32)

@@ -216,7 +216,7 @@ def _minimum_degree(
         if done[node] or degree_on_heap != degree(node):
             continue  # a newer entry of the heap replaces this one
         if node < n_joints and not supports.may_eliminate(node):
-            continue  # a hub that supports its parts is a neighbour: when this hub is eliminated, the joint is pushed again
+            continue  # a hub that supports its parts is a neighbour: the elimination of this hub pushes the joint again
         done[node] = True
         order.append(node)
         affected = neighbours[node]
