@@ -101,7 +101,7 @@ class Interpolator:
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
         self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of them
-        # times and states that divide an interval, including its ends, by the time at which the interval begins
+        # interior states of intervals, with both ends: (times, states) by the time at which the interval begins
         self.filled: dict[float, tuple[Array, Array]] = {}
         # memory arrays of steps across singular positions, with their polynomials, by the first times of the intervals
         self.across: dict[float, Array] = {}
@@ -367,10 +367,10 @@ class Interpolator:
         for block in _blocks(groups):
             self._divide_where_needed(table, block)
             begins = table.t[block[:, indices.FIRST_OWN]].tolist()
-            divided = [self.filled[t] for t in begins if t in self.filled]
-            shape = (len(divided), self.parts + 1)
+            pairs = [self.filled[t] for t in begins if t in self.filled]
+            shape = (len(pairs), self.parts + 1)
             t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
-            for row, (own_t, own) in enumerate(divided):
+            for row, (own_t, own) in enumerate(pairs):
                 t[row, : len(own_t)], states[row, : len(own)] = own_t, own
             yield t, states
 
@@ -460,7 +460,7 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.complete(times, rows, a_and_lam)
-        if interpolator.static is not None or interpolator.repairs:  # the interpolator may have another workspace
+        if interpolator.static is not None or interpolator.repairs:  # its workspace may not suit another run
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 

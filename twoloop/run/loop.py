@@ -295,7 +295,7 @@ class IntegrationLoop:
         is_crossing = self.plan is not run.plan and not run.pieces and run.control[a.FIXED_STEP] == 0.0
         if is_crossing:  # the next output time does not shorten attempts across a singular position
             outputs = np.append(outputs[:-1], self.t1 + FAR_BEYOND * (self.t1 - run.t0))
-        self.filled[:] = 0  # Ctrl-C may arrive before `advance` sets it
+        self.filled[:] = 0  # Ctrl-C may arrive before `advance` sets these numbers
         try:
             with self._stopped_in_time():
                 self.code = run.advance(outputs, buffers, self.filled, (self.plan, self.control, self.kit))

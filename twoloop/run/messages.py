@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of the loop in Python, besides those that advance() returns
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of ends of runs, besides those that `advance` returns
 STAGNATION_STEPS = 20_000  # smallest number of accepted steps over which the mean step size is computed
 # A run stalls if its mean step size is below STAGNATION_PACE times the largest one, and the rest of the run would take
 # more than STAGNATION_LEFT steps. It also stalls if the rest would take more than OUT_OF_REACH steps, which take days.
@@ -118,7 +118,7 @@ class StiffnessMonitor:
         self.last = last if last.size == LAST_STEPS else np.concatenate([self.last, last])[-LAST_STEPS:]
 
     def sample_state(self, t: float, state: Array, n_q: int) -> None:
-        """Add a sample at the state after the last steps; in long runs only at every second, fourth, ... call."""
+        """Add the state after the last steps as a sample; in long runs only at every second, fourth, ... call."""
         if self.plan.stable_to is None or self.last.size < LAST_STEPS:
             return
         self.n_seen += 1
@@ -191,9 +191,9 @@ def _dominant_eigenvalue(
         largest = float(np.abs(image).max(initial=0.0))
         if not 0.0 < largest < np.inf:
             return 0.0, False
-        previous = direction[independent]
-        cosine = float(image @ previous) / float(np.linalg.norm(image) * np.linalg.norm(previous))
-        eigenvalue, is_negative = largest / (displacement * float(np.abs(previous).max())), cosine < -ALIGNED
+        old_direction = direction[independent]
+        cosine = float(image @ old_direction) / float(np.linalg.norm(image) * np.linalg.norm(old_direction))
+        eigenvalue, is_negative = largest / (displacement * float(np.abs(old_direction).max())), cosine < -ALIGNED
         direction[independent] = image / largest
     return eigenvalue, is_negative
 

@@ -46,7 +46,7 @@ class Options:
 
     @cached_property
     def own_tolerance(self) -> float | None:
-        """Tolerance of a method with its own error test (Newmark), which replaces rtol and atol, else None."""
+        """Tolerance that replaces rtol and atol in a method with its own error test (Newmark); None: no such test."""
         return getattr(self.method, "error_tol", None)
 
     @cached_property
@@ -57,7 +57,7 @@ class Options:
 
     def set_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
-        run.work.notes[indices.KINK_AFTER] = t1  # no jump of C_t is known so far
+        run.work.notes[indices.KINK_AFTER] = t1  # next jump of C_t: none is known before t1
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, t1)
 

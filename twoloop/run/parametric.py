@@ -74,7 +74,7 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region in which runs, with or without checks of derivatives, have compared callbacks so far."""
+        """Return the region in which runs, `with_derivatives` or without, have compared callbacks so far."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 

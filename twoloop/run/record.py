@@ -195,10 +195,10 @@ class Recorder:
     Attributes
     ----------
     search : EventSearch or None
-        Search for events, with the events found so far.
+        Search for events, which contains the events so far.
     n_steps, last_step : int, float
-        Number of steps searched so far; after a terminal event, that of steps up to it, and the time, s, from the
-        beginning of the last step to the event.
+        Number of steps searched so far, at most up to a terminal event; time, s, from the beginning of the last step to
+        this event, else 0.
     interrupted : bool
         Whether Ctrl-C interrupted the search for events, or the interpolation between the steps.
     """
@@ -597,7 +597,7 @@ INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record with one row per step; update `counts` (as INITIAL_COUNTS) to totals after them."""
+    """Return fields of a record with one row per step; `counts`: see INITIAL_COUNTS, updated to after these steps."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -621,7 +621,7 @@ def fields_of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
 
 
 def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
-    """Return the fields t, q, v, a and lam of a record; `table`: rows [q, v, a, lam] at times t; n: number of q."""
+    """Return the fields t, q, v, a and lam of a record with n coordinates; `table`: rows [q, v, a, lam] at times t."""
     columns = table.T
     return {"t": t, "q": columns[:n], "v": columns[n : 2 * n], "a": columns[2 * n : 3 * n], "lam": columns[3 * n :]}
 

@@ -140,7 +140,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return arguments and value of a compiled force at the start; for Python functions, clear samples, return None."""
+    """Return (arguments, value) of a compiled force at the start; for Python functions clear samples, return None."""
     if functions := python_functions(system):
         functions.restart()
         return None
@@ -266,8 +266,8 @@ class IndependentRerun:
         self.buffers, self.filled = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
 
-    def integrate(self, t0: float, state: Array, times: Array, most: int) -> RerunPiece | None:
-        """Integrate from a state [q, v] at t0 to all `times`; return None on failure or after about `most` attempts."""
+    def integrate(self, t0: float, state: Array, times: Array, max_attempts: int) -> RerunPiece | None:
+        """Integrate from a state [q, v] at t0 to all `times`; return None on failure or after about `max_attempts`."""
         run, a, n = self.run, self.run.a, len(state)
         proposed_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:
@@ -278,7 +278,7 @@ class IndependentRerun:
         states: list[Array] = []
         longest, n_total = 0.0, 0
         buffers, filled = self.buffers, self.filled
-        for _ in range(0, most + len(times), len(buffers[0])):
+        for _ in range(0, max_attempts + len(times), len(buffers[0])):
             code = run.advance(times, buffers, filled)
             n_rows, n_steps = filled.tolist()
             states.append(buffers[1][:n_rows, :n].copy())

@@ -38,7 +38,7 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # as FIRST_CHUNK, for callbacks that are called in Python, which may be slow
 SMALL = 32  # number of coordinates up to which a system is small; larger systems have proportionally smaller chunks
-TRIAL_STEPS = 10  # number of steps at the start of a run in which one short step replaces a method for long steps
+TRIAL_STEPS = 10  # number of first steps: a short step size among these replaces a method that needs long steps
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
 CONTRADICTS = 1e-6  # residual of a row of C_q a = gamma, relative to its terms, from which on constraints contradict
 
@@ -92,8 +92,8 @@ class Run:
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
         self.control[loop_state.BRIDGE], self.control[loop_state.SAMPLE_MOTION] = self.static is None, 1.0
-        rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # C_t of kinematics alone is zero
-        self.control[loop_state.DRIVEN] = bool(rates)
+        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # C_t of kinematics alone is zero
+        self.control[loop_state.DRIVEN] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
         self.clock = np.zeros(loop_state.N_CLOCK)
@@ -263,11 +263,11 @@ class Run:
 
     def is_lost_without_dense(self, code: int) -> bool:
         """Return whether steps failed in the static form of linear algebra, but may succeed in another form."""
-        reasons = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
+        failure_codes = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.static is not None
             and code in (self.a.STEP_TOO_SMALL, self.a.FIXED_STEP_FAILED, self.a.RANK_LOST)
-            and int(self.clock[self.a.FAILURE_CODE]) in reasons
+            and int(self.clock[self.a.FAILURE_CODE]) in failure_codes
         )
 
     def change_form(self) -> None:
@@ -408,7 +408,7 @@ class Run:
         return equations_in_words(rows, counted, factors[:, counted], norms(all_rows))
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
-        """Set the first step size and the limits of step sizes, s; first_step None: an estimate."""
+        """Set the first step size and the limits of step sizes, s; `first_step` None: take an estimate."""
         self.max_step = max_step
         self.limit_steps()
         proposed_size = self.first_step(self.t0, t1, self.state, max_step)

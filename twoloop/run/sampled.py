@@ -244,12 +244,12 @@ class SampledRun:
         """Compute the accelerations at t with the new parameters, and restart the method without past steps."""
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
-        n_kept = 0
+        n_not_reset = 0
         if run.plan.first is not None:  # a pair of methods: do not reset the scalars that tell which is active
             from twoloop.kernels.control.stiffness import N_SCALARS
 
-            n_kept = N_SCALARS + 2 * run.system.n_q
-        run.plan.memory[n_kept:] = run.memory[n_kept:]
+            n_not_reset = N_SCALARS + 2 * run.system.n_q
+        run.plan.memory[n_not_reset:] = run.memory[n_not_reset:]
         run.clock[: a.N_PAST] = 0.0
         if code != indices.DONE:
             raise RuntimeError(

@@ -157,7 +157,7 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
 
 
 def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the ratio of `singular_ratio` for the rows of `in_any_units`, which does not depend on units."""
+    """Return `singular_ratio` of the rows as scaled by `in_any_units`, so that it does not depend on units."""
     values = np.linalg.svd(in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 

@@ -421,8 +421,8 @@ def workspace(
     full_ranks = min(n_c, n_q), min(n_c + n_a, n_q)
     rank, rank_v = (rank if rank is not None else highest for rank, highest in zip(ranks, full_ranks, strict=True))
     sizes = n_q, n_c, n_a, rank, rank_v, bool(uses_null_space and n_q > rank_v), bool(augmented), n_nodes
-    n_matrices = matrices * n_q**2 if static is None else static.n_matrices(matrices)
-    work = empty((*sizes, None if static is None else static.static, n_matrices))
+    n_floats = matrices * n_q**2 if static is None else static.n_matrices(matrices)
+    work = empty((*sizes, None if static is None else static.static, n_floats))
     return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, static)
 
 
