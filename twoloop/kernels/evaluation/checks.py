@@ -176,7 +176,7 @@ def _is_symmetric(mass, allowed):
 
 
 @exact
-def _is_rounding(value, row, state, sizes, least, rate, allowed):
+def _is_rounding_error(value, row, state, sizes, least, rate, allowed):
     """Return whether a sum, `value`, is a rounding error: at most `allowed` times the sum of the |terms|.
 
     The terms are `rate` and row[j] state[j] for all j; |state[j]| counts as at least sizes[j] and at least `least`.
@@ -235,9 +235,9 @@ def _is_consistent(C, rate, rows, q, v, sizes, allowed):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
-        if not _is_rounding(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
+        if not _is_rounding_error(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _is_rounding(C[i], rows[i], q, stored_sizes, rounding, 0.0, allowed):
+        if i < C.size and not _is_rounding_error(C[i], rows[i], q, stored_sizes, rounding, 0.0, allowed):
             return False
     return True
 
@@ -307,9 +307,9 @@ def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern,
         f.nonholonomic_gamma(t, q, v, f.p, results[rate + n_c : gamma])
     if flags[KINEMATICS_GIVEN] == 1:
         fused_results = results[gamma : gamma + n_c * (n + 3)]
-        matrix = fused_results[3 * n_c :].reshape((n_c, n))
+        fused_Cq = fused_results[3 * n_c :].reshape((n_c, n))
         f.kinematics(
-            t, q, v, f.p, fused_results[:n_c], matrix, fused_results[n_c : 2 * n_c], fused_results[2 * n_c : 3 * n_c]
+            t, q, v, f.p, fused_results[:n_c], fused_Cq, fused_results[n_c : 2 * n_c], fused_results[2 * n_c : 3 * n_c]
         )
     end = gamma + n_c * (n + 3)
     if not (finite(mass) and finite(rows) and finite_vector(results[:end])):
@@ -356,7 +356,7 @@ def rows_at(f, t, positions, n_c, rows):
 
 
 @exact
-def _agrees(fused, separate, allowed, rounding_errors):
+def _is_close(fused, separate, allowed, rounding_errors):
     """Return whether entries in row i of both matrices differ by at most rounding_errors[i] + allowed max|separate|."""
     largest = 0.0
     for i in range(separate.shape[0]):
@@ -383,15 +383,15 @@ def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, allowed, roun
     f.jacobian(t, q, f.p, separate_rows)
     f.constraint_rate(t, q, f.p, separate[1])
     f.gamma(t, q, v, f.p, separate[2])
-    agree = _agrees(fused_rows, separate_rows, allowed, rounding_errors)
+    agree = _is_close(fused_rows, separate_rows, allowed, rounding_errors)
     for k in range(1, 3):
-        agree = agree and _agrees(
+        agree = agree and _is_close(
             fused[k : k + 1].reshape((n_c, 1)), separate[k : k + 1].reshape((n_c, 1)), allowed, rounding_errors
         )
     for i in range(n_c):
         for j in range(n):
             rounding_errors[i] += rounding * abs(separate_rows[i, j]) * abs(q[j])
-    return agree and _agrees(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), allowed, rounding_errors)
+    return agree and _is_close(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), allowed, rounding_errors)
 
 
 VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors

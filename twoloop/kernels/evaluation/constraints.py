@@ -146,13 +146,13 @@ def _difference_side(notes, t, e):
 
 
 @compiled
-def _differences(f, w, t, q, v, e, first, last):
+def _fill_gamma(f, w, t, q, v, e, first, last):
     """Store Gamma[first:last], by differences with the steps e and 2 e, in w.Gamma; return three maxima.
 
     They are max|Gamma|, the largest disagreement of the two differences (both NaN if not finite), and the largest
     |term| of G v.
     """
-    Gamma_twice = w.Gamma_tried[0]
+    Gamma_coarse = w.Gamma_tried[0]
     side = _difference_side(w.notes, t, e)
     one_sided_step = representable_step(t, ONE_SIDED_STEP_RATIO * e)
     if side != 0.0 and one_sided_step > 0.0:
@@ -160,7 +160,7 @@ def _differences(f, w, t, q, v, e, first, last):
     largest_term = 0.0
     for i in range(first, last):
         w.Gamma[i] = 0.0
-        Gamma_twice[i] = 0.0
+        Gamma_coarse[i] = 0.0
     for k in range(4):
         shift = (-2.0, -1.0, 1.0, 2.0)[k] * e if side == 0.0 else (0.0, 1.0, 2.0, 4.0)[k] * side * e
         for j in range(q.size):
@@ -174,16 +174,16 @@ def _differences(f, w, t, q, v, e, first, last):
                 largest_term = max(largest_term, abs(w.Gx[i, j] * v[j]))
             if side != 0.0:
                 w.Gamma[i] -= ONE_SIDED[k] * w.g[i] / (side * e)
-                Gamma_twice[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
+                Gamma_coarse[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
             elif k == 0 or k == 3:
-                Gamma_twice[i] -= w.g[i] / (2.0 * shift)
+                Gamma_coarse[i] -= w.g[i] / (2.0 * shift)
             else:
                 w.Gamma[i] -= w.g[i] / (2.0 * shift)
     largest = 0.0
     disagreement = 0.0
     for i in range(first, last):
-        disagreement = max(disagreement, abs(w.Gamma[i] - Gamma_twice[i]))
-        w.Gamma[i] = (4.0 * w.Gamma[i] - Gamma_twice[i]) / 3.0
+        disagreement = max(disagreement, abs(w.Gamma[i] - Gamma_coarse[i]))
+        w.Gamma[i] = (4.0 * w.Gamma[i] - Gamma_coarse[i]) / 3.0
         largest = max(largest, abs(w.Gamma[i]))
         if not np.isfinite(w.Gamma[i]):
             return np.nan, np.nan, largest_term
@@ -210,7 +210,7 @@ def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
         if e <= 0.0:
             break
         copy(w.Gamma, w.Gamma_tried[1])
-        largest, disagreement, _ = _differences(f, w, t, q, v, e, first, last)
+        largest, disagreement, _ = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest):
             return DONE
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
@@ -224,7 +224,7 @@ def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
                 break
         step_ratio *= 0.25
     w.notes[GAMMA_ACCURACY] = least_change / w.notes[GAMMA_SCALE]
-    _differences(f, w, t, q, v, representable_step(t, w.notes[GAMMA_STEP_RATIO] * largest_step), first, last)
+    _fill_gamma(f, w, t, q, v, representable_step(t, w.notes[GAMMA_STEP_RATIO] * largest_step), first, last)
     return DONE if w.notes[GAMMA_ACCURACY] <= w.notes[GAMMA_REQUIRED] else GAMMA_INACCURATE
 
 
@@ -240,7 +240,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.notes[GAMMA_STEP_RATIO] * largest_step)
     if e > 0.0:
-        largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
+        largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
             return DONE  # the caller reports values that are not finite; without a scale, errors cannot be judged
         rounding = ROUNDING_OF_TERMS * terms / largest_step

@@ -302,13 +302,13 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
         return project_state(f, w, t, q, v, tolerance, a, lam)
     code = DONE
     if task <= tasks.RESTORE:
-        reuse = w.notes[REUSE] if task == tasks.EVALUATE else w.notes[ROUNDED]
-        code = restore_positions(f, w, t, q, v, tolerance, reuse)
+        reuse_limit = w.notes[REUSE] if task == tasks.EVALUATE else w.notes[ROUNDED]
+        code = restore_positions(f, w, t, q, v, tolerance, reuse_limit)
         if code == DONE and task != tasks.EVALUATE:
             code = _verify_pattern(w)
         if code != DONE:
             return code
-        restore_velocities(f, w, t, q, v, reuse)
+        restore_velocities(f, w, t, q, v, reuse_limit)
     if task == tasks.RESTORE:
         return code
     if task != tasks.MULTIPLIERS:

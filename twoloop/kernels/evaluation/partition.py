@@ -437,11 +437,11 @@ def rows_hold(w, q):
 
 
 @merged
-def restore_positions(f, w, t, q, v, tolerance, reuse):
+def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve eq. (15) by Newton's method for the dependent positions in q; return a code.
 
     The iteration ends after a correction of at most `tolerance`. On return, rows and factors in w belong to q, or to q
-    before the last correction, if this was at most `reuse`; the fused callback also stores w.Rate and w.Gamma, for v.
+    before the last correction, if this was at most `reuse_limit`; the fused callback also stores w.Rate and w.Gamma.
     """
     last_correction = np.inf
     has_converged = w.C.size == 0
@@ -468,7 +468,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
                 return not_finite(w.notes, CONSTRAINT, t, q)
             q[columns[k]] -= w.z[k]
             correction = max(correction, abs(w.z[k]))
-        if correction <= reuse:
+        if correction <= reuse_limit:
             return DONE
         has_converged = correction <= tolerance
         if not has_converged and correction > CONTRACTION * last_correction:
@@ -493,10 +493,10 @@ def find_null_space(f, w, t, q):
 
 
 @merged
-def restore_velocities(f, w, t, q, v, reuse):
+def restore_velocities(f, w, t, q, v, reuse_limit):
     """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, with rows and factors in w.
 
-    If no velocity changes by more than `reuse`, w.Gamma by the fused callback stays valid (KNOWN).
+    If no velocity changes by more than `reuse_limit`, w.Gamma by the fused callback stays valid (KNOWN).
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size
@@ -520,7 +520,7 @@ def restore_velocities(f, w, t, q, v, reuse):
     for k in range(rows.size):
         change = max(change, abs(v[columns[k]] - w.z[k]))
         v[columns[k]] = w.z[k]
-    if not change <= reuse:
+    if not change <= reuse_limit:
         w.notes[KNOWN] = 0.0
 
 

@@ -289,7 +289,7 @@ def _load_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 
 @compiled
-def _residual(program, jacobian, force, x, r):
+def _fill_residual(program, jacobian, force, x, r):
     """Store r = [b - G^T lam, lam - G x] for the force b and unknowns [x, lam]; return max|b - G^T lam| / max|b|."""
     n_q, largest, residual = force.size, 0.0, 0.0
     copy(force, r[:n_q])
@@ -326,14 +326,14 @@ def least_norm(f, w, lam):
         return NEEDS_DENSE
     for i in range(n):
         x[i] = 0.0
-    last_residual = _residual(program, w.jacobian_values, force, x, change)
+    last_residual = _fill_residual(program, w.jacobian_values, force, x, change)
     for _ in range(MAX_SOLUTIONS):
         if last_residual <= CONVERGED_RESIDUAL:
             break
         solve(program, values, no_stiffness, change, y)
         for i in range(n):
             x[i] += change[i]
-        residual = _residual(program, w.jacobian_values, force, x, change)
+        residual = _fill_residual(program, w.jacobian_values, force, x, change)
         if not residual < last_residual:
             last_residual = residual
             break

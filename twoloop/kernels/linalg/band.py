@@ -62,8 +62,8 @@ def call_lapack(typing_context, address, arguments):
             pointers.append(builder.bitcast(pointer, cgutils.voidptr_t))
         info = cgutils.alloca_once_value(builder, ir.Constant(ir.IntType(32), 0))
         pointers.append(builder.bitcast(info, cgutils.voidptr_t))
-        function = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t] * len(pointers))
-        builder.call(builder.inttoptr(routine, function.as_pointer()), pointers)
+        function_type = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t] * len(pointers))
+        builder.call(builder.inttoptr(routine, function_type.as_pointer()), pointers)
         return builder.sext(builder.load(info), ir.IntType(64))
 
     return types.int64(address, arguments), generate

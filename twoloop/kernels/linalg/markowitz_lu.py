@@ -294,17 +294,17 @@ def _store_program(index, counts, lists):
         next_upper = index[begin_upper(r) + k]
         for n in range(counts[ROW_SIZE, i]):
             j = counts[COLUMN_POSITION, lists[COLUMNS, i, n]]
-            s = k
+            entry = k
             if j < k:
-                s = slot
+                entry = slot
                 slot += 1
             elif j > k:
-                s = next_upper
+                entry = next_upper
                 next_upper += 1
-            counts[WHERE, j] = s
-            index[in_row + s], index[in_column + s], index[source + s] = k, j, lists[SOURCES, i, n]
-        for s in range(index[begin_lower(r) + k], slot):
-            j = index[in_column + s]
+            counts[WHERE, j] = entry
+            index[in_row + entry], index[in_column + entry], index[source + entry] = k, j, lists[SOURCES, i, n]
+        for entry in range(index[begin_lower(r) + k], slot):
+            j = index[in_column + entry]
             for u in range(index[begin_upper(r) + j], index[end_upper(r) + j]):
                 index[target] = counts[WHERE, index[in_column + u]]
                 target += 1
@@ -448,9 +448,9 @@ def solve_transposed(index, values, x):
             for k in range(i):
                 x[k] -= A[i, k] * x[i]
         for k in range(r - 1, -1, -1):
-            p = pivots[k]
-            if p != k:
-                x[k], x[p] = x[p], x[k]
+            pivot_row = pivots[k]
+            if pivot_row != k:
+                x[k], x[pivot_row] = x[pivot_row], x[k]
         return
     n_slots, first_lower = index[N_SLOTS], index[FIRST_LOWER]
     in_row, in_column = begin_entries(r), begin_entries(r) + n_slots

@@ -25,11 +25,11 @@ def _dot(x, y):
 def _orthogonalise(basis, n, rest, parts):
     """Subtract from `rest` its components along n orthonormal rows, and add them to `parts`; return |rest|^2."""
     for i in range(n):
-        part = _dot(basis[i], rest)
-        if part != 0.0:
-            parts[i] += part
+        component = _dot(basis[i], rest)
+        if component != 0.0:
+            parts[i] += component
             for j in range(rest.size):
-                rest[j] -= part * basis[i, j]
+                rest[j] -= component * basis[i, j]
     return _dot(rest, rest)
 
 
@@ -51,11 +51,11 @@ def select_rows(G, min_sine, basis, factors, kept):
             rest[j] = G[k, j]
         for i in range(n_kept):
             parts[i] = 0.0
-        square = _dot(G[k], G[k])
+        row_square = _dot(G[k], G[k])
         rest_square = _orthogonalise(basis, n_kept, rest, parts)
-        if rest_square < REPEAT_BELOW * square:
+        if rest_square < REPEAT_BELOW * row_square:
             rest_square = _orthogonalise(basis, n_kept, rest, parts)
-        if rest_square > min_sine**2 * square:
+        if rest_square > min_sine**2 * row_square:
             parts[n_kept] = math.sqrt(rest_square)
             for j in range(rest.size):
                 rest[j] /= parts[n_kept]

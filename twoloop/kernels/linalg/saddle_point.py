@@ -85,10 +85,10 @@ def _reduce_dense(columns, independent, M, D, A, MT):
         for j in range(n_dof):
             MT[i, j] = M[i, independent[j]]
         for k in range(columns.size):
-            m = M[i, columns[k]]
-            if m != 0.0:
+            mass_entry = M[i, columns[k]]
+            if mass_entry != 0.0:
                 for j in range(n_dof):
-                    MT[i, j] += m * D[j, k]
+                    MT[i, j] += mass_entry * D[j, k]
     for i in range(n_dof):
         for j in range(i, n_dof):
             A[i, j] = MT[independent[i], j]

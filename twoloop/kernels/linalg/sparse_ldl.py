@@ -96,9 +96,9 @@ def factor(program, counts, values, sizes, min_sine_square):
                 values[k] = 0.0
                 for s in range(first, last):
                     values[s] = 0.0
-                    r = s + 1
-                    while r < last:
-                        r += runs[u]
+                    slot = s + 1
+                    while slot < last:
+                        slot += runs[u]
                         u += 2
                 continue
             smallest = min(smallest, -pivot / sizes[k])
@@ -111,14 +111,14 @@ def factor(program, counts, values, sizes, min_sine_square):
             if not is_row:
                 sizes[row_of[s - n]] += multiplier * values[s]
             values[row_of[s - n]] -= multiplier * values[s]
-            r = s + 1
-            while r < last:
+            slot = s + 1
+            while slot < last:
                 size = runs[u]
                 if multiplier != 0.0:  # two thirds of the multipliers are 0 if a planar mechanism is modelled in space
-                    into, own = values[runs[u + 1] : runs[u + 1] + size], values[r : r + size]
+                    into, own = values[runs[u + 1] : runs[u + 1] + size], values[slot : slot + size]
                     for i in range(size):
                         into[i] -= multiplier * own[i]
-                r += size
+                slot += size
                 u += 2
             values[s] = multiplier
     return smallest

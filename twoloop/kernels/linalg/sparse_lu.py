@@ -91,7 +91,7 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
     """Store the entries of Newton's matrix, for z (real or complex), in their slots in `values`."""
     for s in range(values.size):
         values[s] = 0.0
-    off = program[N_OFF]
+    n_off = program[N_OFF]
     _, _, slots = mass_of(program)
     for k in range(mass.size):
         values[slots[k]] += mass[k]
@@ -100,13 +100,13 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
     _, _, slots = jacobian_of(program)
     for k in range(slots.size):
         values[slots[k]] += jacobian[k]
-        values[slots[k] + off] += jacobian[k]
+        values[slots[k] + n_off] += jacobian[k]
     product_rows, first, second, slots = stiffened_of(program)
     for u in range(product_rows.size):
         product = stiffness[product_rows[u]] * jacobian[first[u]] * jacobian[second[u]]
         values[slots[u]] += product
         if slots[u] >= program[N_PIVOTS]:
-            values[slots[u] + off] += product
+            values[slots[u] + n_off] += product
 
 
 @compiled
@@ -129,9 +129,9 @@ def factor(program, counts, values, sizes):
             for s in range(first, last):
                 values[s] = 0.0
                 values[s + off] = 0.0
-                r = s + 1
-                while r < last:
-                    r += runs[u]
+                slot = s + 1
+                while slot < last:
+                    slot += runs[u]
                     u += 2
             continue
         if not abs(values[k]) > MIN_PIVOT * sizes[k]:  # also true for NaN
@@ -144,18 +144,18 @@ def factor(program, counts, values, sizes):
             change = lower * values[s + off]
             values[target] -= change
             sizes[target] += abs(change)
-            r = s + 1
-            while r < last:
+            slot = s + 1
+            while slot < last:
                 size, target = runs[u], runs[u + 1]
                 if upper != 0.0:
-                    into, own = values[target : target + size], values[r : r + size]
+                    into, own = values[target : target + size], values[slot : slot + size]
                     for i in range(size):
                         into[i] -= own[i] * upper
                 if lower != 0.0:
-                    into, own = values[target + off : target + off + size], values[r + off : r + off + size]
+                    into, own = values[target + off : target + off + size], values[slot + off : slot + off + size]
                     for i in range(size):
                         into[i] -= lower * own[i]
-                r += size
+                slot += size
                 u += 2
             values[s] = lower
     return True
@@ -164,7 +164,7 @@ def factor(program, counts, values, sizes):
 @compiled
 def solve(program, values, x, y):
     """Replace the right-hand side x = [r, c] by the solution, with the factors `values`; y is scratch."""
-    n, off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
+    n, n_off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
     begin, row_of = columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -175,7 +175,7 @@ def solve(program, values, x, y):
     for k in range(n - 1, -1, -1):
         total = y[k]
         for s in range(begin[k], begin[k + 1]):
-            total -= values[n + off + s] * y[row_of[s]]
+            total -= values[n + n_off + s] * y[row_of[s]]
         y[k] = total * values[k]
     for k in range(n):
         x[order[k]] = y[k]

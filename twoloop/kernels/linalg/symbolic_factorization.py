@@ -289,8 +289,8 @@ def program_in_order(
     keys = column_of * n + row_of  # the keys are ascending
 
     def slots(column: Integers, row: Integers) -> Integers:
-        positions = n + np.searchsorted(keys, column * n + row)
-        return np.where(column == row, column, positions)
+        off_diagonal_slots = n + np.searchsorted(keys, column * n + row)
+        return np.where(column == row, column, off_diagonal_slots)
 
     firsts, seconds = [row_of[:0]], [row_of[:0]]
     for rows_in_column in rows_below:

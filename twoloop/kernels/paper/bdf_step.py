@@ -294,12 +294,12 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _blocks(memory, n)
-    fixed = tolerances[ESTIMATE] == 0.0
+    has_fixed_step = tolerances[ESTIMATE] == 0.0
     if memory[DEPTH] == 0.0:
-        _begin_history(memory, differences, state, h, 0.0 if fixed else 1.0)
+        _begin_history(memory, differences, state, h, 0.0 if has_fixed_step else 1.0)
     _predict(memory, differences, trial, h, prediction, rate)
     k = int(memory[ORDER])
-    if fixed and k < options[HIGHEST]:
+    if has_fixed_step and k < options[HIGHEST]:
         code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
     else:
         code = _correct(f, w, options, t + h, _corrector_coefficient(h, k), prediction, rate, new_state, scratch[:n])
@@ -309,7 +309,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     for m in range(2 * n):
         d[m] = y1[m] - d[m]
     error, factor = 0.0, 0.0
-    if fixed:
+    if has_fixed_step:
         memory[NEXT_ORDER] = min(memory[ORDER] + 1.0, options[HIGHEST])
     else:
         error, factor = _choose_order(options, memory, tolerances, trial, y, y1, d)
