@@ -421,7 +421,7 @@ def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, 
 
 
 def _is_left_out(kind: str, callbacks: dict[str, Any]) -> bool:
-    """Return whether a kind is missing, None, or the replacement that another system uses for it."""
+    """Return whether a kind of callback is missing, None, or the zero callback that replaces a missing one."""
     entry, given = KINDS[kind], callbacks.get(kind)
     if given is None:
         return kind not in callbacks or entry.optional or kind == "mass"  # mass_values may replace it
@@ -442,7 +442,7 @@ def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, ja
 
 
 class PlainFunctions(NamedTuple):
-    """Plain functions by kind, entries whose values they return, kinds `taking` the parameters, and these, p."""
+    """Plain functions by kind, entries whose values they return, and the kinds `taking` the parameters p."""
 
     functions: dict[str, Any]
     entries: dict[str, Entries]

@@ -74,7 +74,7 @@ def _method(kind: str) -> Callable[..., Any]:
 
 def _with_entries(text: str | None, plain: bool) -> str | None:
     """Return a docstring with the callbacks in place of PLACEHOLDER; None if `text` is None (python -OO)."""
-    return text and PLACEHOLDER.sub(lambda place: "".join(_entry(kind, plain, place[1]) for kind in KINDS), text)
+    return text and PLACEHOLDER.sub(lambda match: "".join(_entry(kind, plain, match[1]) for kind in KINDS), text)
 
 
 def _entry(kind: str, plain: bool, indent: str) -> str:

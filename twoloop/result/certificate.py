@@ -28,7 +28,7 @@ SPLIT = 100.0  # defect of an interval, in tolerances, above which its steps are
 MAX_WRONG = 3  # number of wrong steps after which the rest of an interval is skipped
 NEGLIGIBLE = 1e-10  # singular value of the constraint rows, relative to the largest, below which it counts as zero
 USUAL_GROWTH = 10.0  # factor of error growth over an interval up to which the defect is not divided by this factor
-MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # attempted steps in an interval: constant, and per step of the run in it
+MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # attempts in an interval: at most the first plus the second per step
 LOOSER = (10.0, 100.0)  # factors on the tolerances with which a failed reintegration is repeated
 
 
@@ -124,7 +124,7 @@ def _certify(result: Record, rtol: float | None, atol: ArrayLike | None, handler
     faults = tuple(field_faults(result, result.system, checker.rtol, checker.atol, LIMIT))
     defect, t_worst, unseen = _local_errors(checker)
     error, t_error, t_grown = checker.errors() if defect <= LIMIT else (defect, t_worst, np.inf)
-    if t_grown < np.inf:  # the growth of a tolerance at the start explains the error: the steps may be right
+    if t_grown < np.inf:  # the growth of a small initial error explains the error: the steps may be right
         unseen = [*((start, end) for start, end in unseen if end <= t_grown), (t_grown, float(checker.t[-1]))]
     end = end_of_run(result)
     last_time = max(float(result.t[-1]), *(float(t[-1]) for t in result.t_events or () if len(t)), -np.inf)

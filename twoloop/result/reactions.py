@@ -111,7 +111,7 @@ def _force_and_torque(joint: Joint, q: Array, point: Array, generalized: Array) 
         return force, np.zeros(force.shape[1:] if dimension == 2 else force.shape)
     if dimension == 2:
         return force, moments[0] - (arm[0] * force[1] - arm[1] * force[0])
-    if len(moments) == 4:  # e' = G^T spin / 2, so the torque in body axes is G g / 2
+    if len(moments) == 4:  # e' = G^T w / 2 with angular velocity w, so the torque in body axes is G moments / 2
         from twoloop.bodies.rotation import half_spin, rotated  # compiled on import
 
         torque = 0.5 * np.stack(rotated.py_func(*angles, *half_spin.py_func(*angles, *moments)))

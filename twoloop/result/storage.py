@@ -166,24 +166,24 @@ def _read_folder(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 
 def _read_file(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Return the arrays and other fields of a file; raise ValueError if it was not written by `Result.save`."""
-    expected = f"path must lead to a file written by Result.save; {str(path)!r}"
+    requirement = f"path must lead to a file written by Result.save; {str(path)!r}"
     arrays: dict[str, NDArray[Any]] = {}
-    field = ""
+    note = ""
     with path.open("rb") as file:
         try:
             with zipfile.ZipFile(file) as archive:
                 for name in archive.namelist():
-                    field = f": {name.removesuffix('.npy')} cannot be read"
+                    note = f": {name.removesuffix('.npy')} cannot be read"
                     with archive.open(name) as member:
                         arrays[name.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
                         if member.read(1):  # reading to the end verifies the checksum of the archive
                             raise ValueError("the array is followed by other data")
-            field = ""
+            note = ""
             metadata = json.loads(str(arrays["words"]))
         except Exception as error:  # a damaged archive may raise any exception
-            raise ValueError(f"{expected} is none{field} ({type(error).__name__}: {error})") from error
+            raise ValueError(f"{requirement} is none{note} ({type(error).__name__}: {error})") from error
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        raise ValueError(f"{expected} has other contents")
+        raise ValueError(f"{requirement} has other contents")
     return arrays, metadata
 
 
