@@ -103,7 +103,7 @@ class Interpolator:
         self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of them
         # interior states of intervals, with both ends: (times, states) by the time at which the interval begins
         self.filled: dict[float, tuple[Array, Array]] = {}
-        # memory arrays of steps across singular positions, with their polynomials, by the first times of the intervals
+        # memories of crossing steps, which contain their polynomials, by the times at which the intervals begin
         self.across: dict[float, Array] = {}
         self.accurate: set[float] = set()  # first times of intervals whose polynomials need no interior states
         self.judges = True  # whether interior states may be computed; false if they were read from a file

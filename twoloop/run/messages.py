@@ -198,7 +198,7 @@ def _dominant_eigenvalue(
     return eigenvalue, is_negative
 
 
-NEARLY_SINGULAR = 1e-3  # ratio of singular values of C_q (or inertias) up to which the message of a failure mentions it
+NEARLY_SINGULAR = 1e-3  # ratio of singular values of C_q (or of inertias) up to which messages call C_q (or M) singular
 # ratio of the rounding error of velocities (or accelerations) to the tolerance above which a run is not trusted further
 MAX_LASTING_ERROR = 100.0
 LOST_AT_END = 1e-6  # ratio of singular values up to which constraints do not determine velocities at the end of a run

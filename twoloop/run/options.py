@@ -40,9 +40,9 @@ class Options:
     @cached_property
     def key(self) -> object:
         """Key in caches of integrators: the same object for equal options."""
-        sizes = self.first_step, self.max_step, self.max_steps, self.step_size
+        step_options = self.first_step, self.max_step, self.max_steps, self.step_size
         tolerances = self.rtol, self.atol.tobytes()
-        return _key(identity(self.method), *tolerances, *sizes, self.compiled, self.check_derivatives)
+        return _key(identity(self.method), *tolerances, *step_options, self.compiled, self.check_derivatives)
 
     @cached_property
     def own_tolerance(self) -> float | None:
@@ -139,8 +139,8 @@ def check_options(
         check_size("max_steps", max_steps, 1)
     if time_limit is not None:
         check_positive("time_limit", time_limit)
-    sizes = first_step, float(max_step), max_steps, step_size
-    return Options(chosen, float(rtol), atol, *sizes, compiled, bool(check_derivatives))
+    step_options = first_step, float(max_step), max_steps, step_size
+    return Options(chosen, float(rtol), atol, *step_options, compiled, bool(check_derivatives))
 
 
 def check_method(method: str | Method) -> Method:

@@ -132,7 +132,7 @@ class ParametricRun:
             traced.trusted = False
 
     def agrees(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Return whether callbacks agree with traces near the start, and M is definite, diagonal as in the setup."""
+        """Return whether callbacks agree with traces near the start, and M keeps its structure (definite, diagonal)."""
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))

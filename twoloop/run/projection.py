@@ -97,9 +97,9 @@ class Dependence(NamedTuple):
     """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    shares: dict[int, Array]  # by dependent row: its coefficients (n_c,) as a combination of the independent rows
+    shares: dict[int, Array]  # by index of a dependent row: coefficients (n_c,) of the independent rows that sum to it
     allowed: Array  # displacement (n_q,) that C_q allows; its largest entry is 1 in the units of the coordinates
-    onto_constraints: Callable[[Array], Array | None]  # projects a nearby position onto the constraints; None: it fails
+    onto_constraints: Callable[[Array], Array | None]  # returns a projected nearby position, or None on failure
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:

@@ -36,7 +36,7 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 
 # largest number of attempts in the first chunk of a small system; after each chunk, checks in Python take 0.2 ms
 FIRST_CHUNK = 1024
-FIRST_CHUNK_IN_PYTHON = 64  # as FIRST_CHUNK, for callbacks that are called in Python, which may be slow
+FIRST_CHUNK_IN_PYTHON = 64  # largest number of attempts in the first chunk if callbacks are slow Python functions
 SMALL = 32  # number of coordinates up to which a system is small; larger systems have proportionally smaller chunks
 TRIAL_STEPS = 10  # number of first steps: a short step size among these replaces a method that needs long steps
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form

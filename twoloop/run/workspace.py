@@ -369,8 +369,8 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     numbers = (plan.numbers, plan.own_numbers)
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # ids in the key stay unique, as the cached kits keep the objects with these ids alive
-    steps = (plan.inner, plan.step, plan.first, plan.second)
-    key = (id(system.functions), flags.tobytes(), *steps, len(LOADED), *map(id, (*plan.own, *numbers)))
+    plan_functions = (plan.inner, plan.step, plan.first, plan.second)
+    key = (id(system.functions), flags.tobytes(), *plan_functions, len(LOADED), *map(id, (*plan.own, *numbers)))
     run_changes_flags = flags[FORM] == AUGMENTED  # a run may change these flags
     if key in kits:
         return _with_own_flags(kits[key][0]) if run_changes_flags else kits[key][0]
