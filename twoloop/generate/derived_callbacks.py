@@ -82,7 +82,7 @@ def with_derived_callbacks(system: ConstrainedSystem, check: Check) -> tuple[Con
 def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: TraceCache) -> DerivedPrograms:
     equations = cache.equations(system)
     programs = {}
-    for name, forms in _results(equations, absent).items():
+    for name, forms in _missing_derivatives(equations, absent).items():
         program = OperationTable.of(equations.graph, 1 + 2 * system.n_q, dict(enumerate(forms.values())))
         if len(program.rows) > MOST_OPERATIONS:
             raise Untraceable(f"{name} takes {len(program.rows)} operations")
@@ -90,7 +90,7 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
     return DerivedPrograms(programs, Traced(system, equations.graph))
 
 
-def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
+def _missing_derivatives(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
     """Return missing C_q and Gamma by kind of callback ("gamma": both kinds), as expressions by flat array index."""
     system = equations.system
     gamma: dict[int, Affine] = {}

@@ -39,7 +39,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {  # functions that use only operator
     "hypot": lambda x, y: (x * x + y * y) ** 0.5,
 }
 # names in FUNCTIONS and OPERATORS of functions that have other names in `math` or NumPy
-NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power", "true_divide": "divide"}
+NUMPY_NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power", "true_divide": "divide"}
 
 
 class Untraceable(ValueError):
@@ -185,7 +185,7 @@ class Parameter(float):
         return parameter
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
-        name = NAMES.get(ufunc.__name__, ufunc.__name__)
+        name = NUMPY_NAMES.get(ufunc.__name__, ufunc.__name__)
         if method != "__call__" or name not in _OPERATIONS.keys() | FUNCTIONS.keys() or options:
             self._refuse_decision(f"it calls numpy.{ufunc.__name__} on its parameters")
             plain = (float(each) if type(each) is Parameter else each for each in inputs)
@@ -282,7 +282,7 @@ def _tape_of(*numbers: float) -> ParameterTape:
 
 def apply_function(name: str, *arguments: Any) -> Any:
     """Return the value of a function of NumPy or `math`, by its name; a Parameter if an argument is a Parameter."""
-    name = NAMES.get(name, name)
+    name = NUMPY_NAMES.get(name, name)
     if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol has its own operators
         return OPERATORS[name](*arguments)
     numbers = [each if type(each) is Parameter else float(each) for each in arguments]
@@ -327,8 +327,8 @@ def _refusing_method(name: str) -> Callable[..., Any]:
     return decide
 
 
-_REFUSED = ("bool", "int", "float", "trunc", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne")
-for _name in (*_REFUSED, "mod", "rmod", "floordiv", "rfloordiv", "divmod", "rdivmod"):
+_REFUSED_METHODS = ("bool", "int", "float", "trunc", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne")
+for _name in (*_REFUSED_METHODS, "mod", "rmod", "floordiv", "rfloordiv", "divmod", "rdivmod"):
     setattr(Parameter, f"__{_name}__", _refusing_method(f"__{_name}__"))
 Parameter.__hash__ = float.__hash__  # type: ignore[method-assign]
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
@@ -341,7 +341,7 @@ for _name in _UNARY:
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
     """Return an array of function values at all entries of arrays, without calls of the entries' `__array_ufunc__`."""
-    operands = list(map(_operand, inputs))
+    operands = list(map(_as_object_array, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:
         return results
@@ -349,7 +349,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
     return out[0]
 
 
-def _operand(value: Any) -> Any:
+def _as_object_array(value: Any) -> Any:
     """Return a value as an array of objects; its type is tested by type(), because symbols refuse isinstance()."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)

@@ -237,7 +237,7 @@ class OperationTable(NamedTuple):
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
 LITERALS = (0.0, 1.0, -1.0)  # values of coefficients that are literals in the code, as they need no multiplication
-ROUNDING = 8.0 * 2.0**-52  # largest difference from 1 or -1 at which a coefficient becomes this literal: rounding error
+LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference from 1 or -1 at which a coefficient counts as this literal
 
 
 class Coefficient(float):
@@ -354,4 +354,4 @@ def literal(value: float) -> float | None:
     if type(value) is Parameter or not math.isfinite(value):
         return None
     nearest = float(round(value))
-    return nearest if nearest in LITERALS and abs(value - nearest) <= ROUNDING * abs(nearest) else None
+    return nearest if nearest in LITERALS and abs(value - nearest) <= LITERAL_TOLERANCE * abs(nearest) else None

@@ -176,7 +176,7 @@ def series_program(
         total = _sum_of_products(graph, factors, [*multipliers, *a], force[i], reaction_products, of_rates=False)
         balance.append(total)
     inputs = [*range(1 + 2 * n), *map(only_quantity, a), *map(only_quantity, lam)]
-    program = _assemble(graph, sums, inputs, n, n_rows, rows, balance, row_products, reaction_products)
+    program = _assemble_program(graph, sums, inputs, n, n_rows, rows, balance, row_products, reaction_products)
     return replace(program, traced=Traced(system, graph))
 
 
@@ -194,7 +194,7 @@ def _without_sums(sums: dict[int, Affine], form: Affine) -> Affine:
     summed = [i for i in form.terms if i in sums]
     if not summed:
         return form
-    total = _without(form, summed)
+    total = _without_terms(form, summed)
     for i in summed:
         total = total + sums[i].times(form.terms[i])
     return total
@@ -224,9 +224,9 @@ def _sum_of_products(
             continue
         varying = Affine(graph, 0.0, factor.terms)
         scale, form = varying.normalised()
-        _collect(by_factor, form, multiplier.times(scale))
+        _add_to_group(by_factor, form, multiplier.times(scale))
         for i, c in factor.terms.items():
-            _collect(by_quantity, graph.quantity(i), multiplier.times(c))
+            _add_to_group(by_quantity, graph.quantity(i), multiplier.times(c))
     groups = (by_quantity, by_factor) if of_rates else (by_factor, by_quantity)
     candidates = [[_normalized_product(*each) for each in candidate.values() if each[1].terms] for candidate in groups]
     for key, scale, factor, multiplier in min(
@@ -244,12 +244,12 @@ def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float,
     return (factor.key, multiplier.key), scale, factor, multiplier
 
 
-def _collect(groups: dict[Any, tuple[Affine, Affine]], factor: Affine, multiplier: Affine) -> None:
+def _add_to_group(groups: dict[Any, tuple[Affine, Affine]], factor: Affine, multiplier: Affine) -> None:
     previous = groups.get(factor.key)
     groups[factor.key] = (factor, multiplier if previous is None else previous[1] + multiplier)
 
 
-def _assemble(
+def _assemble_program(
     graph: Graph,
     sums: dict[int, Affine],
     inputs: list[int],
@@ -272,7 +272,7 @@ def _assemble(
         raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
     tables = [
         [
-            *_groups(operations),
+            *_grouped_operations(operations),
             (
                 PENDING,
                 sorted([(only_quantity(form), *factors) for form, *factors in products.values()], key=_term_counts),
@@ -291,8 +291,8 @@ def _assemble(
         n_rows,
         _table(tables[0], nodes),
         _table(tables[1], nodes),
-        *_nonzero_sums([_without(form, v_and_a) for form in rows], nodes),
-        *_nonzero_sums([_without(form, lam_and_a) for form in balance], nodes),
+        *_nonzero_sums([_without_terms(form, v_and_a) for form in rows], nodes),
+        *_nonzero_sums([_without_terms(form, lam_and_a) for form in balance], nodes),
     )
 
 
@@ -311,17 +311,17 @@ def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any
 def _nonzero_sums(forms: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
     """Return the nonzero ones of `forms` as Sums, and their indices in `forms`; `nodes`: node of each quantity."""
     indices = [k for k, form in enumerate(forms) if form.terms or form.constant]
-    sums = _sums([forms[k] for k in indices], nodes)
+    sums = _as_sums([forms[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)
     return sums._replace(row=index_array[sums.row]), index_array
 
 
-def _without(form: Affine, inputs: Container[int]) -> Affine:
+def _without_terms(form: Affine, inputs: Container[int]) -> Affine:
     """Return an expression without its terms in the quantities `inputs`."""
     return Affine(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
 
 
-def _groups(operations: list[Any]) -> list[tuple[int, list[Any]]]:
+def _grouped_operations(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     """Return groups of operations of one kind, as (kind, operations); a group depends only on the groups before it."""
     nodes = {node for node, *_ in operations}
     level: dict[int, int] = {}
@@ -351,7 +351,7 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
 
 def _table(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> Table:
     members = [each for _, group in groups for each in group]
-    sums = [_sums([each[k] for each in members], nodes) for k in (1, 2)]
+    sums = [_as_sums([each[k] for each in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
     for kind, group in groups:
         end = begin + len(group)
@@ -361,7 +361,7 @@ def _table(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> Table:
     return Table(np.array(rows, dtype=np.int64), *sums)
 
 
-def _sums(forms: list[Affine], nodes: dict[int, int]) -> Sums:
+def _as_sums(forms: list[Affine], nodes: dict[int, int]) -> Sums:
     terms = [[(nodes[i], c) for i, c in form.terms.items()] or [(0, 0.0)] for form in forms]
     more = [(k, *term) for k, each in enumerate(terms) for term in each[1:]]
     return Sums(

@@ -26,7 +26,7 @@ from twoloop.problem.system import ConstrainedSystem
 BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
 # callbacks whose dependence on the state is analysed
 BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")
-SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations whose results have no short pulses if degrees are at most MAX_DEGREE
+SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # operations without short pulses if degrees are at most MAX_DEGREE
 # largest degree of polynomials in time, or in sines and cosines, without short pulses; cos(t)**100 has pulses
 MAX_DEGREE = 8
 MAX_DEGREE_OF_STATE = 32  # largest degree of polynomials in q and v, and of their roots, without short pulses
@@ -187,7 +187,7 @@ def _has_time_pulses(graph: Graph, needed: list[int]) -> bool:
     dependent = [i for i in needed if graph.inputs_of[i] & TIME]
     degrees = Degrees([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
     degrees.run(graph, dependent)
-    return any(graph.kind(i) not in SMOOTH or degrees.values[i] > MAX_DEGREE for i in dependent)
+    return any(graph.kind(i) not in SMOOTH_OPERATIONS or degrees.values[i] > MAX_DEGREE for i in dependent)
 
 
 def _has_state_pulses(graph: Graph, needed: list[int], n_q: int) -> bool:
@@ -209,7 +209,7 @@ def _has_state_pulses(graph: Graph, needed: list[int], n_q: int) -> bool:
 
 def _is_steep(graph: Graph, needed: list[int]) -> bool:
     """Return whether a quantity in `needed` is a quotient, a root, a sine of time, or a fast sine of the state."""
-    if any(graph.kind(i) not in SMOOTH for i in needed):
+    if any(graph.kind(i) not in SMOOTH_OPERATIONS for i in needed):
         return True
     rates = Rates()
     rates.run(graph, needed)

@@ -183,28 +183,28 @@ def _number_or_symbol(numeric: Any, symbolic: Callable[..., Any]) -> Callable[..
     return function
 
 
-def _is_real(dtype: Any) -> bool:
+def _is_real_dtype(dtype: Any) -> bool:
     return dtype is None or np.dtype(dtype) == np.float64
 
 
-def _constructor(constructor: Any) -> Callable[..., Any]:
+def _symbolic_constructor(constructor: Any) -> Callable[..., Any]:
     """Return a substitute for `zeros`, `ones` or `empty` whose arrays of real numbers can contain expressions."""
 
     def function(shape: Any, dtype: Any = None, **options: Any) -> Any:
-        if not _is_real(dtype):
+        if not _is_real_dtype(dtype):
             return constructor(shape, dtype, **options)
         return np.full(shape, 1.0 if constructor is np.ones else 0.0, dtype=object)
 
     return function
 
 
-def _conversion(conversion: Any) -> Callable[..., Any]:
+def _symbolic_conversion(conversion: Any) -> Callable[..., Any]:
     """Return a substitute for `array`, `asarray` or `ascontiguousarray` that also accepts expressions."""
 
     def function(value: Any, dtype: Any = None, **options: Any) -> Any:
         if _symbol_in(value) is None and not _has_parameters(value):
             return conversion(value, dtype, **options)
-        if not _is_real(dtype):
+        if not _is_real_dtype(dtype):
             _refuse_symbols(value, f"makes {np.dtype(dtype).name} of")
         return conversion(value, object, **options)
 
@@ -215,10 +215,10 @@ def _full(shape: Any, value: Any, dtype: Any = None) -> Any:
     if (
         _symbol_in(value) is None
         and not _has_parameters(value)
-        and not (_is_real(dtype) and np.asarray(value).dtype == np.float64)
+        and not (_is_real_dtype(dtype) and np.asarray(value).dtype == np.float64)
     ):
         return np.full(shape, value, dtype)
-    if not _is_real(dtype):
+    if not _is_real_dtype(dtype):
         _refuse_symbols(value, f"makes {np.dtype(dtype).name} of")
     return np.full(shape, value, object)
 
@@ -249,9 +249,9 @@ class _Mathematics:
         if name in ("pow", "power"):
             return lambda x, y: x**y
         if self._module is np and name in CONSTRUCTORS:
-            return _constructor(original)
+            return _symbolic_constructor(original)
         if self._module is np and name in CONVERSIONS:
-            return _conversion(original)
+            return _symbolic_conversion(original)
         if original is np.full:
             return _full
         if original is np.linalg.norm:
@@ -262,7 +262,7 @@ class _Mathematics:
 
 
 # order in which callbacks are traced
-CALLBACKS = (
+TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
@@ -298,7 +298,7 @@ class Equations:
 
     def trace_all(self) -> "Equations":
         """Trace the callbacks of the system that can be traced, so that copies share the results; return self."""
-        for kind in CALLBACKS:
+        for kind in TRACING_ORDER:
             if not self._is_derived(kind):
                 with suppress(Untraceable):  # `of` raises it again if the callback is needed
                     self.of(kind)
@@ -426,9 +426,9 @@ Evaluator = Callable[[Any], Array]  # evaluates an array of expressions for the 
 # limits of the random values of parameters in traces: values are of similar size, so that rounding hides no term
 GENERIC = 0.5, 1.5
 # a parameter is a constant if its magnitude is below this value or above its inverse: powers would under- or overflow
-EXTREME = 1e-30
+MIN_MAGNITUDE = 1e-30
 
-_CACHES = BoundedCache()
+_TRACE_CACHES = BoundedCache()
 
 
 class TraceCache:
@@ -541,7 +541,7 @@ def derive_cached(
     """
     for cache_for in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("family", cache_for), partial(cache_for, system))
-        derived = system.remembered((what, cache_for), partial(_derive, system, cache, what, make))
+        derived = system.remembered((what, cache_for), partial(_derive_from, system, cache, what, make))
         try:
             if isinstance(derived, Untraceable):
                 raise derived
@@ -553,7 +553,7 @@ def derive_cached(
     raise reason
 
 
-def _derive(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
+def _derive_from(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
     """Return the result of `derive_cached` from one trace cache, or the exception that says why there is none."""
     try:
         shared = cache.remembered(what, partial(make, cache))
@@ -585,12 +585,12 @@ def shared_cache(system: ConstrainedSystem) -> TraceCache:
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
     """Return the trace cache that a system with compiled callbacks shares with others; create it if it is missing."""
     parameters = system.parameters
-    classes = _classes(parameters)
+    classes = _parameter_classes(parameters)
     fixed = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that the bytes are equal
     key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed.tobytes())
-    cache: TraceCache | None = _CACHES.get(key)
+    cache: TraceCache | None = _TRACE_CACHES.get(key)
     if cache is None:
-        _CACHES[key] = cache = TraceCache(parameters, classes)
+        _TRACE_CACHES[key] = cache = TraceCache(parameters, classes)
     return cache
 
 
@@ -599,10 +599,10 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
     return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
-def _classes(parameters: Array) -> NDArray[np.int64]:
+def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
     """Return the class of each parameter, see `TraceCache`; classes are numbered in the order of the parameters."""
     magnitudes = np.abs(parameters)
-    varies = (magnitudes > EXTREME) & (magnitudes < 1.0 / EXTREME) & (magnitudes != np.floor(magnitudes))
+    varies = (magnitudes > MIN_MAGNITUDE) & (magnitudes < 1.0 / MIN_MAGNITUDE) & (magnitudes != np.floor(magnitudes))
     _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[first.argsort()] = np.arange(1, len(first) + 1)

@@ -30,8 +30,8 @@ KINDS = (
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
 N_NEARBY = 8  # number of random states near the start at which calls and traces are compared, besides the start
-TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
-DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
+RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
+NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 # approximate largest number of compared states: in a chunk of steps, in a run, in a run with callbacks called in Python
 MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of entries compared at all states of a run: large systems have fewer
@@ -231,8 +231,8 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
     n, directions = len(q), _random_directions(len(q))
     states = np.empty((1 + N_NEARBY, 1 + 2 * n))
     states[0, 0], states[0, 1 : 1 + n], states[0, 1 + n :] = t0, q, v
-    states[1:, 0] = t0 + (t1 - t0) * TIMES
-    states[1:, 1 : 1 + n] = q + DISTANCE * scales * directions[0]
+    states[1:, 0] = t0 + (t1 - t0) * RELATIVE_TIMES
+    states[1:, 1 : 1 + n] = q + NEARBY_DISTANCE * scales * directions[0]
     states[1:, 1 + n :] = speed * directions[1]
     return states
 

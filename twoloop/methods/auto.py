@@ -13,25 +13,27 @@ from twoloop.methods.plan import Method, Plan, cached_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
-MANY = 16  # number of coordinates from which on an evaluation may cost more than the algebra of a step of Adams
-# largest number of constraints per coordinate at which Adams replaces DOP853 for MANY coordinates: with more
+MANY_COORDINATES = 16  # number of coordinates from which on evaluations may cost more than the algebra of Adams' method
+# largest number of constraints per coordinate at which Adams replaces DOP853 from MANY_COORDINATES on: with more
 # constraints, projections cost more than evaluations
-CONSTRAINED = 0.25
-TIGHT_MANY = 1e-10  # tolerance below which Adams replaces DOP853 for MANY coordinates with any number of constraints
-VERY_MANY = 64  # number of coordinates from which on Adams replaces DOP853 in any case, except with sparse matrices
-HUGE = 1000  # number of coordinates above which Newton's method, whose matrices are full, is not tried
-LONG_STEPS = 1e-9  # a series that pays at this tolerance is used at looser ones, too, if other methods need short steps
-SERIES = 1e-6  # tolerance below which a Taylor series may cost less than DOP853
-SOME_OPERATIONS = 12  # largest number of operations per coordinate at which a Taylor series costs less than DOP853
-# replaces SOME_OPERATIONS with fewer than FEW coordinates, and for MANY coordinates at tolerances of at least SERIES
-FEW_OPERATIONS = 8
-FEW = 5  # number of coordinates below which FEW_OPERATIONS replaces SOME_OPERATIONS
-SERIES_OF_MANY = 1e-8  # replaces SERIES for MANY coordinates with generated code
+MAX_CONSTRAINT_RATIO = 0.25
+# tolerance below which Adams replaces DOP853 from MANY_COORDINATES on, with any number of constraints
+ADAMS_TOLERANCE = 1e-10
+VERY_MANY_COORDINATES = 64  # number of coordinates from which on Adams replaces DOP853, except with sparse matrices
+MAX_NEWTON_COORDINATES = 1000  # largest number of coordinates for which Newton's method, with full matrices, is tried
+# tolerance whose rule for the choice of a series also applies at looser ones if the other methods need short steps
+SHORT_STEP_TOLERANCE = 1e-9
+SERIES_TOLERANCE = 1e-6  # tolerance below which a Taylor series may cost less than DOP853
+MAX_OPERATIONS = 12  # largest number of operations per coordinate at which a Taylor series costs less than DOP853
+# replaces MAX_OPERATIONS below FEW_COORDINATES, and for at least MANY_COORDINATES at looser tolerances
+MAX_OPERATIONS_FEW = 8
+FEW_COORDINATES = 5  # number of coordinates below which MAX_OPERATIONS_FEW replaces MAX_OPERATIONS
+SERIES_TOLERANCE_MANY = 1e-8  # replaces SERIES_TOLERANCE from MANY_COORDINATES on with generated code
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated by the method for few digits
 TIGHTEST = 9e-7  # tolerance below which stiff motion is integrated by the method for many digits
 # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams. h: step size, rho: largest rate of motion
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25
-LIMIT_FEW_OF_MANY = 2.0  # replaces LIMIT_FEW for MANY coordinates, whose evaluations cost more than a trial
+LIMIT_FEW_OF_MANY = 2.0  # replaces LIMIT_FEW from MANY_COORDINATES on, where evaluations cost more than a trial
 # number of successive estimates of h rho above the limit before a trial, as accuracy may allow a few long steps; for
 # Adams, and with LIMIT_FEW_OF_MANY, one estimate is enough
 ESTIMATES_FEW = 2
@@ -192,10 +194,10 @@ class Auto:
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
         if self.cost_ratio is not None:  # generated code: a series runs near singular positions, as it is more exact
-            return tolerance < (SERIES if n_q < MANY else SERIES_OF_MANY)
-        if tolerance < SERIES:
-            return operations <= (SOME_OPERATIONS if n_q >= FEW else FEW_OPERATIONS)
-        return operations <= FEW_OPERATIONS and n_q >= MANY
+            return tolerance < (SERIES_TOLERANCE if n_q < MANY_COORDINATES else SERIES_TOLERANCE_MANY)
+        if tolerance < SERIES_TOLERANCE:
+            return operations <= (MAX_OPERATIONS if n_q >= FEW_COORDINATES else MAX_OPERATIONS_FEW)
+        return operations <= MAX_OPERATIONS_FEW and n_q >= MANY_COORDINATES
 
     def takes_code(self, fixed: bool) -> bool:
         """Return whether the steps of this method can run with generated code: not fixed steps, which are implicit."""
@@ -224,7 +226,7 @@ class Auto:
         explicit = self._explicit(n_q, rtol, atol, second, cost_ratio)
         # at looser tolerances the series also pays if the other methods are limited to a hundredth of the run
         stages_suffice = explicit.unseen < 1.0 and not self.narrow
-        if not pays and (stages_suffice or not self._series_pays(n_q, LONG_STEPS)):
+        if not pays and (stages_suffice or not self._series_pays(n_q, SHORT_STEP_TOLERANCE)):
             return explicit
         series = self.series.plan(n_q, rtol, atol, False)
         chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, ESTIMATES_FEW, cost_ratio)
@@ -232,13 +234,13 @@ class Auto:
 
     def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, cost_ratio: float) -> Plan:
         """Return the plan of the explicit method, `few` or `many`, with its switch to Newton's method, `second`."""
-        many = n_q >= VERY_MANY and not self.sparse
-        if n_q >= MANY and self.cost_ratio is None:
-            many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
+        many = n_q >= VERY_MANY_COORDINATES and not self.sparse
+        if n_q >= MANY_COORDINATES and self.cost_ratio is None:
+            many = many or self.n_rows <= MAX_CONSTRAINT_RATIO * n_q or least_tolerance(rtol, atol) < ADAMS_TOLERANCE
         explicit, limit, estimates = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, ESTIMATES_FEW)
-        if explicit is self.few and n_q >= MANY:  # here evaluations cost more than a trial
+        if explicit is self.few and n_q >= MANY_COORDINATES:  # here evaluations cost more than a trial
             limit, estimates = LIMIT_FEW_OF_MANY, 1
-        if n_q > HUGE:
+        if n_q > MAX_NEWTON_COORDINATES:
             return explicit.plan(n_q, rtol, atol, False)
         return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, estimates, cost_ratio)
 

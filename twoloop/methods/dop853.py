@@ -65,7 +65,7 @@ E5 = np.array(
 
 COARSE_SHARE = 0.1  # factor on the error estimate of order 3 in the combined estimate e5^2 / sqrt(e5^2 + 0.01 e3^2)
 # largest change of a position, relative to the tolerance, for which the velocity of a stage uses an earlier Jacobian
-REUSE = 1e-4
+REUSE_TOLERANCE = 1e-4
 # lower limit of the error, relative to the tolerance, in the trend that the step size follows (`Plan.least_error`); it
 # is low because halving the step divides the error by more than 100
 LEAST_ERROR = 1e-6
@@ -168,6 +168,6 @@ class DOP853:
             least_error=LEAST_ERROR if free else 0.0,
             rough=ROUGH,
             stable_to=lambda memory: STABLE_TO,
-            reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
+            reuse=0.0 if fixed else REUSE_TOLERANCE * least_tolerance(rtol, atol),
             unseen=LONGEST_GAP if free else 1.0,
         )

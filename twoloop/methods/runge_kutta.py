@@ -24,7 +24,7 @@ NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps with Newton's method:
 # h rho from which on fixed-point iteration converges so slowly that Newton's method is tried; rho: largest rate
 LIMIT_OF_FIXED_POINT = 1.5
 # largest condition number of the eigenvectors of A that count as a basis; its inverse: smallest nonzero eigenvalue
-ILL_CONDITIONED = 1e8
+MAX_CONDITION = 1e8
 # number of parts of a step for the solution within it, by the highest order for which the number suffices: with fewer
 # parts the error is more than a few times that at the ends (four-bar linkage, tolerances of 1e-4 to 1e-12)
 PARTS = {5: 1, 6: 2, 8: 3, 10: 4, np.inf: 6}
@@ -122,7 +122,7 @@ class RungeKutta:
             )
         if self.outer in ("auto", "newton"):
             values, vectors = np.linalg.eig(self.tableau.A)
-            if np.linalg.cond(vectors) > ILL_CONDITIONED or np.abs(values).min() < 1.0 / ILL_CONDITIONED:
+            if np.linalg.cond(vectors) > MAX_CONDITION or np.abs(values).min() < 1.0 / MAX_CONDITION:
                 raise ValueError(
                     f"tableau must have an invertible A with a basis of eigenvectors for outer={self.outer!r}; that of "
                     f"{self.tableau.name} has not. Take outer='fixed-point'"

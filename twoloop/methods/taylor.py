@@ -17,11 +17,11 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-LOWEST, HIGHEST = 4, 40  # limits of the option `order`
-# order of the series: LEAST plus PER_DIGIT for each digit of the tolerance, about the cheapest for benchmark mechanisms
-PER_DIGIT, LEAST = 1.15, 5.0
-PER_DIGIT_IN_LANES, LEAST_IN_LANES = 1.25, 3.5  # PER_DIGIT and LEAST for series in SIMD lanes
-FIXED = 19  # order of fixed steps
+LOWEST_ORDER, HIGHEST_ORDER = 4, 40  # limits of the option `order`
+# order of the series: LEAST_ORDER + ORDER_PER_DIGIT per digit of the tolerance, about the cheapest for the benchmark
+ORDER_PER_DIGIT, LEAST_ORDER = 1.15, 5.0
+ORDER_PER_DIGIT_IN_LANES, LEAST_ORDER_IN_LANES = 1.25, 3.5  # LEAST_ORDER and ORDER_PER_DIGIT in SIMD lanes
+FIXED_STEP_ORDER = 19  # order of fixed steps
 # limits of the number of parts into which a step is divided for the solution within it; the states between parts are
 # values of the series of the step, projected onto the constraints
 MIN_PARTS, MAX_PARTS = 3, 6
@@ -30,7 +30,7 @@ PADDING = 8  # a table is padded to a multiple of this number of operations
 
 def order_in_lanes(rtol: float, atol: float) -> int:
     """Return the order of the series in SIMD lanes at these tolerances."""
-    return _order(rtol, atol, LEAST_IN_LANES, PER_DIGIT_IN_LANES)
+    return _order(rtol, atol, LEAST_ORDER_IN_LANES, ORDER_PER_DIGIT_IN_LANES)
 
 
 def _order(rtol: float, atol: float, least: float, per_digit: float) -> int:
@@ -83,8 +83,8 @@ class Taylor:
     program: SeriesProgram | None = None  # program of one system; solve_dae sets it
 
     def __post_init__(self) -> None:
-        if self.order is not None and not LOWEST <= check_size("order", self.order, 1) <= HIGHEST:
-            raise ValueError(f"order must be between {LOWEST} and {HIGHEST}; given {self.order}")
+        if self.order is not None and not LOWEST_ORDER <= check_size("order", self.order, 1) <= HIGHEST_ORDER:
+            raise ValueError(f"order must be between {LOWEST_ORDER} and {HIGHEST_ORDER}; given {self.order}")
 
     @property
     def name(self) -> str:
@@ -122,9 +122,9 @@ class Taylor:
             raise ValueError("Taylor() knows no system yet: take for_system(system), as solve_dae does")
         order = self.order
         if order is None and fixed:
-            order = FIXED
+            order = FIXED_STEP_ORDER
         elif order is None:
-            order = _order(rtol, atol, LEAST, PER_DIGIT)
+            order = _order(rtol, atol, LEAST_ORDER, ORDER_PER_DIGIT)
         highest = order + 1
         widths = [-(-len(table.first.column) // PADDING) * PADDING for table in (program.early, program.late)]
         plan = Plan(
