@@ -33,7 +33,7 @@ from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
-ARRAY = f"{DOUBLE}*"
+DOUBLE_POINTER = f"{DOUBLE}*"
 
 
 def write_accelerations(
@@ -138,7 +138,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
     module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
         n, pointers = equations.system.n_q, _coefficient_pointers(emit)
-        kinds = [emit.double, ARRAY, ARRAY, *[ARRAY] * len(pointers), ARRAY]
+        kinds = [emit.double, DOUBLE_POINTER, DOUBLE_POINTER, *[DOUBLE_POINTER] * len(pointers), DOUBLE_POINTER]
         builder = module.function(name, emit.bit, kinds, internal=True)
         inner_emit = emit.like(builder)
         t, q, v, *coefficients, out = builder.arguments
@@ -233,7 +233,7 @@ class SplitFunctions:
     # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write `calls` (name, arguments) of parts, and missing parts; return a flag: whether all results are valid."""
+        """Write `calls`, pairs of a part's name and its arguments, and missing parts; return whether all are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"

@@ -165,7 +165,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
     """Return rows [t, q, v] with the t and q of `states`, and random nonzero v that are about as large as theirs."""
-    times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
+    times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))
     return np.column_stack([times, positions, speed * generic_v])

@@ -54,9 +54,9 @@ LEAST = 10.0 ** np.arange(-2, -9, -1)
 # limits of the smallest pivot at the start: LEAST[i] is chosen from BOUNDS[i] on, and LEAST[-1] below BOUNDS[-1]
 BOUNDS = LEAST[:-1] / RELATIVE_BOUND
 N_FEW = 24  # largest number of coordinates for which FEW_FROM applies
-# indices in LEAST from which on pivots are so small that all rows of G may be added to M. FEW_FROM: for up to N_FEW
-# coordinates (pivots below 1e-3). FEW_SINGULAR_FROM: replaces FEW_FROM if M is singular, as Euler parameters lose two
-# digits in sound models. MANY_FROM: for more than N_FEW coordinates, as added rows make their code much longer.
+# All rows of G may be added to M if pivots are small: if the index in LEAST is at least FEW_FROM (pivots below 1e-3)
+# with up to N_FEW coordinates, FEW_SINGULAR_FROM if M is singular as well (Euler parameters lose two digits in sound
+# models), or MANY_FROM with more coordinates, for which added rows make the code much longer.
 FEW_FROM, FEW_SINGULAR_FROM, MANY_FROM = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
 MIN_GAIN = 2  # smallest decrease of the index in LEAST for which rows are added; else pivots are small with any M
@@ -96,7 +96,7 @@ class PivotChoice:
 
     @classmethod
     def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
-        """Return the choice for the values of M and G at a position.
+        """Return the PivotChoice for the values of M and G at time t and position q.
 
         Raises
         ------
@@ -389,7 +389,7 @@ class Elimination:
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added}
         return Program(
-            self.graph, {"r": force, "c": [each if k in used else self.zero for k, each in enumerate(gamma)]}
+            self.graph, {"r": force, "c": [value if k in used else self.zero for k, value in enumerate(gamma)]}
         )
 
     def _accelerations(self, v: Sequence[Affine]) -> list[Affine]:
@@ -406,7 +406,7 @@ class Elimination:
     @cached_property
     def position_errors(self) -> Program:
         """Return the program for "c", the right-hand sides -C of position corrections; 0 for dependent rows and A."""
-        errors = [*(-each for each in self._values_of("constraint")), *[self.zero] * self.system.n_a]
+        errors = [*(-violation for violation in self._values_of("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._on_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property

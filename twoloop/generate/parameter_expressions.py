@@ -160,13 +160,13 @@ class ParameterTape(Symbolic):
     def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
         """Return the values of numbers for other parameters (n_runs, n_p), as an array (n_runs, len(numbers))."""
         product = self.products(parameters)
-        rows = {powers: k for k, powers in enumerate(dict.fromkeys(each.powers for each in numbers))}
+        rows = {powers: k for k, powers in enumerate(dict.fromkeys(parameter.powers for parameter in numbers))}
         products = np.empty((len(rows), len(parameters)))
         with np.errstate(all="ignore"):
             for powers, k in rows.items():
                 products[k] = product(powers)
-            scales = np.array([[each.scale] for each in numbers]).reshape(-1, 1)
-            values = scales * products[[rows[each.powers] for each in numbers]]
+            scales = np.array([[parameter.scale] for parameter in numbers]).reshape(-1, 1)
+            values = scales * products[[rows[parameter.powers] for parameter in numbers]]
         return np.ascontiguousarray(values.T)
 
 
@@ -188,7 +188,7 @@ class Parameter(float):
         name = NUMPY_NAMES.get(ufunc.__name__, ufunc.__name__)
         if method != "__call__" or name not in _OPERATIONS.keys() | FUNCTIONS.keys() or options:
             self._refuse_decision(f"it calls numpy.{ufunc.__name__} on its parameters")
-            plain = (float(each) if type(each) is Parameter else each for each in inputs)
+            plain = (float(x) if type(x) is Parameter else x for x in inputs)
             return getattr(ufunc, method)(*plain, **options)
         return elementwise(lambda *arguments: apply_function(name, *arguments), inputs, out)
 
@@ -255,7 +255,7 @@ def _product(a: float, b: float) -> float:
         powers = dict(a.powers)
         for place, exponent in b.powers:
             powers[place] = powers.get(place, 0.0) + exponent
-        merged = tape.merged[pair] = tuple(sorted(each for each in powers.items() if each[1]))
+        merged = tape.merged[pair] = tuple(sorted(factor for factor in powers.items() if factor[1]))
     return Parameter(_as_float(a) * _as_float(b), tape, scale, merged) if merged else scale
 
 
@@ -283,10 +283,10 @@ def _tape_of(*numbers: float) -> ParameterTape:
 def apply_function(name: str, *arguments: Any) -> Any:
     """Return the value of a function of NumPy or `math`, by its name; a Parameter if an argument is a Parameter."""
     name = NUMPY_NAMES.get(name, name)
-    if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol has its own operators
+    if any(not issubclass(type(x), NUMBERS) for x in arguments):  # a symbol has its own operators
         return OPERATORS[name](*arguments)
-    numbers = [each if type(each) is Parameter else float(each) for each in arguments]
-    if not any(type(each) is Parameter for each in numbers):
+    numbers = [x if type(x) is Parameter else float(x) for x in arguments]
+    if not any(type(x) is Parameter for x in numbers):
         return float(getattr(np, name)(*numbers))
     if name in _OPERATIONS:
         return _OPERATIONS[name](*numbers)
@@ -301,7 +301,7 @@ def _record_function(name: str, *numbers: float) -> Parameter:
     return Parameter(value, tape, 1.0, tape.atom((name, arguments)))
 
 
-def _operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
+def _binary_operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
     operation = _OPERATIONS[name]
 
     def operate(self: Parameter, other: Any) -> Any:
@@ -312,7 +312,7 @@ def _operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
         if not issubclass(type(other), NUMBERS):  # by type(): a symbol refuses isinstance
             return NotImplemented
-        return operation(*(each if type(each) is Parameter else float(each) for each in pair))
+        return operation(*(x if type(x) is Parameter else float(x) for x in pair))
 
     return operate
 
@@ -332,8 +332,8 @@ for _name in (*_REFUSED_METHODS, "mod", "rmod", "floordiv", "rfloordiv", "divmod
     setattr(Parameter, f"__{_name}__", _refusing_method(f"__{_name}__"))
 Parameter.__hash__ = float.__hash__  # type: ignore[method-assign]
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
-    setattr(Parameter, f"__{_symbol}__", _operator(_name, False))
-    setattr(Parameter, f"__r{_symbol}__", _operator(_name, True))
+    setattr(Parameter, f"__{_symbol}__", _binary_operator(_name, False))
+    setattr(Parameter, f"__r{_symbol}__", _binary_operator(_name, True))
 for _name in _UNARY:
     # NumPy functions call methods of these names for arrays of objects
     setattr(Parameter, _name, lambda self, name=_name: apply_function(name, self))
@@ -361,7 +361,7 @@ def _as_object_array(value: Any) -> Any:
 def array_of(values: Iterable[float]) -> Any:
     """Return an array of floats, or of objects if some values are Parameters."""
     values = list(values)
-    return np.array(values, dtype=object if any(type(each) is Parameter for each in values) else float)
+    return np.array(values, dtype=object if any(type(value) is Parameter for value in values) else float)
 
 
 def number(value: Any) -> float:

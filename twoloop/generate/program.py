@@ -315,7 +315,7 @@ class Coefficients:
         """
         graph, forms = program.graph, program.forms
         needed = graph.needed_by(forms, stored)
-        name: dict[int, Any] = {i: f"input {i}" for i, each in enumerate(graph.operations) if each is None}
+        name: dict[int, Any] = {i: f"input {i}" for i, operation in enumerate(graph.operations) if operation is None}
         name |= {i: k for k, i in enumerate(needed)}
         name |= {i: f"kept {place}" for i, place in stored.items()}
 
@@ -326,7 +326,7 @@ class Coefficients:
         yield [described_form(form) for form in forms]
         for i in needed:
             kind, *arguments = graph.operations[i]  # type: ignore[misc]
-            yield kind, [described_form(each) for each in arguments if isinstance(each, Affine)]
+            yield kind, [described_form(form) for form in arguments if isinstance(form, Affine)]
 
     @property
     def n_varying(self) -> int:

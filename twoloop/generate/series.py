@@ -161,7 +161,7 @@ def series_program(
     mass, force, jacobian, nonholonomic, rate, nonholonomic_rate = map(equations.of, USED_CALLBACKS)
     sums = _sums_of(graph)
     arrays = np.vstack([jacobian, nonholonomic]), mass, np.append(rate, nonholonomic_rate), force
-    G, mass, rates, force = (elementwise(partial(_without_sums, sums), [each]) for each in arrays)
+    G, mass, rates, force = (elementwise(partial(_without_sums, sums), [array]) for array in arrays)
     row_products: dict[Any, Any] = {}
     zero = Affine(graph, 0.0, {})
     used_rows = [i for i in range(n_rows) if independent is None or i in independent]
@@ -172,7 +172,7 @@ def series_program(
     balance = []
     for i in range(n):
         factors, multipliers = [-G[k, i] for k in used_rows], [lam[k] for k in used_rows]
-        factors += [-each for each in mass[i]]
+        factors += [-entry for entry in mass[i]]
         total = _sum_of_products(graph, factors, [*multipliers, *a], force[i], reaction_products, of_rates=False)
         balance.append(total)
     inputs = [*range(1 + 2 * n), *map(only_quantity, a), *map(only_quantity, lam)]
@@ -228,7 +228,9 @@ def _sum_of_products(
         for i, c in factor.terms.items():
             _add_to_group(by_quantity, graph.quantity(i), multiplier.times(c))
     groups = (by_quantity, by_factor) if of_rates else (by_factor, by_quantity)
-    candidates = [[_normalized_product(*each) for each in candidate.values() if each[1].terms] for candidate in groups]
+    candidates = [
+        [_normalized_product(*group) for group in candidate.values() if group[1].terms] for candidate in groups
+    ]
     for key, scale, factor, multiplier in min(
         candidates, key=lambda candidate: len({key for key, *_ in candidate} - products.keys())
     ):
@@ -262,7 +264,9 @@ def _assemble_program(
 ) -> SeriesProgram:
     early: list[Any] = []
     late: list[Any] = []
-    factors = [form for each in (row_products, reaction_products) for _, *forms in each.values() for form in forms]
+    factors = [
+        form for products in (row_products, reaction_products) for _, *forms in products.values() for form in forms
+    ]
     for i, operation in _needed_operations(graph, [*rows, *balance, *factors]):
         if i not in sums:
             kind, first, second = operation
@@ -302,9 +306,9 @@ def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any
     trigonometric = (SINE, COSINE)
     angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trigonometric}
     return [
-        (i, each)
-        for i, each in enumerate(graph.operations)
-        if each is not None and (i in needed or (each[0] in trigonometric and each[1].key in angles))
+        (i, operation)
+        for i, operation in enumerate(graph.operations)
+        if operation is not None and (i in needed or (operation[0] in trigonometric and operation[1].key in angles))
     ]
 
 
@@ -350,12 +354,12 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
 
 
 def _table(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> Table:
-    members = [each for _, group in groups for each in group]
-    sums = [_as_sums([each[k] for each in members], nodes) for k in (1, 2)]
+    members = [member for _, group in groups for member in group]
+    sums = [_as_sums([member[k] for member in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
     for kind, group in groups:
         end = begin + len(group)
-        more = [bound for each in sums for bound in np.searchsorted(each.row, [begin, end])]
+        more = [bound for arguments in sums for bound in np.searchsorted(arguments.row, [begin, end])]
         rows.append([kind, begin, end, *more])
         begin = end
     return Table(np.array(rows, dtype=np.int64), *sums)
@@ -363,12 +367,12 @@ def _table(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> Table:
 
 def _as_sums(forms: list[Affine], nodes: dict[int, int]) -> Sums:
     terms = [[(nodes[i], c) for i, c in form.terms.items()] or [(0, 0.0)] for form in forms]
-    more = [(k, *term) for k, each in enumerate(terms) for term in each[1:]]
+    more = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]
     return Sums(
-        np.array([each[0][0] for each in terms], dtype=np.int64),
-        array_of(each[0][1] for each in terms),
+        np.array([form_terms[0][0] for form_terms in terms], dtype=np.int64),
+        array_of(form_terms[0][1] for form_terms in terms),
         array_of(form.constant for form in forms),
-        np.array([each[0] for each in more], dtype=np.int64),
-        np.array([each[1] for each in more], dtype=np.int64),
-        array_of(each[2] for each in more),
+        np.array([term[0] for term in more], dtype=np.int64),
+        np.array([term[1] for term in more], dtype=np.int64),
+        array_of(term[2] for term in more),
     )

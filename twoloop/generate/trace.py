@@ -126,10 +126,10 @@ class _CallbackCopier(FunctionCopier):
 
     def _add_copy(self, helper: Any) -> None:
         super()._add_copy(helper)
-        self.known[id(helper)].__globals__.setdefault("type", _type)
+        self.known[id(helper)].__globals__.setdefault("type", _symbolic_type)
 
 
-def _type(value: Any, *more: Any) -> Any:
+def _symbolic_type(value: Any, *more: Any) -> Any:
     _refuse_symbols(value, "asks for the type of")
     return type(value, *more)
 
@@ -211,7 +211,7 @@ def _symbolic_conversion(conversion: Any) -> Callable[..., Any]:
     return function
 
 
-def _full(shape: Any, value: Any, dtype: Any = None) -> Any:
+def _symbolic_full(shape: Any, value: Any, dtype: Any = None) -> Any:
     if (
         _symbol_in(value) is None
         and not _has_parameters(value)
@@ -223,7 +223,7 @@ def _full(shape: Any, value: Any, dtype: Any = None) -> Any:
     return np.full(shape, value, object)
 
 
-def _norm(x: Any, *more: Any, **options: Any) -> Any:
+def _symbolic_norm(x: Any, *more: Any, **options: Any) -> Any:
     if _symbol_in(x) is None:
         return np.linalg.norm(x, *more, **options)
     if more or options or np.ndim(x) != 1:
@@ -253,9 +253,9 @@ class _Mathematics:
         if self._module is np and name in CONVERSIONS:
             return _symbolic_conversion(original)
         if original is np.full:
-            return _full
+            return _symbolic_full
         if original is np.linalg.norm:
-            return _norm
+            return _symbolic_norm
         if self._module is np and name in NUMPY_FUNCTIONS:
             return original
         return _for_numbers_only(original, f"{self._module.__name__}.{name}")
@@ -310,7 +310,7 @@ class Equations:
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
             self.t.on(equations.graph),
-            *([x.on(equations.graph) for x in each] for each in (self.q, self.v)),
+            *([x.on(equations.graph) for x in state] for state in (self.q, self.v)),
         )
         equations._forms, equations._copied = {}, self.graph.traced
         return equations
@@ -505,12 +505,10 @@ class TraceCache:
         """Return the ScaledProducts of an array of expressions, computed at the first call for this array object."""
         entry = self._arrays.get(id(array))
         if entry is None:
-            powers = [each.powers if type(each) is Parameter else () for each in array.ravel()]
-            products = {each: k for k, each in enumerate(dict.fromkeys(powers))}
-            scales = np.array(
-                [each.scale if type(each) is Parameter else each for each in array.ravel()], dtype=np.float64
-            )
-            indices = np.array([products[each] for each in powers], dtype=np.int64)
+            powers = [x.powers if type(x) is Parameter else () for x in array.ravel()]
+            products = {x: k for k, x in enumerate(dict.fromkeys(powers))}
+            scales = np.array([x.scale if type(x) is Parameter else x for x in array.ravel()], dtype=np.float64)
+            indices = np.array([products[x] for x in powers], dtype=np.int64)
             scaled = scales.reshape(array.shape), indices.reshape(array.shape), list(products)
             entry = self._arrays[id(array)] = array, scaled
         return entry[1]

@@ -207,14 +207,14 @@ def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float,
     Untraceable
         If a trace is wrong; the message names the callback and the entry.
     """
-    untrusted = [each for each in traced if not each.trusted]
+    untrusted = [trace for trace in traced if not trace.trusted]
     if not untrusted:
         return
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         nearby = states_near_start(t0, t1, q, v)
-        for each in untrusted:
-            each.check_near_start(system, nearby)
+        for trace in untrusted:
+            trace.check_near_start(system, nearby)
 
 
 Check = Callable[[Traced], None]  # raises Untraceable if traces are wrong

@@ -197,7 +197,7 @@ def plans_for(
 
 
 def _has_series(method: Method) -> bool:
-    """Return whether a method has a series, which `for_system` removes for a start at which `check` refuses it."""
+    """Return whether a method has a series; `for_system` removes the series if `check` refuses its traces."""
     return getattr(method, "series", None) is not None
 
 

@@ -23,7 +23,8 @@ from twoloop.methods.tableaux import Tableau
 NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps with Newton's method: stiff forces magnify rounding errors
 # h rho from which on fixed-point iteration converges so slowly that Newton's method is tried; rho: largest rate
 LIMIT_OF_FIXED_POINT = 1.5
-# largest condition number of the eigenvectors of A that count as a basis; its inverse: smallest nonzero eigenvalue
+# largest condition number of the eigenvectors of A with which they count as a basis; the inverse of this number is the
+# smallest magnitude of the eigenvalues with which A counts as invertible
 MAX_CONDITION = 1e8
 # number of parts of a step for the solution within it, by the highest order for which the number suffices: with fewer
 # parts the error is more than a few times that at the ends (four-bar linkage, tolerances of 1e-4 to 1e-12)

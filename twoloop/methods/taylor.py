@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 LOWEST_ORDER, HIGHEST_ORDER = 4, 40  # limits of the option `order`
 # order of the series: LEAST_ORDER + ORDER_PER_DIGIT per digit of the tolerance, about the cheapest for the benchmark
 ORDER_PER_DIGIT, LEAST_ORDER = 1.15, 5.0
-ORDER_PER_DIGIT_IN_LANES, LEAST_ORDER_IN_LANES = 1.25, 3.5  # LEAST_ORDER and ORDER_PER_DIGIT in SIMD lanes
+ORDER_PER_DIGIT_IN_LANES, LEAST_ORDER_IN_LANES = 1.25, 3.5  # ORDER_PER_DIGIT and LEAST_ORDER in SIMD lanes
 FIXED_STEP_ORDER = 19  # order of fixed steps
 # limits of the number of parts into which a step is divided for the solution within it; the states between parts are
 # values of the series of the step, projected onto the constraints
