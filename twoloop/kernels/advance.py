@@ -178,17 +178,17 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
 
 
 @merged
-def _handle_rejection(f, w, control, clock, t, size, proposal, state):
+def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
     """Store a smaller size than `size` in clock[H_NEXT] after a step with too large an error; return CONTINUE.
 
-    Near a singular position, an end code is returned instead. `proposal`: size (s) that follows from the error.
+    Near a singular position, an end code is returned instead. `proposed_size`: size (s) that follows from the error.
     """
     n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
     if retry_projected(f, w, control, clock, size):
         return at.CONTINUE
-    clock[at.H_NEXT] = min(proposal, MAX_RATIO_AFTER_REJECTION * size, size - np.spacing(abs(t + size)))
+    clock[at.H_NEXT] = min(proposed_size, MAX_RATIO_AFTER_REJECTION * size, size - np.spacing(abs(t + size)))
     if fails_at_singular(f, clock, size):
         return at.NEEDS_DENSE
     if size < SHORT_STEP * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
@@ -214,10 +214,10 @@ def _pass_output_time(f, w, clock, outputs, state):
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
 
 
-_ADVANCE = i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS)
+_ADVANCE_SIGNATURE = i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS)
 
 
-@kernel(_ADVANCE)
+@kernel(_ADVANCE_SIGNATURE)
 def advance(
     f, w, options, memory, tolerances, control, clock, state, new_state, outputs, out_t, out_state, out_steps, filled
 ):
@@ -235,9 +235,9 @@ def advance(
     t_repeated = np.inf  # time (s) from which a step of fixed size was last repeated with a new partition
     filled[0] = 0
     filled[1] = 0
-    attempts = 0.0
+    n_attempts = 0.0
     while True:
-        if filled[0] == out_t.size or filled[1] == out_steps.shape[0] or attempts >= control[at.MAX_ATTEMPTS]:
+        if filled[0] == out_t.size or filled[1] == out_steps.shape[0] or n_attempts >= control[at.MAX_ATTEMPTS]:
             return at.PAUSED
         if w.counters[N_ACCEPTED] >= control[at.MAX_STEPS]:
             return at.MAX_STEPS_REACHED
@@ -257,14 +257,14 @@ def advance(
                     copy(state, out_state[first])
                     filled[0] += 1
                 filled[1] += n_taken
-                attempts += n_taken
+                n_attempts += n_taken
                 if at_output and _pass_output_time(f, w, clock, outputs, state):
                     return at.ALL_OUTPUT_DONE
-                end = check_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], at_output, state)
-                if end != at.CONTINUE:
-                    return end
+                end_code = check_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], at_output, state)
+                if end_code != at.CONTINUE:
+                    return end_code
                 continue
-        attempts += 1.0
+        n_attempts += 1.0
         t = clock[at.T]
         crosses_jump = clock[at.APPLIES_JUMP] == 1.0
         if t == clock[at.JUMP_FROM] and not crosses_jump:
@@ -324,9 +324,9 @@ def advance(
         if not crosses_jump:
             f.settle(f, w, options, memory, tolerances, accepted)
         if code != DONE:
-            end = _handle_failure(f, w, control, clock, t, size, code, t_repeated, state)
-            if end != at.CONTINUE:
-                return end
+            end_code = _handle_failure(f, w, control, clock, t, size, code, t_repeated, state)
+            if end_code != at.CONTINUE:
+                return end_code
             if fixed_size:
                 t_repeated = t
             continue
@@ -337,14 +337,14 @@ def advance(
             factor = factor_of(control, clock, size, error)
         elif error_factor > 1.0 and error > 0.0:  # the method did not include `error_factor` in its `factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
-        proposal = min(size * factor, clock[at.H_LIMIT])
+        proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
-            clock[at.H_NEXT] = size if control[at.FIRST_GIVEN] == 1.0 else proposal
+            clock[at.H_NEXT] = size if control[at.FIRST_GIVEN] == 1.0 else proposed_size
             continue
         if not accepted:
-            end = _handle_rejection(f, w, control, clock, t, size, proposal, state)
-            if end != at.CONTINUE:
-                return end
+            end_code = _handle_rejection(f, w, control, clock, t, size, proposed_size, state)
+            if end_code != at.CONTINUE:
+                return end_code
             continue
         if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
             clock[at.H_FAILED] = size
@@ -365,7 +365,7 @@ def advance(
             copy(state, out_state[filled[0]])
             filled[0] += 1
         # a step that was shortened, such as to end at an output time, must not limit the size of the next step
-        clock[at.H_NEXT] = max(proposal, h) if shortened else proposal
+        clock[at.H_NEXT] = max(proposed_size, h) if shortened else proposed_size
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
@@ -380,6 +380,6 @@ def advance(
         if crosses_jump:
             return at.PAUSED
         if control[at.SYMMETRIC] == 0.0:
-            end = check_partition(f, w, control, clock, size, at_output, state)
-            if end != at.CONTINUE:
-                return end
+            end_code = check_partition(f, w, control, clock, size, at_output, state)
+            if end_code != at.CONTINUE:
+                return end_code

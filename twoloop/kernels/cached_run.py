@@ -55,10 +55,10 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     for i in range(pattern.shape[0]):
         for j in range(pattern.shape[1]):
             w.pattern[i, j] = pattern[i, j]
-    rounded = 0.0
+    rounding_error = 0.0
     for j in range(q.size):
-        rounded = max(rounded, ROUNDING * abs(q[j]))
-    w.notes[indices.ROUNDED], w.notes[indices.REUSE] = rounded, max(reuse, rounded)
+        rounding_error = max(rounding_error, ROUNDING * abs(q[j]))
+    w.notes[indices.ROUNDED], w.notes[indices.REUSE] = rounding_error, max(reuse, rounding_error)
     w.notes[indices.GAMMA_REQUIRED], w.notes[indices.GAMMA_STEP_RATIO] = accuracy, 1.0
     w.notes[indices.KINK_BEFORE], w.notes[indices.KINK_AFTER] = -math.inf, math.inf
 
@@ -201,17 +201,17 @@ def _has_same_choices(b):
         return True
     if first_bound != b.expected[PLACE] or b.chosen[1] != n_added or b.scratch[0] != b.constants[SCALE]:
         return False
-    same = True
+    is_same = True
     for k in range(n_kept):
-        same = same and b.chosen[2 + k] == b.expected[KEPT + k]
+        is_same = is_same and b.chosen[2 + k] == b.expected[KEPT + k]
     for k in range(n_added):
-        same = same and b.chosen[2 + len(b.rows) + k] == b.expected[KEPT + n_kept + k]
-    if same and b.kinds.size > 0:
+        is_same = is_same and b.chosen[2 + len(b.rows) + k] == b.expected[KEPT + n_kept + k]
+    if is_same and b.kinds.size > 0:
         n = 4 * b.dependents(b.rows, b.kinds, b.counted, b.counted.size, b.search, b.search_places, b.found)
-        same = n == b.blocks.size
+        is_same = n == b.blocks.size
         for k in range(b.blocks.size):
-            same = same and b.found[k] == b.blocks[k]
-    return same
+            is_same = is_same and b.found[k] == b.blocks[k]
+    return is_same
 
 
 @merged
@@ -245,10 +245,10 @@ def _check_start(checked_kit, b, t, q, v, sizes, shifts):
 @merged
 def _has_all_entries(b):
     """Return whether b.rows is nonzero exactly where b.kinds is: then positions nearby need not be tried."""
-    n, same = b.rows.shape[1], True
+    n, is_same = b.rows.shape[1], True
     for k in range(b.kinds.size):
-        same = same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
-    return same
+        is_same = is_same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
+    return is_same
 
 
 @merged
@@ -318,13 +318,13 @@ NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started; the data of
 @exact
 def _is_last_start(last_start, t, t1, q, v):
     """Return whether the start (t, t1, q, v) equals that in `last_start` bit for bit; store it in `last_start`."""
-    n, same = q.size, last_start[N_EQUAL] > NEVER
+    n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
-        before = last_start[START + k]
-        same = same and x == before and math.copysign(1.0, x) == math.copysign(1.0, before)
+        last_value = last_start[START + k]
+        is_same = is_same and x == last_value and math.copysign(1.0, x) == math.copysign(1.0, last_value)
         last_start[START + k] = x
-    return same
+    return is_same
 
 
 # indices in the report. N_STATES: number of states, including the first. N_STEPS: number of steps. NOTHING_TO_CHECK: 1
@@ -334,7 +334,7 @@ def _is_last_start(last_start, t, t1, q, v):
 # that `advance` returned. IS_NEW: 1 if the start differs from the previous one. From N_REPORT on: the counters
 N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
-N_HEAD = N_REPORT + N_COUNTERS
+N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
 
 
 @merged

@@ -64,11 +64,11 @@ def empty(sizes: Sizes) -> Work:
 def copy_of(work: Work) -> Work:
     """Return a copy of a workspace, of those data that are kept from one step to the next."""
     sizes = work.sizes
-    copied = _take_unused(sizes) or _allocate(sizes)
-    for target, source in zip(lasting(copied), lasting(work), strict=True):
+    duplicate = _take_unused(sizes) or _allocate(sizes)
+    for target, source in zip(lasting(duplicate), lasting(work), strict=True):
         target[:] = source
-    copied.changes[:] = 0.0
-    return copied
+    duplicate.changes[:] = 0.0
+    return duplicate
 
 
 def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -134,16 +134,16 @@ def _static_shapes(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[
     """
     n, n_redundant = n_q + n_c, n_c - rank
     n_rows = n_c if static.dense_jacobian else 0
-    side = n_q if static.dense_mass else 0
+    mass_side = n_q if static.dense_mass else 0
     matrices = dict.fromkeys(("L", "S", "W", "A", "MT", "Gx", "G_of_S"), (0, 0))
     empty_vectors = dict.fromkeys(("values", "values_v", "values_a", "right"), (0,))
     numbers: dict[str, tuple[int, ...]] = {
-        "augmented": ((n_rows + 1) * n_q * static.dense_jacobian + side * side,),
+        "augmented": ((n_rows + 1) * n_q * static.dense_jacobian + mass_side * mass_side,),
         **matrices,
         **empty_vectors,
         "D": (n_q + 1, 0),
         "pattern": (n_rows, n_q),
-        "mass_pattern": (side, side),
+        "mass_pattern": (mass_side, mass_side),
         "z": (n_c,),
         "minimum": ((static.n_factors + n + n_q) * (n_redundant > 0),),
         "predicted": (n_q,),
@@ -180,7 +180,7 @@ def _layout(
     n_rows = n_c + n_a
     n_redundant = n_rows - r_v
     n_dof = n_q - r_v if reduced else 0
-    size = n_q + r_v if augmented else 0
+    n_augmented = n_q + r_v if augmented else 0
     n_entries = (n_rows + 1) * n_q
     numbers: dict[str, tuple[int, ...]] = {
         "augmented": (n_entries + n_q * n_q,),  # must be the first array; `entries`, `G` and `M` are parts of it
@@ -204,8 +204,8 @@ def _layout(
         "minimum": (n_redundant * (r_v + n_redundant + 1),),
         "values": (values_size(r),),
         "values_v": (values_size(r_v),),
-        "values_a": (values_size(size, may_be_dense=False),),
-        "right": (2 * size,),
+        "values_a": (values_size(n_augmented, may_be_dense=False),),
+        "right": (2 * n_augmented,),
         "predicted": (r,),
         "notes": (N_NOTES,),
         "nodes": (n_nodes,),
@@ -217,19 +217,19 @@ def _layout(
         "places": (n_rows + 1 + n_rows * n_q,),
         **{"rows": (r,), "dependent": (r,), "independent": (n_q - r,)},
         **{"rows_v": (r_v,), "dependent_v": (r_v,), "independent_v": (n_q - r_v,), "index_v": (index_size(r_v),)},
-        "index_a": (index_size(size),),
+        "index_a": (index_size(n_augmented),),
         "order": (n_q,),
         "row_order": (n_rows,),
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
         "index": (index_size(r),),  # must be the last array, as its end keeps no data from one step to the next
     }
-    rows_of_G, side = n_rows + 1, n_q
+    rows_of_G, mass_side = n_rows + 1, n_q
     if static is not None:
         static_shapes = _static_shapes(n_q, n_c, r, static)
         numbers |= static_shapes[0]
         integers |= static_shapes[1]
-        rows_of_G, side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
+        rows_of_G, mass_side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
         n_entries = rows_of_G * n_q
     # names of the arrays for positions that velocities use, too, if there are no non-holonomic constraints
     of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
@@ -240,7 +240,7 @@ def _layout(
     of_numbers, n_numbers = _array_ranges(numbers)
     of_integers, n_integers = _array_ranges(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
-    of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
+    of_numbers["M"] = n_entries, n_entries + mass_side * mass_side, (mass_side, mass_side)
     # number of integers at the end of `index` that are used only while the order of elimination is chosen
     n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
     n_lasting = of_numbers["matrices"][0], of_integers["index"][1] - n_ordering
@@ -261,10 +261,7 @@ def _layout(
 
 
 def _array_ranges(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Return (first offset, end, shape) of each array by name, and the length of the memory that contains all arrays.
-
-    Each array begins at the start of a cache line.
-    """
+    """Return (first offset, end, shape) of each array by name, aligned to cache lines, and the length of all arrays."""
     ranges, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)

@@ -35,7 +35,7 @@ N_PARTS = 12  # number of parts of an interval, at whose ends C_t and b are samp
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 RATE_HALVINGS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
-TIME_ROUNDING = 5e3  # rounding error of the twelfth difference due to that of t, relative to slope times np.spacing(t)
+TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, relative to slope times np.spacing(t)
 STEEPNESS = 4.0  # slope of C_t or b, relative to its mean over the step, above which a part of the step is a ramp
 MAX_RAMP_SHARE = 0.125  # longest part of a step, relative to its size, that counts as a ramp: steps must end at a ramp
 MIN_SPACINGS = 8.0  # duration of an interval, in spacings of floating-point numbers, at which its bisection ends
@@ -92,10 +92,7 @@ def _allowed_error(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest |change of a velocity - h times its mean acceleration|, relative to the tolerance.
-
-    The mean acceleration is that of `state` and `new_state`.
-    """
+    """Return the largest velocity change beyond h times the mean acceleration of both states, over the tolerance."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -160,13 +157,13 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of intervals between the samples of one set
 LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-# ratio of second difference to range of the samples above which a change is sudden: that of a bell four spacings wide
+# ratio of second difference to range of the samples above which a change is sudden, as in a pulse four spacings wide
 SUDDEN_SHARE = 0.1
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
 # smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too
 # coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
-N_IN_STEP = 8.0  # least number of samples in a step, because a force that acts for a quarter of it may miss all stages
+N_IN_STEP = 8.0  # least number of samples in a step: a force that acts for a quarter of the step may miss all stages
 RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one below which samples ahead are taken again
 LEAST_APART = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 HALVINGS = 20  # number of bisections that locate the change of a value between two samples
@@ -208,10 +205,7 @@ def _largest(values):
 
 @compiled
 def _is_smooth(values, k, n):
-    """Return whether the second differences of `values` at k and k + 1 have the same sign and similar sizes.
-
-    `values` has n + 1 entries; if k + 1 is the last one, k - 1 replaces it.
-    """
+    """Return whether second differences of n + 1 values at k and next to k have the same sign and similar sizes."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -438,10 +432,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return `size`, or the size (s) of a step from t to the next sudden change if it is smaller.
-
-    `new_state` is scratch; `last` is the last output time.
-    """
+    """Return `size`, or the size (s) of a step from t to the next sudden change if smaller; `new_state` is scratch."""
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]

@@ -84,10 +84,7 @@ def record_accepted(rule, past, h, error):
 
 @compiled
 def evaluate_near(f, w, t, Q, V, A):
-    """Project the state (Q, V) onto the constraints in place, and store its accelerations in A; return a code.
-
-    (Q, V), n_q each, must be near the constraints.
-    """
+    """Project (Q, V), a state near the constraints, in place, and store its accelerations in A; return a code."""
     # PROJECT is the cheapest task of generated code, and in the static form the task EVALUATE does not project
     if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)

@@ -68,7 +68,7 @@ from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
 # FIRST_ESTIMATE: number of evaluations before the first estimate of rho; BETWEEN_ESTIMATES: number between two
-# estimates, which take about eight evaluations each. The explicit method multiplies both numbers by COST_RATIO
+# estimates, which take about eight evaluations each. For the explicit method, both are multiplied by COST_RATIO
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
 NEGLIGIBLE = 1e-3  # product of step size and eigenvalue of dF/dv below which the power iterations for dF/dv end
@@ -112,8 +112,8 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 (
     PHASE,  # EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps in this phase
-    MAY_ESTIMATE,  # 1: the last attempt was accepted, so that the rate may be estimated
-    NEXT_ESTIMATE,  # number of evaluations at which the rate is estimated again
+    MAY_ESTIMATE,  # 1: the last attempt was accepted, so that rho may be estimated
+    NEXT_ESTIMATE,  # number of evaluations since the start of the run at which rho is estimated again
     ESTIMATES_TO_WAIT,  # number of estimates before the next trial may begin
     WAIT,  # value of ESTIMATES_TO_WAIT after the last trial
     T_BEGIN,  # time from which the cost per second is measured, s
@@ -229,10 +229,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the larger relative rate of change (1/s) of velocities and accelerations, or infinity if it is unknown.
-
-    The rate of accelerations is a difference over DIFFERENCE_STEP / `rate`; (Q, V, A) is scratch.
-    """
+    """Return the larger relative rate of change (1/s) of velocities and of accelerations; infinity if it is unknown."""
     n = Q.size
     dt = DIFFERENCE_STEP / rate
     fastest = largest = change = 0.0
@@ -252,10 +249,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Return whether a vibration of angular frequency `rate` (1/s) has velocities of at most QUIET_FACTOR tolerances.
-
-    The velocities are computed from the accelerations in `state`.
-    """
+    """Return whether a vibration of angular frequency `rate` (1/s) has velocities up to QUIET_FACTOR tolerances."""
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]

@@ -26,7 +26,7 @@ ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many s
 SAFETY = 0.8  # factor on the step size for which the estimated error would equal the tolerance
 GROWTH, SHRINKAGE = 1.2, 0.5  # largest and smallest ratio of successive step sizes
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
-LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes to which `departure` can lead
+LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes that an error of predicted positions can cause
 RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
 
 # eight Gauss nodes on [0, 1] and their weights: exact for c_i and (1 - s) c_i up to i = 15
@@ -86,7 +86,7 @@ def _row(memory, which):
 
 @inlined
 def _table(memory, n, which):
-    """Return a view (N_TERMS + 1, n padded) of table number `which`: phi_i is row i - 1 plus the last row, d."""
+    """Return a view (N_TERMS + 1, n padded) of table `which` of differences: phi_i is row i - 1 plus the last row."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
     return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))
@@ -94,10 +94,7 @@ def _table(memory, n, which):
 
 @inlined
 def _scratch(memory, n):
-    """Return two scratch rows (n padded), one for velocities and one for positions, of numbers in `memory`.
-
-    The rows first contain mean accelerations over the step, and later the weights ERROR_FACTOR / tolerance.
-    """
+    """Return two scratch rows (n padded) of `memory`, for v and q: mean accelerations, later 1 / allowed errors."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -153,7 +150,7 @@ def _compute_coefficients(memory, h, k):
         beta[i + 1] *= beta[i]
     for m in range(8):
         c[m] = 1.0
-    before = 0.0  # psi_i(n), at first psi_0 = 0
+    previous_psi = 0.0  # psi_i(n), at first psi_0 = 0
     for i in range(k + 2):
         velocity_integral = 0.0
         position_integral = 0.0
@@ -163,8 +160,8 @@ def _compute_coefficients(memory, h, k):
         g[i], G[i] = velocity_integral, position_integral
         inverse = 1.0 / new_psi[i]
         for m in range(8):
-            c[m] *= (NODES[m] * h + before) * inverse
-        before = psi[i]
+            c[m] *= (NODES[m] * h + previous_psi) * inverse
+        previous_psi = psi[i]
 
 
 @merged
@@ -227,8 +224,7 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
 def _error(g, G, h, order, largest_v, largest_q):
     """Return the estimated error of a step at `order`, in units of the tolerances.
 
-    `largest_v` and `largest_q` are the largest component of phi_{order+1}, divided by the tolerances of velocities and
-    of positions.
+    `largest_v`, `largest_q`: largest component of phi_{order+1}, divided by the tolerances of velocities, of positions.
     """
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 
@@ -277,8 +273,8 @@ def _choose_order(memory, h, k, table, d, n):
         return np.inf, 0.0
     if error > 1.0:
         return error, max(SAFETY * error ** (-1.0 / (k + 1.0)), SHRINKAGE)
-    root = expected ** (1.0 / (order + 1.0))
-    return error, SAFETY / min(max(root, SAFETY / (START_GROWTH if starting else GROWTH)), 1.0)
+    error_root = expected ** (1.0 / (order + 1.0))
+    return error, SAFETY / min(max(error_root, SAFETY / (START_GROWTH if starting else GROWTH)), 1.0)
 
 
 @kernel(ATTEMPT, vectorized=True)

@@ -53,7 +53,7 @@ MAX_LEFT_OUT = 9  # number of left-out nodes above which the step fails
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of `begin`. BEGIN,
 # DURATION, END: times (s) of the polynomial of the last converged attempt (END = -inf: no polynomial)
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
-# smallest and largest fraction of the polynomial that is accepted as a step
+# duration of the shortest and longest part of the polynomial that is taken as one step, relative to the polynomial
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 # longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
 UNSEEN = 0.0767
@@ -84,17 +84,9 @@ def memory_size(n):
 def begin(memory, largest_pivot, earliest, base=None):
     """Store the conditions for the next polynomial in `memory`, and discard the stored polynomial.
 
-    Parameters
-    ----------
-    memory : ndarray
-        The memory of the step.
-    largest_pivot : float
-        Largest pivot of the run so far.
-    earliest : float
-        Earliest time at which nodes may lie, s.
-    base : (float, ndarray), optional
-        Time, s, and state [q, v, ...] of an earlier step, farther from the singular position, through whose q and v the
-        polynomial goes. None: it goes through q and v at the beginning of the step.
+    `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). The
+    polynomial goes through q and v of `base`, the time (s) and state [q, v, ...] of an earlier step that was farther
+    from the singular position; without `base`, through q and v at the beginning of the step.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
@@ -199,7 +191,7 @@ def _interpolate(j, c, left_out, a):
 
 @compiled
 def _widest_gap(c, c0, left_out):
-    """Return the longest part of [c0, 1] between nodes c with left_out = 0, as a fraction of the polynomial."""
+    """Return the longest part of [c0, 1] without an evaluated node (left_out = 0), as a fraction of the polynomial."""
     widest, before = 0.0, c0
     for k in range(S):
         if left_out[k] == 0.0 and c[k] > c0:
@@ -222,7 +214,7 @@ def _choose_partition_at_end(f, w, t, q, pivot, near):
 
 @compiled
 def _weights_to_start(b, c, c0, weights_v, weights_q):
-    """Store weights (S) of accelerations in weights_v and weights_q, for their integral and double integral to c0."""
+    """Store the weights (S) of accelerations in their integral (weights_v) and double integral (weights_q) to c0."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):
@@ -312,7 +304,7 @@ def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
 
 
 def state_at(memory, options, t):
-    """Return the state [q, v, a] of the polynomial in `memory` at time t, s."""
+    """Return the state [q, v, a] (3 n) of the polynomial in `memory` at the time t (s)."""
     stored, n = memory[-N_STORED:], (memory.size - 3 * S - N_STORED) // (S + 7)
     b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))

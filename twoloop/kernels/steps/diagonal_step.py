@@ -105,16 +105,16 @@ def _fill_matrix(w, memory, n, m, z, H):
 def factor_matrix(w, memory, z):
     """Factor T^T (M - z^2 K - z D) T, with z = gamma h and the tangents K and D computed last; return a code."""
     n, m = w.Q.size, w.independent.size
-    numbers = matrix_storage(w, n, at.FILTER)
-    H = as_matrix(numbers, m)
+    storage = matrix_storage(w, n, at.FILTER)
+    H = as_matrix(storage, m)
     w.counters[N_FACTORIZATIONS] += 1
-    _fill_matrix(w, memory, n, m, z, numbers)
+    _fill_matrix(w, memory, n, m, z, storage)
     memory[at.SYMMETRIC] = 0.0
     if _is_symmetric(H):
         if ldl_factor(H):
             memory[at.SYMMETRIC] = 1.0
             return DONE
-        _fill_matrix(w, memory, n, m, z, numbers)  # L D L^T fails if the matrix is indefinite, as in a compressed beam
+        _fill_matrix(w, memory, n, m, z, storage)  # L D L^T fails if the matrix is indefinite, as in a compressed beam
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
 
@@ -127,8 +127,8 @@ def factor_iteration(f, w, memory, t, q, v, z):
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    numbers = matrix_storage(w, n, at.FILTER)
-    K, R = numbers.reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
+    storage = matrix_storage(w, n, at.FILTER)
+    K, R = storage.reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
     AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
     if code == DONE:
@@ -202,10 +202,7 @@ VELOCITY_WEIGHT = 0.1  # weight, in the convergence test, of the position error 
 
 @inlined
 def stages_of(memory, s, n):
-    """Return views of `memory`: velocities (s, n) and accelerations (s, n) of the stages, and final accelerations (n).
-
-    The final accelerations are those of the last stage of the last accepted step.
-    """
+    """Return views of `memory`: velocities (s, n), accelerations (s, n) of stages; accelerations (n) at the start."""
     last = memory.size - n
     return (
         memory[last - 2 * s * n : last - s * n].reshape((s, n)),
@@ -223,10 +220,7 @@ def gamma_of(options):
 
 @merged
 def _set_stage_state(z, q_bar, v_bar, a, Q, V):
-    """Store V = v_bar + z a and Q = q_bar + z V (n_q each), the state of a stage with accelerations a.
-
-    The entries of dependent coordinates are start values for the inner loop.
-    """
+    """Store V = v_bar + z a and Q = q_bar + z V (n_q), the state of a stage; dependent entries are start values."""
     for m in range(Q.size):
         V[m] = v_bar[m] + z * a[m]
         Q[m] = q_bar[m] + z * V[m]
@@ -251,10 +245,7 @@ def one_stage_of(options):
 
 @compiled
 def _prepare(f, w, options, memory, t, h, Q, V, F):
-    """Update the derivatives and factors for a Newton iteration, unless they can be reused; return a code.
-
-    The last evaluation must have been at (t, Q, V), with the accelerations F.
-    """
+    """Update the derivatives at (t, Q, V), where F was evaluated last, and factors, unless reused; return a code."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -455,7 +446,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
 def _extrapolate(f, w, options, memory, h, q1, v1):
     """Replace (q1, v1), the state at the end of the step, by the result of the embedded formula.
 
-    On entry, E_Q and E_V in `memory` must be the difference of the two formulas, as `_error` has filtered it (twice).
+    On entry, E_Q and E_V in `memory` must be the difference of the two formulas, filtered twice by `_error`.
     """
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, N_FILTERS):
@@ -473,10 +464,10 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
-    longest = motion_time(w, tolerances, state, state[2 * n :])
+    max_duration = motion_time(w, tolerances, state, state[2 * n :])
     if memory[at.CHANGED] == 1.0:
-        longest = max(longest, motion_time(w, tolerances, state, A_stage[-1]))
-    error = velocity_error(w, tolerances, e_v, longest, state, new_state)
+        max_duration = max(max_duration, motion_time(w, tolerances, state, A_stage[-1]))
+    error = velocity_error(w, tolerances, e_v, max_duration, state, new_state)
     if error <= 1.0:
         return 0.0
     for i in range(w.independent.size):
@@ -485,7 +476,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     if _factor_filter(f, w, options, memory, h_longer) == DONE:
         _filter(f, w, options, memory, h_longer, e_q, e_v)
         # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
-        error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
+        error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     memory[at.H_FACTORED] = 0.0
     return error
 

@@ -65,15 +65,14 @@ from twoloop.kernels.linalg.dense import copy
 # nodes are too far apart to detect short forces, and the defect is evaluated between nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
-# contraction rho at which a first step should converge: from a rejected guess of its size, the next guess is computed
-START_CONTRACTION = 0.12
+START_CONTRACTION = 0.12  # contraction rho for which the size of the first step is guessed anew if a guess is rejected
 MAX_STARTS = 4  # largest number of guesses of the first step size
 DIVERGED_FACTOR = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
 MAX_LIMITED = 24.0  # value of the field LIMITED at which another method takes over, because the motion is stiff
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations hardly vary within a step
-N_PARTS = 4  # number of equal parts of a step, at whose inner ends the pivots of C_q are computed
-MIN_PIVOT_RATIO = 0.4  # ratio of such a pivot to that at the step's beginning below which a singular position is near
+N_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
+MIN_PIVOT_RATIO = 0.4  # ratio of a pivot within a step to that at its beginning below which a singular position is near
 # smallest tolerance with which this method goes on after a singular position: with smaller ones, five more runs of the
 # benchmark A02 were wrong, so another method takes over
 TIGHT_TOLERANCE = 1e-8
@@ -86,7 +85,7 @@ N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
 LEAST_TREND = 0.4  # lower bound of the trend: the ratio of successive values of the step size that the error allows
 MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
-_places = merged(places)
+_offsets = merged(places)
 
 
 def memory_size(n, n_iterated, n_rows):
@@ -113,8 +112,7 @@ def _predict_from_rejected(f, data, state):
 def _collocate(f, w, options, data, tolerances, t, h, state):
     """Solve for the stages of a step of size h; return a code, the error, and the ratio of the next step size to h.
 
-    The stages are stored in `data`. The code is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py.
-    The error is in units of the tolerances.
+    The stages are stored in `data`. The code is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED. Error: in tolerances.
     """
     is_first, estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[LOOK] / CHECKED_GAP
@@ -254,12 +252,12 @@ def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
     The lanes get the projected states, their accelerations and multipliers, and 1 in the field FINE if the projection
     converges, otherwise 0.
     """
-    ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
+    begin_ends = _offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
         row = min(k, n_ends - 1)
-        data[ends + k] = out_t[row]
+        data[begin_ends + k] = out_t[row]
         for i in range(2 * n):
-            data[ends + LANES * (1 + i) + k] = out_state[row, i]
+            data[begin_ends + LANES * (1 + i) + k] = out_state[row, i]
         data[field.FINE + k] = 1.0
     tolerance = max(options[THETA], MIN_CORRECTION * w.notes[ROUNDED])
     f.correct_ends(data, f.own_numbers)
@@ -285,7 +283,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
     if it violates redundant rows. If constraints depend on time (`driven`), the change of velocities is checked, too:
     a large one may be due to a discontinuity of the drive between the nodes, see discontinuities.py.
     """
-    _, _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
+    _, _, _, _, _, ends, end_a, lam, _ = _offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if data[field.FINE + k] == 0.0:
         return False
     for i in range(n):
@@ -310,7 +308,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return whether a step of size h may follow the last step before the integrator has checked the last step."""
+    """Return whether another step, of size h, may be taken before the integrator has checked the last step."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED * h_long or _is_unsuited(w, data, tolerances):
         return False
@@ -320,11 +318,7 @@ def _can_take_next_step(w, data, tolerances, control, clock, h):
 
 @merged
 def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Take at most n_most steps from `state`, up to the time `goal`; return their number.
-
-    The times, unprojected states and sizes of the steps are stored in out_t, out_state and out_steps; `state` becomes
-    the last state.
-    """
+    """Take at most n_most steps, and store their unprojected ends in out_t and out_state; return their number."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         h_wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])

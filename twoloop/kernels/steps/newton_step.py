@@ -192,8 +192,8 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[newton_options_at(s) + at.GAMMA0]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
-    longest = motion_time(w, tolerances, state, state[2 * n :])
-    error = velocity_error(w, tolerances, e_v, longest, state, new_state)
+    max_duration = motion_time(w, tolerances, state, state[2 * n :])
+    error = velocity_error(w, tolerances, e_v, max_duration, state, new_state)
     if error <= 1.0:
         return 0.0
     for i in range(w.independent.size):
@@ -201,7 +201,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
         # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
-        error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
+        error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
     return error
@@ -241,15 +241,15 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if memory[at.HAS_JACOBIAN] == 0.0:
             # compute derivatives at the middle stage: stiff directions turn as the bodies move, and those of the middle
             # stage differ least from those of the others. Between stages, a force might act that acts at no stage
-            x = node * h
+            dt = node * h
             for m in range(n):
-                q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
-                v_mid[m] = v[m] + x * a[m]
-            code = evaluate(f, w, t + x, q_mid, v_mid, options[INNER_TOL], a_mid)
+                q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])
+                v_mid[m] = v[m] + dt * a[m]
+            code = evaluate(f, w, t + dt, q_mid, v_mid, options[INNER_TOL], a_mid)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
-            multipliers(f, w, t + x, q_mid, v_mid, a_mid, w.lam)
-            code = derivatives_at(f, w, options, memory, s, t + x, q_mid, v_mid, a_mid)
+            multipliers(f, w, t + dt, q_mid, v_mid, a_mid, w.lam)
+            code = derivatives_at(f, w, options, memory, s, t + dt, q_mid, v_mid, a_mid)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
             memory[at.HAS_JACOBIAN] = 1.0

@@ -23,10 +23,9 @@ There are three kinds of storage:
   are computed by differences, in 2 b + 1 groups of columns without common rows (Curtis, Powell and Reid 1974, doi
   10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
 - sparse, for large systems: all coordinates are treated as independent, and the bordered matrix, with the right-hand
-  side [M r; G r], has a fixed sparsity pattern. K and D are computed by differences in groups of columns. Each time,
-  all coordinates are displaced at once, too, and the change of the residual is compared with the change that K and D
-  predict. A deviation shows that entries are missing, which were zero when the pattern was recorded: other storage is
-  then needed.
+  side [M r; G r], has a fixed sparsity pattern. K and D are computed by differences in groups of columns. Then all
+  coordinates are displaced at once, and the change of the residual is compared with that predicted by K and D. If they
+  deviate, entries are missing, which were zero when the pattern was recorded: other storage is then needed.
 """
 
 import numpy as np
@@ -425,7 +424,7 @@ def _fill_band_from_tangents(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_derivatives(f, w, memory, s, t, q, v):
-    """Store K and D, as bands, and the border at (t, q, v), the last evaluated state, in w.matrices; return a code."""
+    """Store K, D (as bands) and the border in w.matrices; return a code. (t, q, v) is the last evaluated state."""
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
@@ -467,13 +466,13 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
     n = w.Q.size
     K, D = _band(matrix_storage(w, n, BY_Q), n, b), _band(matrix_storage(w, n, BY_V), n, b)
     damped = memory[DAMPED] == 1.0
-    target = lu_band(numbers, n, b)
+    band = lu_band(numbers, n, b)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
             value = w.M[i, j] - z * z * K[i, b + j - i]
             if damped:
                 value -= z * D[i, b + j - i]
-            target[j, 2 * b + i - j] = value
+            band[j, 2 * b + i - j] = value
     Cq, _, _ = _border(w, n, w.rows.size, b)
     return factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, which), factorize, substitute)
 
@@ -623,11 +622,10 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 
 @compiled
-def _fill_entries_by_differences(f, w, t, q, v, by_v, base, moved_residual, moved, entries):
+def _fill_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
     """Store the entries of K, or D if `by_v`, computed by differences, in `entries`; return DONE or NOT_FINITE.
 
-    The coordinates of a group of columns are displaced at once. `base` (n_q) is the residual at (q, v);
-    `moved_residual` and `moved` (n_q) are scratch.
+    All columns of a group are computed at once. `base` (n_q) is the residual at (q, v); `residual`, `moved`: scratch.
     """
     rows, columns, begins = tangents_of(f.newton_program)
     base_point = v if by_v else q
@@ -638,32 +636,32 @@ def _fill_entries_by_differences(f, w, t, q, v, by_v, base, moved_residual, move
             j = columns[k]
             moved[j] = base_point[j] + RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
         if by_v:
-            _fill_sparse_residual(f, w, t, q, moved, False, moved_residual)
+            _fill_sparse_residual(f, w, t, q, moved, False, residual)
         else:
-            _fill_sparse_residual(f, w, t, moved, v, True, moved_residual)
+            _fill_sparse_residual(f, w, t, moved, v, True, residual)
         for k in range(first, last):
             i, j = rows[k], columns[k]
-            entries[k] = (moved_residual[i] - base[i]) / (moved[j] - base_point[j])
+            entries[k] = (residual[i] - base[i]) / (moved[j] - base_point[j])
     return DONE if finite_vector(entries) else NOT_FINITE
 
 
 @compiled
-def _has_complete_pattern(f, base, moved_residual, base_point, moved, largest, entries, predicted):
-    """Return whether the `entries` of K or D explain the difference between `base` and `moved_residual` (n_q).
+def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
+    """Return whether the `entries` of K or D explain the difference between `base` and `residual` (n_q).
 
-    `base` is the residual at `base_point` (q or v), `moved_residual` that at `moved`; `largest` is the largest term of
-    a residual. `moved_residual` and `predicted` (n_q) are overwritten.
+    `base` is the residual at `base_point` (q or v), `residual` that at `moved`; `largest` is the largest term of
+    a residual. `residual` and `predicted` (n_q) are overwritten.
     """
     rows, columns, _ = tangents_of(f.newton_program)
     predicted[:] = 0.0
     for k in range(rows.size):
         i, j = rows[k], columns[k]
         term = entries[k] * (moved[j] - base_point[j])
-        moved_residual[i] -= term
+        residual[i] -= term
         predicted[i] += abs(term)
     largest_excess = 0.0
     for i in range(base.size):
-        largest_excess = max(largest_excess, abs(moved_residual[i] - base[i]) - MAX_DEVIATION * predicted[i])
+        largest_excess = max(largest_excess, abs(residual[i] - base[i]) - MAX_DEVIATION * predicted[i])
     return largest_excess <= NOISE * largest
 
 
@@ -677,39 +675,37 @@ def _fill_sparse_derivatives(f, w, memory, t, q, v):
         return NEEDS_DENSE
     w.counters[N_JACOBIANS] += 1
     mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
-    base, moved_residual, moved, pivot_sizes, _, _ = _sparse_vectors(f, w)
+    base, residual, moved, pivot_sizes, _, _ = _sparse_vectors(f, w)
     copy(w.mass_values, mass)
     copy(w.jacobian_values, jacobian)
     copy(w.counts, counts)
     copy(w.solutions[w.solutions.size - counts.size :], stiffness)
     largest = _fill_sparse_residual(f, w, t, q, v, False, base)
-    code = _fill_entries_by_differences(f, w, t, q, v, False, base, moved_residual, moved, K)
+    code = _fill_entries_by_differences(f, w, t, q, v, False, base, residual, moved, K)
     if code != DONE:
         return code
     for j in range(q.size):
         moved[j] = displace_unequally(q[j], j)
-    _fill_sparse_residual(f, w, t, moved, v, True, moved_residual)
-    is_complete = _has_complete_pattern(f, base, moved_residual, q, moved, largest, K, pivot_sizes[: q.size])
+    _fill_sparse_residual(f, w, t, moved, v, True, residual)
+    is_complete = _has_complete_pattern(f, base, residual, q, moved, largest, K, pivot_sizes[: q.size])
     copy(jacobian, w.jacobian_values)
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
-    _fill_sparse_residual(f, w, t, q, moved, False, moved_residual)
+    _fill_sparse_residual(f, w, t, q, moved, False, residual)
     memory[DAMPED] = 0.0
     for i in range(q.size):
-        if moved_residual[i] != base[i]:
+        if residual[i] != base[i]:
             memory[DAMPED] = 1.0
     if memory[DAMPED] == 0.0:
         D[:] = 0.0
         return DONE if is_complete else NEEDS_DENSE
-    code = _fill_entries_by_differences(f, w, t, q, v, True, base, moved_residual, moved, D)
+    code = _fill_entries_by_differences(f, w, t, q, v, True, base, residual, moved, D)
     if code != DONE:
         return code
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
-    _fill_sparse_residual(f, w, t, q, moved, False, moved_residual)
-    is_complete = (
-        _has_complete_pattern(f, base, moved_residual, v, moved, largest, D, pivot_sizes[: q.size]) and is_complete
-    )
+    _fill_sparse_residual(f, w, t, q, moved, False, residual)
+    is_complete = _has_complete_pattern(f, base, residual, v, moved, largest, D, pivot_sizes[: q.size]) and is_complete
     return DONE if is_complete else NEEDS_DENSE
 
 
@@ -796,7 +792,7 @@ def factor_systems(f, w, options, memory, s, h):
     code = factor_filter(f, w, options, memory, s, h)
     offset += N_EIGEN_SCALARS + s
     for k in range(n_systems):
-        if code == DONE and (k > 0 or n_real == 0):  # a real eigenvalue equals gamma0
+        if code == DONE and (k > 0 or n_real == 0):  # eigenvalue 0, if real, equals gamma0: its factors exist already
             code = _factor_system(f, w, memory, s, k, h * complex(options[offset], options[offset + 1]))
         offset += 2 + 4 * s
     memory[H_FACTORED] = h
@@ -809,14 +805,9 @@ def _solve_real(f, w, memory, s, x):
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
-        n_unknowns = y.size
-        _fill_sparse_right_side(f, w, x, right.view(np.float64)[:n_unknowns])
-        solve_lu(
-            f.newton_program,
-            _sparse_factors(f, w, 0),
-            right.view(np.float64)[:n_unknowns],
-            y.view(np.float64)[:n_unknowns],
-        )
+        N = y.size
+        _fill_sparse_right_side(f, w, x, right.view(np.float64)[:N])
+        solve_lu(f.newton_program, _sparse_factors(f, w, 0), right.view(np.float64)[:N], y.view(np.float64)[:N])
         copy(right.view(np.float64)[:n], x)
     elif f.flags[BANDWIDTH] >= 0:
         X, pivots = vector(memory, s, n, Q_MOVED), pivots_of(memory, s, n, 0)
@@ -844,7 +835,7 @@ def _solve_complex(f, w, options, memory, s, k, x):
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
     """Replace x (complex; the first n_dof numbers of an array (n_q)) by the solution of the system of eigenvalue k."""
-    if k == 0 and options[newton_options_at(s) + N_REAL] > 0.0:  # a real eigenvalue equals gamma0
+    if k == 0 and options[newton_options_at(s) + N_REAL] > 0.0:  # the eigenvalue is real and equals gamma0
         real_part = vector(memory, s, w.Q.size, V_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real

@@ -37,13 +37,12 @@ def options_array(
 ) -> NDArray[np.float64]:
     """Return the array `options` of an implicit Runge-Kutta method with the tableau A, b, c.
 
-    `extrapolation`: see EXTRAPOLATION; `outer_test`: 1 if test (32) of the paper, for the convergence of the outer
-    loop, also covers the dependent coordinates, else 0; `power`: order - 1.
+    `outer_test`: 1 if test (32) of the paper also covers the dependent coordinates; others: see EXTRAPOLATION, POWER.
     """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
-    rows = (b, b @ A, c, _lagrange(c, 0.0), _lagrange(c, 1.0))
-    return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), *rows])
+    vectors = (b, b @ A, c, _lagrange(c, 0.0), _lagrange(c, 1.0))
+    return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), *vectors])
 
 
 def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
@@ -135,8 +134,7 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # indices of the scalars in `memory`
 (
-    # 1: the block TRIAL contains the stage accelerations of the last attempt; in diagonal_step.py: an attempt was made
-    HAS_TRIAL,
+    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt (diagonal_step.py: an attempt was made)
     H_TRIAL,  # step size of the last attempt, s
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step, s
@@ -168,11 +166,11 @@ def newton_options(
     """
     values, T = np.linalg.eig(A)
     inverse = np.linalg.inv(T)
-    real = [k for k in range(len(b)) if values[k].imag == 0.0]
+    reals = [k for k in range(len(b)) if values[k].imag == 0.0]
     pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
-    gamma0 = float(values[real[0]].real) if real else float(np.abs(values).min())
-    parts: list[Any] = [[len(real), len(pairs), gamma0, float(velocities)], _estimate_weights(b, c, gamma0)]
-    for k in real + pairs:
+    gamma0 = float(values[reals[0]].real) if reals else float(np.abs(values).min())
+    parts: list[Any] = [[len(reals), len(pairs), gamma0, float(velocities)], _estimate_weights(b, c, gamma0)]
+    for k in reals + pairs:
         row, column = inverse[k], T[:, k]
         parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])

@@ -78,7 +78,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     NEXT_UNIT,  # unit of time of the series about the end of the last attempt, s
     ALLOWED_SIZE,  # step size that the current series allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
-    TRIED,  # 1: the last attempt computed the other series, which becomes the current one if the attempt is accepted
+    TRIED,  # 1: the last attempt computed the series about its end, which becomes the current one if it is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
     TARGET,  # index, 0 or 1, of the series that `expand` computes
     # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_DISTANCE; 0: not known yet
@@ -92,8 +92,8 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
     """Return the length of `memory`; `early` and `late`: EARLY_WIDTH and LATE_WIDTH."""
-    rows = order + 2
-    scratch = rows * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
+    n_orders = order + 2
+    scratch = n_orders * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
     return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch + n_q
 
 
@@ -263,25 +263,21 @@ def _fill_second_factors(options, table, values, y):
 
 @inlined
 def arrays_of(options, memory, n, n_rows):
-    """Return views of `memory`: coefficients of all quantities and of arguments, sums of products, r and c.
-
-    N has one row for each order, as have (X1, Y1) and (X2, Y2), the arguments of early and late operations; r (n) and
-    c (n_rows) are right-hand sides.
-    """
+    """Return views of `memory`: coefficients of quantities (N), arguments (X1 to Y2), sums of products; r (n), c."""
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
-    depth = order + 2
+    n_orders = order + 2
     begin = N_MEMORY_SCALARS + 2 * (order + 1) * n
-    N = memory[begin : begin + depth * n_nodes].reshape((depth, n_nodes))
-    begin += depth * n_nodes
-    X1 = memory[begin : begin + depth * early].reshape((depth, early))
-    begin += depth * early
-    Y1 = memory[begin : begin + depth * early].reshape((depth, early))
-    begin += depth * early
-    X2 = memory[begin : begin + depth * late].reshape((depth, late))
-    begin += depth * late
-    Y2 = memory[begin : begin + depth * late].reshape((depth, late))
-    begin += depth * late
+    N = memory[begin : begin + n_orders * n_nodes].reshape((n_orders, n_nodes))
+    begin += n_orders * n_nodes
+    X1 = memory[begin : begin + n_orders * early].reshape((n_orders, early))
+    begin += n_orders * early
+    Y1 = memory[begin : begin + n_orders * early].reshape((n_orders, early))
+    begin += n_orders * early
+    X2 = memory[begin : begin + n_orders * late].reshape((n_orders, late))
+    begin += n_orders * late
+    Y2 = memory[begin : begin + n_orders * late].reshape((n_orders, late))
+    begin += n_orders * late
     total1 = memory[begin : begin + early]
     begin += early
     total2 = memory[begin : begin + late]
@@ -290,7 +286,7 @@ def arrays_of(options, memory, n, n_rows):
 
 
 @merged
-def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
+def begin_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
     """Store the coefficients of t and q up to order 1, of v and early operations of order 0; set r and c to zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
@@ -299,7 +295,7 @@ def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
         N[0, 1 + j] = series[j] = state[j]
         N[0, 1 + n + j] = state[n + j]
         N[1, 1 + j] = series[n + j] = unit * state[n + j]
-    begin_operations(options, EARLY, N[0], N[0, first:], x, y)
+    begin_operations(options, EARLY, N[0], N[0, begin_early:], x, y)
 
 
 @merged
@@ -315,7 +311,7 @@ def integrate_coefficients(K, unit, N, series, a):
 
 @merged
 def end_series(w, order, series):
-    """Count the evaluations; return DONE, or NOT_FINITE if the last order of `series` is not finite."""
+    """Count the evaluations in w.counters; return DONE, or NOT_FINITE if `series` is not finite in its last order."""
     w.counters[N_EVALUATIONS] += order - 1
     n = series.size // (order + 1)
     for j in range(n):
@@ -326,31 +322,28 @@ def end_series(w, order, series):
 
 @compiled
 def expand(f, w, options, memory, t, state, unit):
-    """Store series TARGET about `state` at t in `memory`; return a code. `unit`: unit of time, s.
-
-    w must contain the factors of the matrices at this state.
-    """
+    """Store series TARGET about `state` at t, with `unit` (s) as unit of time, by the factors in w; return a code."""
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
     series = series_of(memory, order, n, memory[TARGET])
     A, LAM = 1 + 2 * n, 1 + 3 * n
-    first = LAM + n_rows
-    second = first + _integers(options, EARLY + FIRST + COLUMN).size
+    begin_early = LAM + n_rows
+    begin_late = begin_early + _integers(options, EARLY + FIRST + COLUMN).size
     indices, constant = _integers(options, BALANCE + SUM_INDICES), _numbers(options, BALANCE + CONSTANT)
 
-    begin_series(options, t, unit, state, N, series, first, X1[0], Y1[0], r, c)
+    begin_series(options, t, unit, state, N, series, begin_early, X1[0], Y1[0], r, c)
     for k in range(order - 1):
         K = k + 1
         if K > 1:
             N[K, 0] = 0.0
         sum_of_products(X1, Y1, K, total1)
-        _next_coefficients(options, EARLY, K, N[K], N[K, first:], X1[K], Y1[K], X1[0], Y1[0], total1)
+        _next_coefficients(options, EARLY, K, N[K], N[K, begin_early:], X1[K], Y1[K], X1[0], Y1[0], total1)
         _store_sums(options, ROWS, -K / unit, N[K], c)
         if k == 0:
-            begin_operations(options, LATE, N[0], N[0, second:], X2[0], Y2[0])
+            begin_operations(options, LATE, N[0], N[0, begin_late:], X2[0], Y2[0])
         else:
             sum_of_products(X2, Y2, k, total2)
-            _next_coefficients(options, LATE, k, N[k], N[k, second:], X2[k], Y2[k], X2[0], Y2[0], total2)
+            _next_coefficients(options, LATE, k, N[k], N[k, begin_late:], X2[k], Y2[k], X2[0], Y2[0], total2)
         _store_sums(options, BALANCE, 1.0, N[k], r)
         if k == 0:
             for o in range(indices.size):
@@ -452,10 +445,7 @@ def _evaluate(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the defect at t + s h relative to the allowed defect, or infinity if the equations have no value there.
-
-    q, v and a (n each) are scratch.
-    """
+    """Return the ratio of the defect at t + s h to the allowed one (no value: infinity). q, v, a (n) are scratch."""
     series_a = series_accelerations(memory, q.size)
     _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
@@ -536,7 +526,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if estimated:
-        error = x / memory[ALLOWED_SIZE]  # an upper limit: the estimated error is a power of this ratio
+        error = x / memory[ALLOWED_SIZE]  # an upper bound of the error, which is a power of this ratio
         if error > 1.0 + SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)

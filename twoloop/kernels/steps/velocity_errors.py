@@ -81,25 +81,25 @@ def motion_time(w, tolerances, state, a):
     for j in w.independent:
         largest_v = max(largest_v, abs(state[n + j]))
         largest_a = max(largest_a, abs(a[j]))
-    longest = LONGEST_GAPS * tolerances[GAP]
-    return largest_v / largest_a if largest_v < longest * largest_a else longest
+    max_duration = LONGEST_GAPS * tolerances[GAP]
+    return largest_v / largest_a if largest_v < max_duration * largest_a else max_duration
 
 
 @compiled
-def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
+def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, state, new_state):
     """Return whether outdated derivatives J might make the error estimate wrong.
 
     There are two cases. First, the effect of the velocity error `unfiltered` (n_dof) would exceed the tolerances if it
-    lasted for `longest` (s). Second, the duration computed with J is short, and Newton's method converges so slowly
+    lasted `max_duration` (s). Second, the duration computed with J is short, and Newton's method converges so slowly
     that J must have changed by more than OUTDATED_CHANGE.
     """
     duration = memory[at.DURATION]
     if (
-        duration < min(longest, FAST_DURATION * z)
+        duration < min(max_duration, FAST_DURATION * z)
         and memory[at.CONTRACTION] * duration * duration > OUTDATED_CHANGE * z * z
     ):
         return True
-    return velocity_error(w, tolerances, unfiltered, longest, state, new_state) > 1.0
+    return velocity_error(w, tolerances, unfiltered, max_duration, state, new_state) > 1.0
 
 
 @compiled
@@ -111,8 +111,8 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_
     end of the step and a state displaced from it by a multiple of (e_q, e_v).
     """
     n = w.Q.size
-    longest = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
-    if not _derivatives_may_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
+    max_duration = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
+    if not _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, state, new_state):
         return True
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     Q, V = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
@@ -143,4 +143,4 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_
         largest_difference = max(largest_difference, abs(product - difference) / scale)
         largest_product = max(largest_product, abs(product) / scale, abs(difference) / scale)
         largest_v = max(largest_v, abs(e_v[i]) / scale)
-    return largest_difference <= OUTDATED_CHANGE * largest_product or largest_product * longest <= largest_v
+    return largest_difference <= OUTDATED_CHANGE * largest_product or largest_product * max_duration <= largest_v
