@@ -161,8 +161,8 @@ def _has_empty_row(rows):
 
 
 @exact
-def _is_symmetric(mass, allowed):
-    """Return whether M is symmetric, up to differences of `allowed` times its largest entry."""
+def _is_symmetric(mass, tolerance):
+    """Return whether M is symmetric, up to differences of `tolerance` times its largest entry."""
     largest, asymmetry, is_exactly_symmetric = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
@@ -172,19 +172,19 @@ def _is_symmetric(mass, allowed):
     for i in range(len(mass)):
         for j in range(len(mass)):
             largest, asymmetry = max(largest, abs(mass[i, j])), max(asymmetry, abs(mass[i, j] - mass[j, i]))
-    return asymmetry <= allowed * largest
+    return asymmetry <= tolerance * largest
 
 
 @exact
-def _is_rounding_error(value, row, state, sizes, least, rate, allowed):
-    """Return whether a sum, `value`, is a rounding error: at most `allowed` times the sum of the |terms|.
+def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
+    """Return whether a sum, `value`, is a rounding error: at most `tolerance` times the sum of the |terms|.
 
-    The terms are `rate` and row[j] state[j] for all j; |state[j]| counts as at least sizes[j] and at least `least`.
+    The terms are `rate` and row[j] state[j] for all j; |state[j]| counts as at least sizes[j] and at least `min_size`.
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):
-        sum_of_terms += abs(row[j]) * max(abs(state[j]), sizes[j], least)
-    return abs(value) <= allowed * sum_of_terms
+        sum_of_terms += abs(row[j]) * max(abs(state[j]), sizes[j], min_size)
+    return abs(value) <= tolerance * sum_of_terms
 
 
 @exact
@@ -221,7 +221,7 @@ def _find_stored_sizes(q, rows, n_c, sizes):
 
 
 @exact
-def _is_consistent(C, rate, rows, q, v, sizes, allowed):
+def _is_consistent(C, rate, rows, q, v, sizes, tolerance):
     """Return whether (q, v) satisfies the constraints, with values C, `rows` and `rate`, up to rounding.
 
     The size of a coordinate counts as at least its stored size, and at least the rounding error of the largest
@@ -235,9 +235,9 @@ def _is_consistent(C, rate, rows, q, v, sizes, allowed):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
-        if not _is_rounding_error(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
+        if not _is_rounding_error(speed + rate[i], rows[i], v, v, fastest, rate[i], tolerance):
             return False
-        if i < C.size and not _is_rounding_error(C[i], rows[i], q, stored_sizes, rounding, 0.0, allowed):
+        if i < C.size and not _is_rounding_error(C[i], rows[i], q, stored_sizes, rounding, 0.0, tolerance):
             return False
     return True
 
@@ -356,7 +356,7 @@ def rows_at(f, t, positions, n_c, rows):
 
 
 @exact
-def _is_close(fused, separate, allowed, rounding_errors):
+def _is_close(fused, separate, tolerance, rounding_errors):
     """Return whether entries in row i of both matrices differ by at most rounding_errors[i] + allowed max|separate|."""
     largest = 0.0
     for i in range(separate.shape[0]):
@@ -364,14 +364,14 @@ def _is_close(fused, separate, allowed, rounding_errors):
             largest = max(largest, abs(separate[i, j]))
     for i in range(separate.shape[0]):
         for j in range(separate.shape[1]):
-            if abs(fused[i, j] - separate[i, j]) > allowed * largest + rounding_errors[i]:
+            if abs(fused[i, j] - separate[i, j]) > tolerance * largest + rounding_errors[i]:
                 return False
     return True
 
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
-def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, allowed, rounding):
-    """Return whether results of the fused and the separate callbacks differ by at most `allowed` times the largest one.
+def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, tolerance, rounding):
+    """Return whether results of fused and separate callbacks differ by at most `tolerance` times the largest result.
 
     Values of C may also differ by `rounding` times the sum of their |terms|. `fused` and `separate`, (3 + n_q, n_c),
     are zero on entry, and contain C, C_t, gamma and C_q on return; `rounding_errors` (n_c), zero on entry, is scratch.
@@ -383,15 +383,15 @@ def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, allowed, roun
     f.jacobian(t, q, f.p, separate_rows)
     f.constraint_rate(t, q, f.p, separate[1])
     f.gamma(t, q, v, f.p, separate[2])
-    agree = _is_close(fused_rows, separate_rows, allowed, rounding_errors)
+    agree = _is_close(fused_rows, separate_rows, tolerance, rounding_errors)
     for k in range(1, 3):
         agree = agree and _is_close(
-            fused[k : k + 1].reshape((n_c, 1)), separate[k : k + 1].reshape((n_c, 1)), allowed, rounding_errors
+            fused[k : k + 1].reshape((n_c, 1)), separate[k : k + 1].reshape((n_c, 1)), tolerance, rounding_errors
         )
     for i in range(n_c):
         for j in range(n):
             rounding_errors[i] += rounding * abs(separate_rows[i, j]) * abs(q[j])
-    return agree and _is_close(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), allowed, rounding_errors)
+    return agree and _is_close(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, rounding_errors)
 
 
 VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors

@@ -139,10 +139,10 @@ def largest_difference_step(q, v):
 @merged
 def _difference_side(notes, t, e):
     """Return the side of t for differences: 1, after t, or -1, before t, if C_t or b jumps near t; else 0, both."""
-    before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
-    if min(before, after) >= 2.0 * e:
+    since_jump, until_jump = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
+    if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
-    return 1.0 if after >= before else -1.0
+    return 1.0 if until_jump >= since_jump else -1.0
 
 
 @compiled

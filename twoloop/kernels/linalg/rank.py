@@ -22,15 +22,15 @@ def _dot(x, y):
 
 
 @compiled
-def _orthogonalise(basis, n, rest, parts):
-    """Subtract from `rest` its components along n orthonormal rows, and add them to `parts`; return |rest|^2."""
+def _orthogonalise(basis, n, remainder, components):
+    """Subtract from `remainder` its parts along n orthonormal rows, add these to `components`; return |remainder|^2."""
     for i in range(n):
-        component = _dot(basis[i], rest)
+        component = _dot(basis[i], remainder)
         if component != 0.0:
-            parts[i] += component
-            for j in range(rest.size):
-                rest[j] -= component * basis[i, j]
-    return _dot(rest, rest)
+            components[i] += component
+            for j in range(remainder.size):
+                remainder[j] -= component * basis[i, j]
+    return _dot(remainder, remainder)
 
 
 @merged
@@ -46,19 +46,19 @@ def select_rows(G, min_sine, basis, factors, kept):
     for k in range(len(G)):
         if n_kept == len(basis) - 1:
             break
-        rest, parts = basis[n_kept], factors[n_kept]
-        for j in range(rest.size):
-            rest[j] = G[k, j]
+        remainder, components = basis[n_kept], factors[n_kept]
+        for j in range(remainder.size):
+            remainder[j] = G[k, j]
         for i in range(n_kept):
-            parts[i] = 0.0
+            components[i] = 0.0
         row_square = _dot(G[k], G[k])
-        rest_square = _orthogonalise(basis, n_kept, rest, parts)
-        if rest_square < REPEAT_BELOW * row_square:
-            rest_square = _orthogonalise(basis, n_kept, rest, parts)
-        if rest_square > min_sine**2 * row_square:
-            parts[n_kept] = math.sqrt(rest_square)
-            for j in range(rest.size):
-                rest[j] /= parts[n_kept]
+        remainder_square = _orthogonalise(basis, n_kept, remainder, components)
+        if remainder_square < REPEAT_BELOW * row_square:
+            remainder_square = _orthogonalise(basis, n_kept, remainder, components)
+        if remainder_square > min_sine**2 * row_square:
+            components[n_kept] = math.sqrt(remainder_square)
+            for j in range(remainder.size):
+                remainder[j] /= components[n_kept]
             kept[n_kept] = k
             n_kept += 1
     return n_kept
@@ -232,13 +232,13 @@ def _count_weak_eigenvalues(mass, weak_ratio, A):
 @compiled
 def _has_similar_eigenvalues(mass):
     """Return whether, by Gershgorin's circles, all eigenvalues of M exceed SIMILAR_EIGENVALUES times the largest."""
-    least, largest = math.inf, 0.0
+    smallest, largest = math.inf, 0.0
     for i in range(len(mass)):
         row_sum = 0.0
         for j in range(len(mass)):
             row_sum += abs(mass[i, j])
-        least, largest = min(least, 2.0 * mass[i, i] - row_sum), max(largest, row_sum)
-    return least > SIMILAR_EIGENVALUES * largest
+        smallest, largest = min(smallest, 2.0 * mass[i, i] - row_sum), max(largest, row_sum)
+    return smallest > SIMILAR_EIGENVALUES * largest
 
 
 @merged

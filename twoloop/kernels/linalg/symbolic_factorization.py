@@ -48,7 +48,7 @@ class _DisjointSets:
 
 
 class _Supports:
-    """The ground and the remaining hubs as supports of parts; a part is a set of bodies joined by eliminated joints."""
+    """Supports of parts, the ground or remaining hubs; a part is a set of bodies that eliminated joints connect."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
@@ -60,7 +60,7 @@ class _Supports:
         self.supported: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def may_eliminate(self, joint: int) -> bool:
-        """Return whether a joint may be the next to be eliminated, see the docstring of this module."""
+        """Return whether a joint may be eliminated next, so that its rows are independent; see the module's docstring."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone and any(not self.grounded[part] and not self.hubs_of[part] for part in parts):
@@ -84,12 +84,12 @@ class _Supports:
     def _join(self, bodies: Iterable[int], grounded: bool, hubs: AbstractSet[int]) -> None:
         first, *others = bodies
         part = self.parts.find(first)
-        for other in others:
-            other = self.parts.find(other)
-            if other != part:
-                grounded = grounded or self.grounded[other] or self.grounded[part]
-                hubs = {*hubs, *self.hubs_of[other], *self.hubs_of[part]}
-                part = self.parts.join(part, other)
+        for body in others:
+            other_part = self.parts.find(body)
+            if other_part != part:
+                grounded = grounded or self.grounded[other_part] or self.grounded[part]
+                hubs = {*hubs, *self.hubs_of[other_part], *self.hubs_of[part]}
+                part = self.parts.join(part, other_part)
         self.grounded[part] = self.grounded[part] or grounded
         for hub in hubs - self.hubs_of[part]:
             self.hubs_of[part].add(hub)
@@ -121,7 +121,7 @@ def elimination_order(
     """
     body_of = bodies_of(n_q, mass_entries, together)
     bodies_in_row: list[set[int]] = [set() for _ in range(n_rows)]
-    for i, j in zip(*(each.tolist() for each in jacobian_entries), strict=True):
+    for i, j in zip(*(indices.tolist() for indices in jacobian_entries), strict=True):
         bodies_in_row[i].add(body_of[j])
     first_rows = set(first)
     rows_of: dict[frozenset[int], list[int]] = {}
@@ -162,15 +162,15 @@ def elimination_order(
 def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
     """Return, for each coordinate, the index of the first coordinate of the same body."""
     pairs = np.array([(first, other) for first, *others in together for other in others], dtype=np.int64).reshape(-1, 2)
-    ones, others = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
-    first_of, previous = np.arange(n_q), np.full(n_q, -1)
-    while (first_of != previous).any():
-        previous = first_of.copy()
-        least = np.minimum(first_of[ones], first_of[others])
-        np.minimum.at(first_of, ones, least)
-        np.minimum.at(first_of, others, least)
-        first_of = first_of[first_of]
-    return first_of.tolist()  # type: ignore[no-any-return]
+    rows, columns = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
+    representatives, previous = np.arange(n_q), np.full(n_q, -1)
+    while (representatives != previous).any():
+        previous = representatives.copy()
+        smaller = np.minimum(representatives[rows], representatives[columns])
+        np.minimum.at(representatives, rows, smaller)
+        np.minimum.at(representatives, columns, smaller)
+        representatives = representatives[representatives]
+    return representatives.tolist()  # type: ignore[no-any-return]
 
 
 def _minimum_degree(
@@ -198,37 +198,37 @@ def _minimum_degree(
         else:
             for k in joint_indices:
                 neighbours[k].update(joint_indices)
-    for one, other in pairs:
-        neighbours[node_of[one]].add(node_of[other])
-        neighbours[node_of[other]].add(node_of[one])
-    for k, others in enumerate(neighbours):
-        others.discard(k)
+    for hub_a, hub_b in pairs:
+        neighbours[node_of[hub_a]].add(node_of[hub_b])
+        neighbours[node_of[hub_b]].add(node_of[hub_a])
+    for node, adjacent in enumerate(neighbours):
+        adjacent.discard(node)
     supports = _Supports(joints, n_bodies, set(hubs), lone)
 
     def degree(node: int) -> int:
-        return sum(sizes[other] for other in neighbours[node])
+        return sum(sizes[neighbour] for neighbour in neighbours[node])
 
     heap = [(degree(node), node) for node in range(len(sizes))]
     heapq.heapify(heap)
-    done, order = [False] * len(sizes), []
+    is_eliminated, order = [False] * len(sizes), []
     while heap:
         degree_on_heap, node = heapq.heappop(heap)
-        if done[node] or degree_on_heap != degree(node):
+        if is_eliminated[node] or degree_on_heap != degree(node):
             continue  # a newer entry of the heap replaces this one
         if node < n_joints and not supports.may_eliminate(node):
             continue  # a hub that supports its parts is a neighbour: the elimination of this hub pushes the joint again
-        done[node] = True
+        is_eliminated[node] = True
         order.append(node)
         affected = neighbours[node]
-        for other in affected:
-            neighbours[other] |= affected
-            neighbours[other] -= {node, other}
+        for neighbour in affected:
+            neighbours[neighbour] |= affected
+            neighbours[neighbour] -= {node, neighbour}
         if node < n_joints:
             supports.eliminate(node)
         else:
             supports.eliminate_hub(hubs[node - n_joints])
-        for other in affected:
-            heapq.heappush(heap, (degree(other), other))
+        for neighbour in affected:
+            heapq.heappush(heap, (degree(neighbour), neighbour))
     return order
 
 
@@ -305,8 +305,8 @@ def program_in_order(
     is_above = rows[:n_mass] < columns[:n_mass]
     entry_slots[:n_mass][is_above] = entry_slots[:n_mass][is_above] + len(keys) if unsymmetric else n + len(keys)
     product_rows, first, second = _products_of_entries(jacobian[0], stiff_rows)
-    one, other = (position[jacobian[1][indices]] for indices in (first, second))
-    stiffened = [product_rows, first, second, slots(np.minimum(one, other), np.maximum(one, other))]
+    pivot_a, pivot_b = (position[jacobian[1][indices]] for indices in (first, second))
+    stiffened = [product_rows, first, second, slots(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b))]
     head = [n_q, n, len(keys), len(first_of), len(runs), n_mass, len(jacobian[0]), len(product_rows)]
     parts = [order, begin, row_of, runs, *mass, entry_slots[:n_mass], *jacobian, entry_slots[n_mass:], *stiffened]
     return np.concatenate([np.array(head), *parts]).astype(np.int32)
@@ -333,7 +333,7 @@ def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integer
         entries = sequence[np.searchsorted(ordered, row) : np.searchsorted(ordered, row + 1)]
         first_index, second_index = _index_pairs(len(entries))
         parts.append((np.full(len(first_index), row), entries[first_index], entries[second_index]))
-    product_rows, first, second = (np.concatenate(each) for each in zip(*parts, strict=True))
+    product_rows, first, second = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return product_rows, first, second
 
 
@@ -343,7 +343,7 @@ _INDEX_PAIRS: dict[int, Entries] = {}
 def _index_pairs(m: int) -> Entries:
     """Return the first and second indices of all unordered pairs of m items, including each item with itself."""
     if m not in _INDEX_PAIRS:
-        _INDEX_PAIRS[m] = tuple(each.astype(np.int64) for each in np.triu_indices(m))  # type: ignore[assignment]
+        _INDEX_PAIRS[m] = tuple(indices.astype(np.int64) for indices in np.triu_indices(m))  # type: ignore[assignment]
     return _INDEX_PAIRS[m]
 
 
