@@ -60,7 +60,7 @@ class _Supports:
         self.supported: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def may_eliminate(self, joint: int) -> bool:
-        """Return whether a joint may be eliminated next, so that its rows are independent; see the module's docstring."""
+        """Return whether a joint may be eliminated next: its rows must be independent, see the module's docstring."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone and any(not self.grounded[part] and not self.hubs_of[part] for part in parts):
