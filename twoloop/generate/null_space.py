@@ -23,8 +23,7 @@ from twoloop.generate.graph import Affine, is_zero
 Array = NDArray[np.float64]
 
 # largest change of accelerations or multipliers by a step of refinement, relative to the largest of them, that counts
-# as rounding. In random models the change grew by a factor of up to 300 during a run; for the governor, which needs no
-# refinement, it is 6e-11 at the start and 4e-12 during the run.
+# as rounding. During runs of random models the change grew by up to 300; the governor, with 6e-11, is not refined.
 ROUNDING_OF_SOLUTION = 1e-10
 
 
@@ -77,10 +76,7 @@ class Factors:
             self.blocks.append(Block(places, inverse, below))
 
     def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a 1x1 or 2x2 block of pivots; append to `conditions` or `positive`.
-
-        `alone`: for a row of G, its pivot without the other rows of G; None for a row of M.
-        """
+        """Return the inverse of a block of pivots; add conditions. `alone`: pivots of G without other rows of G."""
         diagonal = [None if pivot is None else pivot.value() for pivot in alone]
         a = pivots[0][0]
         if diagonal[0] is None:

@@ -228,9 +228,7 @@ def _sum_of_products(
         for i, c in factor.terms.items():
             _add_to_group(by_quantity, graph.quantity(i), multiplier.times(c))
     groups = (by_quantity, by_factor) if of_rates else (by_factor, by_quantity)
-    candidates = [
-        [_normalized_product(*group) for group in candidate.values() if group[1].terms] for candidate in groups
-    ]
+    candidates = [[_normalized_product(*pair) for pair in candidate.values() if pair[1].terms] for candidate in groups]
     for key, scale, factor, multiplier in min(
         candidates, key=lambda candidate: len({key for key, *_ in candidate} - products.keys())
     ):
@@ -264,9 +262,7 @@ def _assemble_program(
 ) -> SeriesProgram:
     early: list[Any] = []
     late: list[Any] = []
-    factors = [
-        form for products in (row_products, reaction_products) for _, *forms in products.values() for form in forms
-    ]
+    factors = [form for group in (row_products, reaction_products) for _, *forms in group.values() for form in forms]
     for i, operation in _needed_operations(graph, [*rows, *balance, *factors]):
         if i not in sums:
             kind, first, second = operation

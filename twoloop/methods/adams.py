@@ -6,9 +6,8 @@ import numpy as np
 
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 
-# stability limits for orders 1 to 12: largest h times the frequency of a vibration, at which its amplitude grows by 1 %
-# per step, and largest h times a rate of decay. Orders above 6 have the limit of order 6 for decay, because the order
-# falls when decay limits the steps
+# stability limits for orders 1 to 12: of h times the frequency of a vibration, which grows by 1 % per step there,
+# and of h times a rate of decay, above order 6 that of order 6, because the order falls when decay limits the steps
 STABLE_TO = tuple(
     zip(
         (2.01, 2.01, 0.92, 0.97, 1.09, 1.23, 1.28, 1.13, 1.00, 0.89, 0.79, 0.71),

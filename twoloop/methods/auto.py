@@ -17,8 +17,7 @@ MANY_COORDINATES = 16  # number of coordinates from which on evaluations may cos
 # largest number of constraints per coordinate at which Adams replaces DOP853 from MANY_COORDINATES on: with more
 # constraints, projections cost more than evaluations
 MAX_CONSTRAINT_RATIO = 0.25
-# tolerance below which Adams replaces DOP853 from MANY_COORDINATES on, with any number of constraints
-ADAMS_TOLERANCE = 1e-10
+ADAMS_TOLERANCE = 1e-10  # tolerance below which Adams replaces DOP853 from MANY_COORDINATES on
 VERY_MANY_COORDINATES = 64  # number of coordinates from which on Adams replaces DOP853, except with sparse matrices
 MAX_NEWTON_COORDINATES = 1000  # largest number of coordinates for which Newton's method, with full matrices, is tried
 # tolerance whose rule for the choice of a series also applies at looser ones if the other methods need short steps
@@ -98,7 +97,7 @@ class Auto:
     At looser tolerances a run also begins with `series` if the other methods may take no steps longer than a hundredth
     of the run. Within 10 steps it continues without the series if the next step would be no longer than that. Steps of
     `few` may be longer if forces and constraints have no quotients, roots or fast vibrations. A run also continues
-    without the series if the series is not finite and the functions are.
+    without the series if the series is not finite although the callbacks are.
 
     The largest rate of the motion is estimated from the derivatives of the accelerations, after 100 evaluations and
     then after every 600 (two to four times as many with generated code). This rate sets the limit of stability of the
@@ -106,8 +105,8 @@ class Auto:
 
     - steps have come near the limit, at two successive estimates (at one with `many`, and with `few` from 16
       coordinates on);
-    - steps are above 5 % of the limit, and the rate is more than thirty times that of the motion itself, or velocities
-      that could change at this rate are within ten tolerances;
+    - steps are above 5 % of the limit, and the rate is more than thirty times that of the motion itself, or all
+      velocities that could vibrate or decay at this rate are within ten tolerances;
     - the whole run is expected to cost a thousand trials.
 
     Unless steps are far above the limit, the trial waits until the run has cost three trials, and 64 evaluations for

@@ -17,8 +17,7 @@ Array = NDArray[np.float64]
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # lower limit of the error, relative to the tolerance, in the trend that the step size follows
 ROUGH = 10.0  # measured largest ratio of error to estimate of a step in which a force jumps, for most methods
-# largest correction of a position, unit of q, after which a projection is not repeated: the error of velocities is then
-# as small
+# largest correction of a position, unit of q, after which a projection is not repeated: velocities are then as exact
 LARGEST_MOVE = 1e-14
 OUTER_TOL_RATIO = 0.01  # tolerance of the outer loop, relative to that of the step
 OUTER_TOL_FIXED = 1e-14  # tolerance of the outer loop in fixed steps, which are iterated to rounding

@@ -23,8 +23,7 @@ from twoloop.methods.tableaux import Tableau
 NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps with Newton's method: stiff forces magnify rounding errors
 # h rho from which on fixed-point iteration converges so slowly that Newton's method is tried; rho: largest rate
 LIMIT_OF_FIXED_POINT = 1.5
-# largest condition number of the eigenvectors of A with which they count as a basis; the inverse of this number is the
-# smallest magnitude of the eigenvalues with which A counts as invertible
+# largest condition number of the matrix of eigenvectors of A; its inverse: smallest allowed |eigenvalue| of A
 MAX_CONDITION = 1e8
 # number of parts of a step for the solution within it, by the highest order for which the number suffices: with fewer
 # parts the error is more than a few times that at the ends (four-bar linkage, tolerances of 1e-4 to 1e-12)
@@ -56,12 +55,12 @@ class RungeKutta:
         The step size follows the error and, except with "paper", its trend (Gustafsson 1994).
     error : {"richardson", "richardson-paper"}
         Both take the difference of one step of h and two of h/2, undivided as in (26), for the local error.
-        "richardson": its largest component counts, and the step continues from the extrapolated state, put back on
-        the constraints, whose order is one higher. "richardson-paper": its root mean square (27) counts, and the step
-        continues from the two half steps. Fixed steps estimate nothing and are the tableau's own, with sums from step
-        to step that compensate rounding (Kahan's). With "richardson" the accelerations at both ends of the step are
-        compared with the polynomial through those of the stages. This finds a jump of the force between an end and its
-        nearest stage, which no stage sees.
+        "richardson": the largest component of the difference counts, and the step continues from the extrapolated
+        state, whose order is one higher, put back on the constraints. "richardson-paper": the root mean square (27) of
+        the difference counts, and the step continues from the two half steps. Fixed steps have no error estimate and
+        use the tableau as it is, with sums from step to step that compensate rounding (Kahan). With "richardson" the
+        accelerations at both ends of the step are compared with the polynomial through those of the stages: so a jump
+        of the force between an end and its nearest stage is found, too.
     inner_tol : float, optional
         Newton's method for the positions stops when its last correction is at most this (unit of q). None: 1e-8.
     outer_tol : float, optional
@@ -275,10 +274,10 @@ class ESDIRK:
     Both formulas are L-stable and end with their last stage. With step-size control "TRBDF2" continues from its
     embedded formula, of order 3: the difference, filtered for stiff components three times, is L-stable, too. A step is
     accepted when these errors are within the tolerance: the error of the positions, estimated by the embedded formula
-    and filtered; the error that the velocities will add to the positions before it turns back or decays (ten times that
-    if it does so no faster than the motion changes); and the part of it that remains some steps later, over the time in
-    which the motion changes. ESDIRK4 has a second embedded formula for forces that jump within a step, which the first
-    hardly shows. Vibrations that are faster than the steps are damped. `tested="all"` tests velocities as well.
+    and filtered; the error that the velocity error will add to the positions before it turns back or decays (ten times
+    that if it does so no faster than the motion changes); and the part of it that remains some steps later, over the
+    time in which the motion changes. ESDIRK4 has a second embedded formula for jumps of a force within a step, which
+    the first formula hardly shows. Vibrations faster than the steps are damped. `tested="all"` tests velocities, too.
 
     Parameters
     ----------
@@ -289,8 +288,8 @@ class ESDIRK:
         1e-8.
     outer_tol : float, optional
         The outer loop stops when the last correction changes no independent position by more than this, relative to
-        max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3; below tolerances of 1e-3 less, in proportion to the
-        number of steps over which such corrections add up; with fixed steps 1e-12.
+        max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3; below tolerances of 1e-3 less, because such corrections
+        add up over more steps; with fixed steps 1e-12.
     tested : {"all", "positions"}
         Quantities that the error estimate counts: positions and velocities, or positions and the effect of velocities
         on them. Stiff vibrations that do not matter show in the velocities; "positions" ignores them.
