@@ -67,22 +67,22 @@ def with_derived_callbacks(system: ConstrainedSystem, check: Check) -> tuple[Con
     If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple: finite
     differences then replace missing callbacks. `check` raises Untraceable if the traces are wrong.
     """
-    absent = [kind for kind, size in DERIVABLE.items() if getattr(system, size) and kind not in system.given]
-    if not absent:
+    missing = [kind for kind, size in DERIVABLE.items() if getattr(system, size) and kind not in system.given]
+    if not missing:
         return system, ()
     try:
         derived: DerivedSystem = derive_cached(
-            system, "programs", partial(_derive_programs, system, absent), lambda derived: check(derived.traced)
+            system, "programs", partial(_derive_programs, system, missing), lambda derived: check(derived.traced)
         )
     except Untraceable:
         return system, ()
     return derived.system, (derived.traced,)
 
 
-def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: TraceCache) -> DerivedPrograms:
+def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: TraceCache) -> DerivedPrograms:
     equations = cache.equations(system)
     programs = {}
-    for name, forms in _missing_derivatives(equations, absent).items():
+    for name, forms in _missing_derivatives(equations, missing).items():
         program = OperationTable.of(equations.graph, 1 + 2 * system.n_q, dict(enumerate(forms.values())))
         if len(program.rows) > MOST_OPERATIONS:
             raise Untraceable(f"{name} takes {len(program.rows)} operations")
@@ -90,14 +90,14 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
     return DerivedPrograms(programs, Traced(system, equations.graph))
 
 
-def _missing_derivatives(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
+def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
     """Return missing C_q and Gamma by kind of callback ("gamma": both kinds), as expressions by flat array index."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
-        if kind in absent:
+        if kind in missing:
             gamma |= dict(enumerate(equations.of(kind), first))
-    if "jacobian" not in absent:
+    if "jacobian" not in missing:
         return {"gamma": gamma} if gamma else {}
     entries = enumerate(equations.of("jacobian").ravel())
     return {"gamma": gamma, "jacobian": {k: form for k, form in entries if form.terms or form.constant}}
@@ -167,8 +167,8 @@ def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
     """Return rows [t, q, v] with the t and q of `states`, and random nonzero v that are about as large as theirs."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
-    speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))
-    return np.column_stack([times, positions, speed * generic_v])
+    scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))
+    return np.column_stack([times, positions, scale * generic_v])
 
 
 @cache

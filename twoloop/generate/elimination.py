@@ -200,15 +200,15 @@ class PivotChooser:
         2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times as large as
         M, k digits are lost, which refinement restores. `index`: index in LEAST of the choice with M.
         """
-        last = self._last
-        rows = G[list(last.rows)]
+        last_choice = self._last
+        rows = G[list(last_choice.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
         scratch, chosen = np.zeros_like(self._room), np.zeros_like(self._chosen)
         new_index = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, scratch, chosen)
-        if not 0 <= new_index <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
-            return last
+        if not 0 <= new_index <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last_choice.rows):
+            return last_choice
         least = float(LEAST[new_index])
-        return replace(last, added=last.rows, scale=float(scale), least=least, refined=True)
+        return replace(last_choice, added=last_choice.rows, scale=float(scale), least=least, refined=True)
 
     def _decode(self, index: int) -> PivotChoice:
         """Return the choice that the kernel wrote to `self._chosen`; raise Untraceable if `index` is an error code."""
@@ -570,11 +570,11 @@ class Solution:
         )
 
 
-def _shared_quantities(graph: Graph, factors: Sequence[int], more: Sequence[Program]) -> list[int]:
-    """Return the quantities on which `factors` depend and which the programs `more` use, too, without `factors`."""
+def _shared_quantities(graph: Graph, factors: Sequence[int], other_programs: Sequence[Program]) -> list[int]:
+    """Return the quantities on which `factors` depend and which `other_programs` use, too, without `factors`."""
     computed = set(graph.needed_by(map(graph.quantity, factors)))
-    used = {i for program in more for form in program.forms for i in form.terms}
-    for program in more:
+    used = {i for program in other_programs for form in program.forms for i in form.terms}
+    for program in other_programs:
         for j in program.quantities(computed):
             operation = graph.operations[j]
             assert operation is not None

@@ -386,14 +386,14 @@ class Equations:
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
         """Return -(dG/dt v + dG_t/dt), total derivatives at constant v; `rows`, `rates`: callbacks for G and G_t."""
-        moving = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
-        along = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **moving})
+        direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
+        total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
         gamma = self.of(rates)
         for i, row in enumerate(self.of(rows)):
-            total = along.of(gamma[i])
+            minus_gamma = total_derivative.of(gamma[i])
             for entry, u in zip(row, v, strict=True):
-                total = total + along.of(entry) * u if entry.terms else total
-            gamma[i] = -total
+                minus_gamma = minus_gamma + total_derivative.of(entry) * u if entry.terms else minus_gamma
+            gamma[i] = -minus_gamma
         return gamma
 
 
@@ -554,8 +554,8 @@ def derive_cached(
 def _derive_from(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
     """Return the result of `derive_cached` from one trace cache, or the exception that says why there is none."""
     try:
-        shared = cache.remembered(what, partial(make, cache))
-        return shared.of(system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters)))
+        result = cache.remembered(what, partial(make, cache))
+        return result.of(system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters)))
     except Untraceable as error:
         return error.with_traceback(None)
     except (ArithmeticError, RecursionError) as error:

@@ -6,7 +6,7 @@ import numpy as np
 
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 
-# stability limits for orders 1 to 12: of h times the frequency of a vibration, which grows by 1 % per step there,
+# stability limits for orders 1 to 12: of h times the frequency of a vibration, at which it grows by 1 % per step,
 # and of h times a rate of decay, above order 6 that of order 6, because the order falls when decay limits the steps
 STABLE_TO = tuple(
     zip(

@@ -174,19 +174,19 @@ class Auto:
     ) -> "Auto":
         """Return the method for a system; without `series` if callbacks cannot be traced or `check` refuses traces."""
         sparse = len(system.entries) == 2 and system.n_a == 0
-        chosen = replace(self, n_rows=system.n_c + system.n_a, series=None, lanes=None, sparse=sparse)
+        method = replace(self, n_rows=system.n_c + system.n_a, series=None, lanes=None, sparse=sparse)
         if code is not None:
             lanes = self.lanes if compiles_quickly(code.shared) else None
             lanes = None if lanes is None else lanes.for_system(system, code)
-            chosen = replace(chosen, lanes=lanes, cost_ratio=_cost_ratio(system))
+            method = replace(method, lanes=lanes, cost_ratio=_cost_ratio(system))
         untraced = code is None and (system.called_in_python or not is_quick(system))
         if self.series is None or untraced:
-            return chosen
+            return method
         try:
             series = self.series.for_system(system, code, check)
         except ValueError:
-            return chosen
-        return replace(chosen, series=series, narrow=may_be_steep(system, force_was_traced=True))
+            return method
+        return replace(method, series=series, narrow=may_be_steep(system, force_was_traced=True))
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
         """Return whether a step of the series costs less than the steps of the explicit method that it replaces."""

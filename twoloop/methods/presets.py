@@ -125,13 +125,13 @@ def _required_code(
     system: ConstrainedSystem, method: Method, compiled: Compiled, t0: float, q0: Array, check: Check
 ) -> GeneratedCode:
     """Return the generated code for a method that needs it; raise ValueError if there is none."""
-    what = f"method={method.name!r} needs code made for {system.name!r}"
+    requirement = f"method={method.name!r} needs code made for {system.name!r}"
     if not compiled:
-        raise ValueError(f"{what}; given compiled=False. Leave it out, or take method='auto'")
+        raise ValueError(f"{requirement}; given compiled=False. Leave it out, or take method='auto'")
     try:
         return generated_code(system, t0, q0, check)
     except ValueError as error:
-        raise ValueError(f"{what}, which cannot be had; {error.__cause__}. Take method='auto'") from error
+        raise ValueError(f"{requirement}, which cannot be had; {error.__cause__}. Take method='auto'") from error
 
 
 def _check_takes_code(method: Method, fixed: bool) -> None:
@@ -175,13 +175,13 @@ def plans_for(
 
     Raises ValueError if the method cannot run the system.
     """
-    method_key, choice = identity(method), None if code is None else code.shared.equations.choice
-    key, methods = (method_key, rtol, atol, fixed, choice), system.remembered("methods", dict)
+    method_key, pivot_choice = identity(method), None if code is None else code.shared.equations.choice
+    key, methods = (method_key, rtol, atol, fixed, pivot_choice), system.remembered("methods", dict)
     cached: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
     plans = None if method_key is None else cached.get(key)
     if plans is None:
         # the prepared method does not depend on tolerances
-        prepared = None if method_key is None else methods.get((method_key, choice))
+        prepared = None if method_key is None else methods.get((method_key, pivot_choice))
         if prepared is None:
             prepared = method.for_system(system, code, check) if hasattr(method, "for_system") else method
         plans = _make_plans(system, prepared, rtol, atol, fixed, code)
@@ -191,7 +191,7 @@ def plans_for(
                 cached.pop(next(iter(cached.copy())), None)
             cached[key] = plans
             if len(methods) < MAX_PLANS:
-                methods[method_key, choice] = prepared
+                methods[method_key, pivot_choice] = prepared
     plan, interiors = plans
     return plan.fresh(), interiors
 

@@ -132,8 +132,8 @@ class RungeKutta:
     @property
     def name(self) -> str:
         """Return the name of the method for messages and tables."""
-        usual = {"partition": "lasting", "tested": "all", "outer_test": "all"}
-        changed = [getattr(self, option) for option, value in usual.items() if getattr(self, option) != value]
+        defaults = {"partition": "lasting", "tested": "all", "outer_test": "all"}
+        changed = [getattr(self, option) for option, value in defaults.items() if getattr(self, option) != value]
         return ", ".join([self.tableau.name, self.outer, self.error, *changed])
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
@@ -144,8 +144,8 @@ class RungeKutta:
         tableau = self.tableau
         outer_tol = self.outer_tol
         if outer_tol is None:
-            own_rule = fixed and self.outer == "newton"
-            outer_tol = NEWTON_TOL_FIXED if own_rule else outer_tolerance(rtol, atol, fixed)
+            is_newton_fixed = fixed and self.outer == "newton"
+            outer_tol = NEWTON_TOL_FIXED if is_newton_fixed else outer_tolerance(rtol, atol, fixed)
         options = options_array(
             tableau.A,
             tableau.b,
