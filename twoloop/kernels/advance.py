@@ -103,7 +103,7 @@ def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
 
 
 @merged
-def _attempt(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
+def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
     """Attempt a step; return its code, its error in tolerances, and the ratio of the next step size to `size`.
 
     If the step crosses a jump of C_t or b (`crosses_jump`), the caller has already computed `new_state`.
@@ -289,7 +289,7 @@ def advance(
                 reaches_goal, at_output, shortened = False, False, True
         if not reaches_goal and size <= max(EQUAL_SPACINGS * np.spacing(abs(t)), control[at.SHORTEST]):
             return at.STEP_TOO_SMALL
-        code, error, factor = _attempt(
+        code, error, factor = _attempt_step(
             f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state
         )
         if code == NOT_LOADED:

@@ -120,8 +120,8 @@ def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longes
 
 
 @merged
-def _all_within(t, rows, bounds):
-    """Return whether (time, first entries of the state) is between bounds[0] and bounds[1] for all t[k], rows[k]."""
+def _is_within_bounds(t, rows, bounds):
+    """Return whether t[k] and the first entries of rows[k] are between bounds[0] and bounds[1] for all k."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -221,7 +221,7 @@ def _copy(source, target):
 
 
 @merged
-def _redundant_rows_hold(w, b, n):
+def _has_consistent_rows(w, b, n):
     """Return whether the accelerations a in b.state satisfy all rows of G a = Gamma within CONTRADICTS."""
     if w.rows_v.size == len(b.rows):
         return True
@@ -236,7 +236,7 @@ def _redundant_rows_hold(w, b, n):
 
 
 @merged
-def _check_start(checked_kit, b, t, q, v, sizes, shifts):
+def _evaluate_start(checked_kit, b, t, q, v, sizes, shifts):
     for k in range(b.start_values.size):
         b.start_values[k] = 0.0
     return b.evaluate_start(checked_kit, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings)
@@ -244,7 +244,7 @@ def _check_start(checked_kit, b, t, q, v, sizes, shifts):
 
 @merged
 def _has_all_entries(b):
-    """Return whether b.rows is nonzero exactly where b.kinds is: then positions nearby need not be tried."""
+    """Return whether b.rows is nonzero exactly where b.kinds is, so that no entry is sought at other positions."""
     n, is_same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         is_same = is_same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
@@ -262,9 +262,9 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
     has_all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
-    flags = _check_start(checked_kit, b, t, q, v, sizes, b.shifts[: 0 if has_all_entries else len(b.shifts)])
+    flags = _evaluate_start(checked_kit, b, t, q, v, sizes, b.shifts[: 0 if has_all_entries else len(b.shifts)])
     if has_all_entries and not _has_all_entries(b):
-        flags = _check_start(checked_kit, b, t, q, v, sizes, b.shifts)
+        flags = _evaluate_start(checked_kit, b, t, q, v, sizes, b.shifts)
     if flags & IN_ORDER == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
     if flags & CONSISTENT == 0 and not is_consistent:
@@ -278,7 +278,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
     prepare_work(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
     _copy(b.lapack, w.lapack[: b.lapack.size])
     w.notes[indices.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
-    if b.start(f, w, t, b.state) != indices.DONE or not _redundant_rows_hold(w, b, n):
+    if b.start(f, w, t, b.state) != indices.DONE or not _has_consistent_rows(w, b, n):
         return REFUSED
     if w.notes[indices.PIVOT] < b.constants[LEAST_PIVOT]:
         return REFUSED
@@ -338,7 +338,7 @@ N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
 
 
 @merged
-def _velocities_jumped(b, k, n):
+def _has_velocity_jump(b, k, n):
     """Return whether velocities jump from state k - 1 to state k, see MAX_CHANGE_RATIO; n: number of coordinates."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
@@ -353,8 +353,8 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
 
     The run has n_rows states after the first, and n_steps steps; `region` contains the bounds for IN_CHECKED_REGION.
     """
-    jumped = n_rows > 0 and _velocities_jumped(b, n_rows, w.Q.size)
-    is_inside = region.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, region)
+    jumped = n_rows > 0 and _has_velocity_jump(b, n_rows, w.Q.size)
+    is_inside = region.shape[1] > 0 and _is_within_bounds(b.t[: 1 + n_rows], b.states, region)
     near_singular = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
     undersampled = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
     nothing_to_check, width = not (jumped or near_singular or undersampled), b.steps.shape[1]

@@ -40,7 +40,7 @@ RESIDUAL, WEAK_PIVOT = 10.0, 0.05
 
 
 @merged
-def _window(low, high, i, last):
+def _node_range(low, high, i, last):
     """Return the first and last state of the polynomial for an interval from state i: centred, in `low` to `high`."""
     if last > i + 1:  # `fill` has computed interior states of the interval: the polynomial interpolates no others
         return i, last
@@ -78,7 +78,7 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 
 
 @merged
-def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
+def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
     """Store in q and v the values at t[i] + s h of the polynomials of an interval of duration h, by Horner's scheme.
 
     (z, c, size) are the nodes, coefficients and number of coefficients for q; (z_v, c_v, size_v) are those for v if
@@ -100,7 +100,7 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
 
 
 @merged
-def _kind_by_length(kind, tolerances, h, states, i):
+def _kind_by_duration(kind, tolerances, h, states, i):
     """Return `kind`, or APART if the interval (duration h) is so short that rounding of q would spoil velocities."""
     n = tolerances.size - ATOL
     for m in range(n):
@@ -111,7 +111,7 @@ def _kind_by_length(kind, tolerances, h, states, i):
 
 
 @merged
-def _change(tolerances, v_before, v):
+def _velocity_change(tolerances, v_before, v):
     """Return the largest change of a velocity from v_before to v, relative to its tolerance."""
     speed, largest = largest_of(v_before), 0.0
     for m in range(v.size):
@@ -154,8 +154,8 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
         h = t[last] - t[i]
-        kind = kind if kind == kinds.JUMP else _kind_by_length(kind, tolerances, h, states, i)
-        lo, hi = _window(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
+        kind = kind if kind == kinds.JUMP else _kind_by_duration(kind, tolerances, h, states, i)
+        lo, hi = _node_range(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
@@ -170,14 +170,16 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
                 copy(states[i, : 2 * n], out[p])
                 continue
             s = (times[p] - t[i]) / h
-            _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+            _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
             copy(q, q_0)
             copy(v, v_0)
             code = DONE if has_partition else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
                 code = restore(f, w, times[p], q, v, tolerance)
             has_partition = (
-                code == DONE and not (has_D and partition_is_poor(w)) and _change(tolerances, v_0, v) <= REPORTED_ERROR
+                code == DONE
+                and not (has_D and partition_is_poor(w))
+                and _velocity_change(tolerances, v_0, v) <= REPORTED_ERROR
             )
             if not has_partition:
                 copy(q_0, q)
@@ -185,7 +187,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
                 code = renew_partition(f, w, times[p], q)
                 if code == DONE:
                     code = restore(f, w, times[p], q, v, tolerance)
-                change = _change(tolerances, v_0, v) if code == DONE else 0.0
+                change = _velocity_change(tolerances, v_0, v) if code == DONE else 0.0
                 if not change <= REPORTED_ERROR and _is_singular(f, w, t, states, i, last, times[p], q, change):
                     code = SINGULAR
             if code != DONE:
@@ -196,7 +198,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 
 @merged
-def _difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
+def _max_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
     """Return the largest of scale_q |q - q_other| and scale_v |v - v_other| in units of the tolerances at state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
@@ -208,8 +210,8 @@ def _difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other)
 
 
 @merged
-def _accelerations_of_polynomials(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """Store the accelerations of the polynomials at t[i] + s h in a (n_q); arguments: see `_interpolate`."""
+def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
+    """Store the accelerations of the polynomials at t[i] + s h in a (n_q); arguments: see `_evaluate_polynomials`."""
     for m in range(a.size):
         value, slope, bend = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
@@ -254,8 +256,8 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
         h = t[last] - t[i]
-        kind = kind if kind == kinds.JUMP else _kind_by_length(kind, tolerances, h, states, i)
-        lo, hi = _window(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
+        kind = kind if kind == kinds.JUMP else _kind_by_duration(kind, tolerances, h, states, i)
+        lo, hi = _node_range(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
@@ -265,18 +267,18 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
         if hi - lo > 1:
             for k in range(N_CHECKED):
                 s = CHECKED_AT[k]
-                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+                _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
                 shorter = size_v - 2 if kind == kinds.APART else 0
-                _interpolate(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter, q_1, v_1)
-                out[g] = max(out[g], _difference(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
+                _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter, q_1, v_1)
+                out[g] = max(out[g], _max_difference(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
             if out[g] <= 1.0 or kind == kinds.VELOCITIES:
                 continue
         out[g] = 0.0
         for k in range(N_CHECKED):
             s = CHECKED_AT[k]
             time = t[i] + s * h
-            _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
-            _accelerations_of_polynomials(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)
+            _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+            _evaluate_accelerations(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)
             copy(rows[0], rows[2])
             code = DONE if k > 0 else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
@@ -287,13 +289,13 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
                 if code == DONE:
                     code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
             if code == DONE:
-                out[g] = max(out[g], _difference(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
+                out[g] = max(out[g], _max_difference(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
                 code = accelerations(f, w, time, rows[2, :n], rows[2, n:], q_1, w.lam)
             if code != DONE:
                 out[g] = np.inf
                 break
             dt = h / size
-            out[g] = max(out[g], _difference(tolerances, dt * dt, dt, states, i, v_1, v_1, q_1, q_1))
+            out[g] = max(out[g], _max_difference(tolerances, dt * dt, dt, states, i, v_1, v_1, q_1, q_1))
         if not np.isfinite(out[g]):
             out[g] = np.inf
     return DONE
@@ -301,7 +303,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def complete(f, w, times, states, out):
-    """Store [a, lam] at consistent states [q, v] in the rows of `out`, NaN after failures; return their number."""
+    """Store [a, lam] at consistent states [q, v] in the rows of `out` (NaN: failure); return the number of failures."""
     n = w.Q.size
     code = SINGULAR
     failures = 0

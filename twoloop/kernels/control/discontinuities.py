@@ -155,7 +155,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     return SMOOTH, t, t + h
 
 
-N_SAMPLES = 20  # number of intervals between the samples of one set
+N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
 LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
 # ratio of second difference to range of the samples above which a change is sudden, as in a pulse four spacings wide
 SUDDEN_SHARE = 0.1
@@ -205,7 +205,7 @@ def _largest(values):
 
 @compiled
 def _is_smooth(values, k, n):
-    """Return whether second differences of n + 1 values at k and next to k have the same sign and similar sizes."""
+    """Return whether second differences of n + 1 values at index k and beside it have equal signs and similar sizes."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -385,7 +385,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample along the motion over a step, or LEAST_DISTANCE spacings if longer; store DISCONTINUITY_OF_MOTION."""
+    """Store the next sudden change along the motion in `clock`; sample a step, or LEAST_DISTANCE spacings if longer."""
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - AT_CHANGE) * size:
         return
     duration = min(max(size, LEAST_DISTANCE * spacing), last - t)

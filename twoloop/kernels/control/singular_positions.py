@@ -33,7 +33,7 @@ SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to th
 GIVE_UP_BELOW = 0.001  # smallest step size near a singular position, relative to the longest of the last steps
 # ratio of the smallest pivot to its largest value so far below which rounding determines accelerations, and a run ends
 UNDETERMINED = 1e-6
-CHECK_INTERVAL = 16  # number of accepted steps of generated code, which uses no partition, between two checks of it
+CHECK_INTERVAL = 16  # number of accepted steps between two checks of the partition, if generated code does not use it
 # the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
 # freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
@@ -45,7 +45,7 @@ PASSED_SHARE = 0.6
 # NEAR_LEAST, NEAR_MOST: smallest and largest result of near_share; SHARE_OF_NOISE: allowed rounding error, in
 # tolerances; EPS: unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
-END_SHARE = 0.25  # static form: pivot at the end of a step, relative to that at its start, below which it is halved
+END_SHARE = 0.25  # static form: pivot at a step's end, relative to that at its start, below which the step is halved
 
 
 @merged

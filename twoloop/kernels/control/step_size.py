@@ -64,7 +64,7 @@ KEEP_BELOW = 1.2
 
 @compiled
 def factor_of(rule, past, h, error):
-    """Return the ratio of the next step size to h by `rule` and history `past`; unit of `error`: the tolerances."""
+    """Return the ratio of the next step size to h by `rule` and history `past`; `error` of the step: in tolerances."""
     if not error > 0.0:
         return rule[FACTOR_MAX]
     follows = error <= 1.0 and rule[LEAST_ERROR] > 0.0
@@ -103,8 +103,8 @@ EQUAL_SPACINGS = 4.0  # largest difference of times that count as equal, in spac
 def on_grid(clock, t, h, target, goal):
     """Return the size (s) of a step from t, the number of grid steps that it completes, and whether it reaches `goal`.
 
-    Grid times are T_START plus multiples of h. `target`: next output time; within a millionth of h of a grid time, it
-    counts as equal to this time. `goal`: `target` or an earlier jump of C_t or b.
+    Grid times are T_START plus multiples of h. `target` is the next output time; if a grid time differs from `target`
+    by at most h / 10^6, both count as equal. `goal` is `target` or the time of an earlier jump of C_t or b.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     margin = max(1e-6 * h, rounding)
@@ -139,7 +139,7 @@ FADING = 0.98  # factor by which H_LONG, the longest of the last steps, decrease
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step, update largest defect and gap in w.notes, and fill `out_step`, its row of out_steps."""
+    """Count an accepted step; update the largest defect and gap in w.notes; fill `out_step`, a row of out_steps."""
     w.counters[N_ACCEPTED] += 1
     if w.notes[DEFECT] >= 0.0:
         w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
@@ -164,7 +164,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
 SHARE_OF_MOTION = 0.1
 SHARE_THROUGH_ZERO = 1e-6  # replaces SHARE_OF_MOTION if the sign of det C_qd changes in the step
 LEAST = 1e-300  # lower bound of the allowed error, which avoids a division by zero
-# error of a predicted position, in tolerances, that is allowed in addition: for steps with hardly any motion
+# part of the allowed error of a predicted position, in tolerances, that does not depend on the motion in the step
 FLOOR = 0.01
 
 

@@ -51,8 +51,8 @@ EQUAL_STEPS = _error_constants()
 
 # indices in `options`. THETA: a projection has converged when its last correction is at most THETA, see `project`
 THETA, N_OPTIONS = range(2)
-# indices of the scalars in `memory`. After the scalars, `memory` contains N_ROWS rows of coefficients, see _row, two
-# tables of differences, see _table, and two scratch rows, see _scratch
+# indices of the scalars in `memory`. After the scalars, `memory` contains N_ROWS rows of coefficients, two tables of
+# differences, and two scratch rows, see _coefficients, _difference_table and _scratch_rows
 (
     CURRENT,  # index, 0 or 1, of the table of differences at the last accepted step
     ORDER,  # order of the next attempt
@@ -78,14 +78,14 @@ def _padded(n_q: int) -> int:
 
 
 @inlined
-def _row(memory, which):
+def _coefficients(memory, which):
     """Return a view (N_TERMS + 2) of row `which`, such as PSI, of the coefficients in `memory`."""
     start = N_SCALARS + which * (N_TERMS + 2)
     return memory[start : start + N_TERMS + 2]
 
 
 @inlined
-def _table(memory, n, which):
+def _difference_table(memory, n, which):
     """Return a view (N_TERMS + 1, n padded) of table `which` of differences: phi_i is row i - 1 plus the last row."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
@@ -93,7 +93,7 @@ def _table(memory, n, which):
 
 
 @inlined
-def _scratch(memory, n):
+def _scratch_rows(memory, n):
     """Return two scratch rows (n padded) of `memory`, for v and q: mean accelerations, later 1 / allowed errors."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
@@ -114,7 +114,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
         return
     memory[FAILED] = 0.0
     memory[CURRENT] = 1.0 - memory[CURRENT]
-    psi, new_psi = _row(memory, PSI), _row(memory, NEW_PSI)
+    psi, new_psi = _coefficients(memory, PSI), _coefficients(memory, NEW_PSI)
     for i in range(N_TERMS):
         psi[i] = new_psi[i]
     memory[DEPTH] = min(memory[DEPTH] + 1.0, float(N_TERMS))
@@ -125,11 +125,11 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
 @merged
 def _begin_history(memory, n, state):
     """Reset `memory` to order 1 and a history that contains only the accelerations of `state`."""
-    table = _table(memory, n, memory[CURRENT])
+    table = _difference_table(memory, n, memory[CURRENT])
     table[:, :] = 0.0
     for m in range(n):
         table[N_TERMS, m] = state[2 * n + m]
-    _row(memory, PSI)[:] = 0.0
+    _coefficients(memory, PSI)[:] = 0.0
     memory[ORDER] = memory[DEPTH] = memory[NEXT_ORDER] = 1.0
     memory[STARTING] = 1.0
     memory[FAILED] = memory[AGE] = 0.0
@@ -138,8 +138,8 @@ def _begin_history(memory, n, state):
 @merged
 def _compute_coefficients(memory, h, k):
     """Store psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of size h in `memory`."""
-    psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
-    g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
+    psi, new_psi, beta = _coefficients(memory, PSI), _coefficients(memory, NEW_PSI), _coefficients(memory, BETA)
+    g, G, c = _coefficients(memory, G_VELOCITY), _coefficients(memory, G_POSITION), _coefficients(memory, C_AT_NODES)
     new_psi[0] = h
     for i in range(N_TERMS):
         new_psi[i + 1] = psi[i] + h
@@ -167,8 +167,8 @@ def _compute_coefficients(memory, h, k):
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
     """Store the predicted state in q1 and v1, and in table `new` the differences that follow if it is exact."""
-    beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
-    mean_v, mean_q = _scratch(memory, n)
+    beta, g, G = _coefficients(memory, BETA), _coefficients(memory, G_VELOCITY), _coefficients(memory, G_POSITION)
+    mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
         # row k + 1 of the table is phi_{k+2} - d, and phi_{k+2} = d - beta_{k+1} phi_{k+1}
@@ -236,8 +236,8 @@ def _choose_order(memory, h, k, table, d, n):
     The rules are those of Shampine and Gordon's STEP. The order decreases if the error at lower orders is not larger.
     It increases after k + 1 steps at order k if the error at order k + 1 is smaller; while STARTING is 1, at each step.
     """
-    g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
-    weight_v, weight_q = _scratch(memory, n)
+    g, G = _coefficients(memory, G_VELOCITY), _coefficients(memory, G_POSITION)
+    weight_v, weight_q = _scratch_rows(memory, n)
     v0 = v1 = v2 = v3 = q0 = q1 = q2 = q3 = 0.0
     lower, lowest = max(k - 1, 0), max(k - 2, 0)
     for m in range(n):
@@ -287,14 +287,14 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
         _begin_history(memory, n, state)
     k = int(memory[ORDER])
     w.counters[N_OUTER] += 1
-    old, new = _table(memory, n, memory[CURRENT]), _table(memory, n, 1.0 - memory[CURRENT])
+    old, new = _difference_table(memory, n, memory[CURRENT]), _difference_table(memory, n, 1.0 - memory[CURRENT])
     _compute_coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
     memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # the order of the next attempt if an evaluation fails in this attempt
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    weight_v, weight_q = _scratch(memory, n)
+    weight_v, weight_q = _scratch_rows(memory, n)
     d = new[N_TERMS]
     rtol = tolerances[RTOL]
     for m in range(n):
@@ -306,7 +306,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error, factor = _choose_order(memory, h, k, new, d, n)
     if not error <= 1.0:
         return Attempt(DONE, error, factor)
-    g, G = _row(memory, G_VELOCITY)[k], _row(memory, G_POSITION)[k]
+    g, G = _coefficients(memory, G_VELOCITY)[k], _coefficients(memory, G_POSITION)[k]
     for m in range(n):
         q1[m] += h * h * G * d[m]
         v1[m] += h * g * d[m]

@@ -244,7 +244,7 @@ def one_stage_of(options):
 
 
 @compiled
-def _prepare(f, w, options, memory, t, h, Q, V, F):
+def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
     """Update the derivatives at (t, Q, V), where F was evaluated last, and factors, unless reused; return a code."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
@@ -291,7 +291,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if f.flags[FORM] != STATIC:  # in the static form no coordinate is dependent
             for m in w.dependent:
                 a[m] = F[m]
-        code = _prepare(f, w, options, memory, t, h, Q, V, F)
+        code = _update_derivatives(f, w, options, memory, t, h, Q, V, F)
         if code != DONE:
             memory[at.HAS_JACOBIAN] = 0.0
             return code
@@ -362,10 +362,10 @@ def _factor_filter(f, w, options, memory, h):
 
 
 @compiled
-def _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
+def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
     """Store `factor` h sum_k weights[k] V_stage[k] in e_q, and `factor` h sum_k weights[k] A_stage[k] in e_v.
 
-    The first n_dof numbers of e_q and e_v (n_q) become the entries of the independent coordinates.
+    Only the entries of independent coordinates are computed; they become the first n_dof numbers of e_q and e_v (n_q).
     """
     for i in range(w.independent.size):
         j = w.independent[i]
@@ -379,7 +379,7 @@ def _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
 
 @compiled
 def _renew_derivatives(f, w, options, memory, t, h, new_state):
-    """Compute the derivatives at `new_state` and t, and factor the systems for steps of size h; return a code."""
+    """Compute the derivatives at t and `new_state`, and factor the matrices for steps of size h; return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -400,7 +400,7 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
 
 @compiled
 def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
-    """Return the largest component of the error estimate of `_weighted_difference`, in units of the tolerances.
+    """Return the largest component of the error estimate of `_store_weighted_sums`, in units of the tolerances.
 
     The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If the derivatives are
     so outdated that the filter is wrong, they are computed anew. On return, the vectors E_Q and E_V of `memory` contain
@@ -412,7 +412,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
     unfiltered, filtered_once = vector(memory, 1, n, at.A_NEW), vector(memory, 1, n, at.A_MID)
     n_dof = w.independent.size
     z = h * gamma_of(options)
-    _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
+    _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
     copy(e_v, unfiltered)
     _filter(f, w, options, memory, h, e_q, e_v)
     if f.flags[FORCE_BY_Q_GIVEN] == 0 and not derivatives_agree(
@@ -421,7 +421,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
         memory[at.CHANGED] = 1.0
         if _renew_derivatives(f, w, options, memory, t + h, h, new_state) != DONE:
             return np.inf
-        _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
+        _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
         copy(e_v, unfiltered)
         _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
@@ -443,7 +443,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
 
 
 @compiled
-def _extrapolate(f, w, options, memory, h, q1, v1):
+def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
     """Replace (q1, v1), the state at the end of the step, by the result of the embedded formula.
 
     On entry, E_Q and E_V in `memory` must be the difference of the two formulas, filtered twice by `_error`.
@@ -573,7 +573,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
         if options[options.size - 1] == 1.0:
-            _extrapolate(f, w, options, memory, h, q1, v1)
+            _apply_embedded_formula(f, w, options, memory, h, q1, v1)
         error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage))
         if error <= 1.0 and options[options.size - 1] == 0.0:
             error_at_jumps = _error_at_jumps(

@@ -111,7 +111,7 @@ def _weighted_sum(weights, slopes, total):
 
 
 @compiled
-def _advance(y, h, weights, slopes, total, y1):
+def _add_weighted_slopes(y, h, weights, slopes, total, y1):
     """Set y1 to y + h sum_k weights[k] slopes[k]; `total` is scratch. As y is added last, y is rounded only once."""
     _weighted_sum(weights, slopes, total)
     for m in range(y.size):
@@ -173,7 +173,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _advance(y, h, A[j, :j], slopes, stage, stage)  # entries of dependent coordinates are start values
+        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # entries of dependent coordinates are start values
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if free:
@@ -182,7 +182,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
             code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-    _advance(y, h, b, slopes, stage, y1)
+    _add_weighted_slopes(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         error = _error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, is_near)

@@ -109,7 +109,7 @@ def _predict_from_rejected(f, data, state):
 
 
 @compiled
-def _collocate(f, w, options, data, tolerances, t, h, state):
+def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     """Solve for the stages of a step of size h; return a code, the error, and the ratio of the next step size to h.
 
     The stages are stored in `data`. The code is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED. Error: in tolerances.
@@ -225,7 +225,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     data[field.TRIED] = 0.0
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, data, tolerances):
         return Attempt(UNSUITED, math.inf, 0.0)
-    result, error, factor = _collocate(f, w, options, data, tolerances, t, h, state)
+    result, error, factor = _solve_collocation(f, w, options, data, tolerances, t, h, state)
     if result == NOT_COMPUTED or (result == REFUSED and tolerances[ESTIMATE] == 0.0):
         return Attempt(OUTER_DIVERGED, math.inf, 0.0)
     if result != CONVERGED:
@@ -246,7 +246,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 
 @merged
-def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
+def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
     """Project the states in the first n_ends rows of `out_state` onto the constraints, each in one lane of `data`.
 
     The lanes get the projected states, their accelerations and multipliers, and 1 in the field FINE if the projection
@@ -327,7 +327,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
         h, reaches_goal = off_grid(control, t, h_wanted, goal - t, False)
         if reaches_goal:
             h = goal - t
-        result, _, factor = _collocate(f, w, options, data, tolerances, t, h, state)
+        result, _, factor = _solve_collocation(f, w, options, data, tolerances, t, h, state)
         if result == NOT_COMPUTED:
             break
         if result != CONVERGED:
@@ -370,7 +370,7 @@ def lobatto_steps(
     )
     if n_ends == 0:
         return 0
-    _project_all(f, w, options, data, n, n_ends, out_t, out_state)
+    _project_ends(f, w, options, data, n, n_ends, out_t, out_state)
     for k in range(n_ends):
         h = out_steps[k, at.H]
         if not _adopt_projection(f, w, options, data, tolerances, driven, n, k, out_t[k], out_state[k], state):

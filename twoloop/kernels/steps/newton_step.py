@@ -50,7 +50,7 @@ MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
 @compiled
-def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
+def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     """Solve for the stage accelerations A_stage (s, n) by Newton's method; return a code.
 
     On entry, A_stage contains predicted accelerations. The ratio of the last two corrections is stored in
@@ -138,7 +138,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 
 
 @compiled
-def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
+def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     """Return the largest component of the filtered error estimate of a step, in units of the tolerances."""
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
@@ -266,7 +266,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
             else:
                 copy(a, trial[j])
-        code = _iterate(f, w, options, memory, t, h, tolerances, q, v, trial)
+        code = _solve_stages(f, w, options, memory, t, h, tolerances, q, v, trial)
         if code == DONE:
             break
         if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
@@ -289,7 +289,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(code, np.inf, 0.0)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _estimate(f, w, options, memory, h, tolerances, state, new_state, trial)
+        error = _estimate_error(f, w, options, memory, h, tolerances, state, new_state, trial)
         error = max(error, distance)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[at.HAS_TRIAL] = 1.0

@@ -479,7 +479,7 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
 
 @compiled
 def _multiply_by_T(w, b, x, X):
-    """Store the product T x in X (n_q); x is the first n_dof numbers of the array x (n_q)."""
+    """Store T x[:n_dof] in X (n_q)."""
     n_dof = w.independent.size
     _, D, columns = _border(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -492,9 +492,9 @@ def _multiply_by_T(w, b, x, X):
 
 @compiled
 def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system with the right-hand side x (n_q), and keep only the independent coordinates.
+    """Solve the bordered system with the right-hand side x (n_q); store the solution's independent part in x[:n_dof].
 
-    On return, the first n_dof numbers of x are the independent coordinates of the solution; the others are scratch.
+    The other entries of x are scratch.
     """
     Cq, _, _ = _border(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
@@ -504,9 +504,9 @@ def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
 
 @compiled
 def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
-    """Replace x by the solution y of (I - z^2 J_q - z J_v) y = x, with the factors of the bordered matrix.
+    """Replace x[:n_dof] by (I - z^2 J_q - z J_v)^-1 x[:n_dof], with the factors of the bordered matrix.
 
-    x and y are the first n_dof numbers of the array x (n_q); the other numbers of this array and X (n_q) are scratch.
+    The other entries of x (n_q), and X (n_q), are scratch.
     """
     _multiply_by_T(w, b, x, X)
     x[:] = 0.0
@@ -516,9 +516,9 @@ def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
 
 @compiled
 def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
-    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
+    """Replace e_v[:n_dof] by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)[:n_dof], with z = h gamma0.
 
-    e_q and e_v are the first n_dof numbers of arrays (n_q); the other numbers of e_v are scratch.
+    The other entries of e_v (n_q) are scratch.
     """
     n = w.Q.size
     b = f.flags[BANDWIDTH]
@@ -801,7 +801,7 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_real(f, w, memory, s, x):
-    """Replace x, the first n_dof numbers of an array (n_q), by (I - z^2 J_q - z J_v)^-1 x, with z = h gamma0."""
+    """Replace x[:n_dof] by (I - z^2 J_q - z J_v)^-1 x[:n_dof], with z = h gamma0; x has n_q entries."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
@@ -818,7 +818,7 @@ def _solve_real(f, w, memory, s, x):
 
 @compiled
 def _solve_complex(f, w, options, memory, s, k, x):
-    """Replace x (complex; the first n_dof numbers of an array (n_q)) by the solution of the system of eigenvalue k."""
+    """Replace x[:n_dof], a complex right-hand side, by the solution of the linear system of eigenvalue number k."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
@@ -834,7 +834,7 @@ def _solve_complex(f, w, options, memory, s, k, x):
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
-    """Replace x (complex; the first n_dof numbers of an array (n_q)) by the solution of the system of eigenvalue k."""
+    """Replace x[:n_dof], a complex right-hand side, by the solution of the linear system of eigenvalue number k."""
     if k == 0 and options[newton_options_at(s) + N_REAL] > 0.0:  # the eigenvalue is real and equals gamma0
         real_part = vector(memory, s, w.Q.size, V_MOVED)
         for i in range(x.size):

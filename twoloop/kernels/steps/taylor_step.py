@@ -110,7 +110,7 @@ def _integers(options, which):
 
 
 @inlined
-def _numbers(options, which):
+def _floats(options, which):
     return options[int(options[N_SCALARS + which]) : int(options[N_SCALARS + which + 1])]
 
 
@@ -149,11 +149,11 @@ def sum_of_products(X, Y, K, total):
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
     """Store the arguments of the operations of group g, sums of `values` without their constants, in `out`."""
-    column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
+    column, coefficient = _integers(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
     row, column = _integers(options, sums + ROW), _integers(options, sums + MORE_COLUMN)
-    coefficient = _numbers(options, sums + MORE_COEFFICIENT)
+    coefficient = _floats(options, sums + MORE_COEFFICIENT)
     for e in range(groups[g + more], groups[g + more + 1]):
         out[row[e]] += coefficient[e] * values[column[e]]
 
@@ -161,12 +161,12 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 @merged
 def _store_sums(options, sums, scale, values, out):
     """Store `scale` times each sum of `values` in the list `sums`, without its constant, in `out` at SUM_INDICES."""
-    column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
+    column, coefficient = _integers(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     indices = _integers(options, sums + SUM_INDICES)
     for o in range(column.size):
         out[indices[o]] = scale * coefficient[o] * values[column[o]]
     row, column = _integers(options, sums + ROW), _integers(options, sums + MORE_COLUMN)
-    coefficient = _numbers(options, sums + MORE_COEFFICIENT)
+    coefficient = _floats(options, sums + MORE_COEFFICIENT)
     for e in range(row.size):
         out[row[e]] += scale * coefficient[e] * values[column[e]]
 
@@ -178,7 +178,7 @@ def begin_operations(options, table, values, z, x, y):
     Pending products, whose second factor depends on the accelerations, are set to zero.
     """
     groups = _integers(options, table + GROUPS)
-    constant, constant_2 = _numbers(options, table + FIRST + CONSTANT), _numbers(options, table + SECOND + CONSTANT)
+    constant, constant_2 = _floats(options, table + FIRST + CONSTANT), _floats(options, table + SECOND + CONSTANT)
     for g in range(0, groups.size, N_GROUP):
         kind = groups[g]
         _fill_arguments(options, table + FIRST, groups, g, MORE_FIRST, values, x)
@@ -287,7 +287,7 @@ def arrays_of(options, memory, n, n_rows):
 
 @merged
 def begin_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Store the coefficients of t and q up to order 1, of v and early operations of order 0; set r and c to zero."""
+    """Store the coefficients of t and q to order 1, of v and early operations to order 0; set r and c to zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -300,7 +300,7 @@ def begin_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
 
 @merged
 def integrate_coefficients(K, unit, N, series, a):
-    """Store coefficients of order K of v, K + 1 of q, in N and `series`, computed from order K - 1 of a (n)."""
+    """Store in N and `series` coefficients K of v and K + 1 of q, the integrals of coefficient K - 1, a (n)."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
     for j in range(n):
@@ -329,7 +329,7 @@ def expand(f, w, options, memory, t, state, unit):
     A, LAM = 1 + 2 * n, 1 + 3 * n
     begin_early = LAM + n_rows
     begin_late = begin_early + _integers(options, EARLY + FIRST + COLUMN).size
-    indices, constant = _integers(options, BALANCE + SUM_INDICES), _numbers(options, BALANCE + CONSTANT)
+    indices, constant = _integers(options, BALANCE + SUM_INDICES), _floats(options, BALANCE + CONSTANT)
 
     begin_series(options, t, unit, state, N, series, begin_early, X1[0], Y1[0], r, c)
     for k in range(order - 1):
@@ -371,7 +371,7 @@ NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step si
 GOLDEN = 0.6180339887498949  # golden section: fractional parts of its multiples are evenly distributed from 0 to 1
 MAX_DEFECT = 1e300  # replaces an infinite defect, which is returned if a function has no finite value within the step
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
-GROWTH = 5.0  # largest ratio of successive step sizes: the unit of the coefficients is the previous step size
+GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of it do not overflow
 TOO_SHORT = 2.0  # error that is returned to reject a first step, because the series allows a much longer step
 
@@ -465,8 +465,8 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 
 @compiled
-def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the first defect within the step above the allowed one, or 0; update the largest one in w.notes[DEFECT].
+def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
+    """Return the first defect within the step that is too large, or 0; update w.notes[DEFECT], the largest other one.
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
@@ -489,7 +489,7 @@ def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
 
 @merged
-def _shrink_factor(defect, order):
+def _factor_after_large_defect(defect, order):
     """Return the ratio of the next step size to the size of a step rejected because of its defect."""
     return max(MIN_FACTOR, 0.9 * defect ** (-1.0 / order))
 
@@ -505,7 +505,7 @@ def settle_taylor(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h by the series about its beginning; the series about its end limits the next size."""
+    """Attempt a step of size h by the series about its beginning; that about its end limits the next step size."""
     n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -541,9 +541,9 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
                 memory[SUSPECTED] = 0.0
             w.notes[DEFECT] = 0.0
-            defect = _defect_within(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
+            defect = _first_large_defect(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
-                return Attempt(DONE, min(defect, MAX_DEFECT), _shrink_factor(defect, order))
+                return Attempt(DONE, min(defect, MAX_DEFECT), _factor_after_large_defect(defect, order))
     _evaluate(series, unit, order, x, q1, v1, series_a)
     store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
@@ -564,7 +564,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if defect > 1.0:
             noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
             if not noise:
-                return Attempt(DONE, min(defect, MAX_DEFECT), _shrink_factor(defect, order))
+                return Attempt(DONE, min(defect, MAX_DEFECT), _factor_after_large_defect(defect, order))
             _evaluate(series, unit, order, x, q1, v1, series_a)
             code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
             if code != DONE:
