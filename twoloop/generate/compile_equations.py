@@ -134,8 +134,8 @@ def _run_accelerations(
 
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
     """Return the name of the function for program `index` of `equations.accelerations`; write it if it is missing."""
-    program, mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
-    module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
+    program, is_mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
+    module, name = emit.builder.module, f"{'mass_first' if is_mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
         n, pointers = equations.system.n_q, _coefficient_pointers(emit)
         kinds = [emit.double, DOUBLE_POINTER, DOUBLE_POINTER, *[DOUBLE_POINTER] * len(pointers), DOUBLE_POINTER]
@@ -144,7 +144,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
         t, q, v, *coefficients, out = builder.arguments
         for attribute, pointer in zip(("numbers", "constants"), coefficients, strict=False):
             setattr(inner_emit, attribute, pointer)
-        if mass_first and equations.parts is not None:
+        if is_mass_first and equations.parts is not None:
             builder.ret(equations.parts.accelerations(inner_emit, t, q, v, coefficients[0], out))
             return name
         lowering = Lowering(inner_emit, numbers)

@@ -547,8 +547,8 @@ class Solution:
         """Return the number of stored quantities."""
         return len(self.stored)
 
-    def _solve(self, right: Sequence[Affine]) -> list[Affine]:
-        return solve(self._blocks, right)
+    def _solve(self, rhs: Sequence[Affine]) -> list[Affine]:
+        return solve(self._blocks, rhs)
 
     def _independent(self) -> list[Affine]:
         return [self._c[k] for k in self._choice.rows]

@@ -94,9 +94,9 @@ class Factors:
         inverse = determinant.reciprocal()
         return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
-    def solve(self, right: Sequence[Affine]) -> list[Affine]:
+    def solve(self, rhs: Sequence[Affine]) -> list[Affine]:
         """Return the solution of the linear system for a right-hand side."""
-        return solve(self.blocks, right)
+        return solve(self.blocks, rhs)
 
 
 def _dot(a: Sequence[Affine], b: Sequence[Affine]) -> Affine:
@@ -395,8 +395,8 @@ def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
         factors[k + 1 :, k] /= factors[k, k]
         factors[k + 1 :, k + 1 :] -= np.outer(factors[k + 1 :, k], factors[k, k + 1 :])
 
-    def solve(right: Array) -> Array:
-        intermediate = solve_triangular(factors, right, lower=True, unit_diagonal=True, check_finite=False)
+    def solve(rhs: Array) -> Array:
+        intermediate = solve_triangular(factors, rhs, lower=True, unit_diagonal=True, check_finite=False)
         return np.asarray(solve_triangular(factors, intermediate, check_finite=False))
 
     a, b = np.random.default_rng(1).choice((-1.0, 1.0), (2, n))
@@ -423,11 +423,11 @@ def solve_refined(
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:
-        right = list(r)
+        rhs = list(r)
         for k in choice.added:
             for i, entry in enumerate(rows[k]):
-                right[i] = right[i] + (entry * c[k]).times(choice.scale)
-        return solve([*right, *(c[k] for k in choice.rows)])
+                rhs[i] = rhs[i] + (entry * c[k]).times(choice.scale)
+        return solve([*rhs, *(c[k] for k in choice.rows)])
 
     def subtract_products(total: Affine, products: Iterable[tuple[Affine, Affine]]) -> Affine:
         for x, y in products:

@@ -127,9 +127,9 @@ class Traced:
             agree |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
         # for each entry, the largest term of all entries that the same callback returns
-        size = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
-        for k, entry in np.argwhere(~agree & ~(differences <= ROUNDING_DIFFERENCE * size)):
-            if not differences[k, entry] <= CLEAR_DIFFERENCE * size[entry] or self._is_systematic(
+        max_term = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
+        for k, entry in np.argwhere(~agree & ~(differences <= ROUNDING_DIFFERENCE * max_term)):
+            if not differences[k, entry] <= CLEAR_DIFFERENCE * max_term[entry] or self._is_systematic(
                 system, states[k], int(entry)
             ):
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
