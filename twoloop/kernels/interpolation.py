@@ -32,7 +32,7 @@ MAX_GAP_RATIO = 8.0  # largest ratio of the longest to the shortest of neighbour
 # rounding error of q over the duration of the interval, in tolerances of v, above which v gets a polynomial of its own
 MAX_VELOCITY_ROUNDING = 10.0
 # pivot within an interval, relative to the larger one of the pivots at its ends, below which the position is singular
-SINGULAR_RATIO = 0.01
+SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5  # pivot below which any position is singular; for pivots see least_pivot in partition.py
 # a position whose pivot is below WEAK_PIVOT is singular, too, if the velocities of the polynomials nearly satisfy the
 # constraints: if their violation, about pivot times change by the projection, is below RESIDUAL tolerances
@@ -126,7 +126,7 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
     """Return whether q at `time` is so near a singular position that rounding errors explain `change`.
 
     `change` is the change of velocities by the projection, in tolerances. The test of the pivot at q is described at
-    SINGULAR_RATIO and WEAK_PIVOT; i and `last` are the states at the ends of the interval.
+    SINGULAR_PIVOT_RATIO and WEAK_PIVOT; i and `last` are the states at the ends of the interval.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):
@@ -134,7 +134,7 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
             largest = max(largest, least_pivot(f, w, t[r], states[r, :n]))
     code = renew_partition(f, w, time, q)
     pivot = least_pivot(f, w, time, q) if code == DONE else 0.0
-    return pivot < max(SINGULAR_RATIO * largest, SINGULAR_PIVOT, min(RESIDUAL / change, WEAK_PIVOT))
+    return pivot < max(SINGULAR_PIVOT_RATIO * largest, SINGULAR_PIVOT, min(RESIDUAL / change, WEAK_PIVOT))
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))

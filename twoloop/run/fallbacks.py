@@ -168,7 +168,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     See kernels/steps/crossing_step.py. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock
-    from twoloop.kernels.steps.crossing_step import BACK, UNSEEN
+    from twoloop.kernels.steps.crossing_step import BACK, NODE_GAP
 
     plan = crossing_plan(run.system.n_q)
     earliest, fixed = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
@@ -192,7 +192,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
     run.pieces = []  # an earlier run of a cached integrator may have ended within a polynomial
     if control[a.FIXED_STEP] == 0.0:
-        control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else UNSEEN / (1.0 - BACK)
+        control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else NODE_GAP / (1.0 - BACK)
     clock[a.LIMIT_AGE] = 0.0
     _prepare_next_origin(run, plan, control)
     return plan, control

@@ -158,7 +158,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
 LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
 # ratio of second difference to range of the samples above which a change is sudden, as in a pulse four spacings wide
-SUDDEN_SHARE = 0.1
+SUDDEN_RATIO = 0.1
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
 # smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too
 # coarsely spaced to look smooth
@@ -170,7 +170,7 @@ HALVINGS = 20  # number of bisections that locate the change of a value between 
 SAME_CHANGE = 1e-5  # largest time between two changes that count as one, relative to the widest spacing of samples
 # time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
 # at zero, such as 1 - cos(t), look sudden
-SOONEST = 5e-5
+MIN_RECORDED_TIME = 5e-5
 STEEPER = 2.0  # smallest ratio of a sudden change to its neighbouring changes; on a smooth slope, the ratio is smaller
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_IN_SHORT = 4  # number of samples within a short step
@@ -218,14 +218,14 @@ def _is_smooth(values, k, n):
 def _find_bend(values, n, slope, least, within):
     """Return the index of the first sudden bend of n + 1 values (0: none), and the limit of second differences.
 
-    The limit is SUDDEN_SHARE times the range of the values, after a line of slope `slope` (per sample) is subtracted.
+    The limit is SUDDEN_RATIO times the range of the values, after a line of slope `slope` (per sample) is subtracted.
     The index is 0 if the range is at most `least`. If `within`, bends of a smooth curve are excluded, see `_is_smooth`.
     """
     low = high = 0.0
     for k in range(1, n + 1):
         off = values[k] - values[0] - k * slope
         low, high = min(low, off), max(high, off)
-    limit = SUDDEN_SHARE * (high - low)
+    limit = SUDDEN_RATIO * (high - low)
     if high - low > least:
         for k in range(1, n):
             second = values[k + 1] - 2.0 * values[k] + values[k - 1]
@@ -282,7 +282,7 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
     Samples k = 0 to n are at begin + k spacing; `column` is the component that bends, `limit` the smallest change.
     """
     values, margin = w.changes[:, column], max(AT_CHANGE * spacing, SAME_CHANGE * clock[at.WIDEST_SAMPLING])
-    soonest = clock[at.T_START] + SOONEST * tolerances[GAP]
+    soonest = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
     for k in range(index - 1, index + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
         is_recorded = low - margin <= clock[at.LAST_CHANGE] <= high + margin

@@ -109,5 +109,5 @@ INNER_TOL = 1e-8  # tolerance of Newton's method for positions that are projecte
 
 
 def initial_direction(n_q: int) -> NDArray[np.float64]:
-    """Return the first direction (n_q) of a power iteration, with unequal components, as vibrations have them."""
+    """Return the first direction (n_q) of a power iteration; its components differ, as those of vibrations do."""
     return np.asarray(0.3 + 0.1 * (np.arange(n_q) % 7))

@@ -28,12 +28,12 @@ SINGULAR_PIVOT = 0.2
 STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
 # ratio of the smallest pivot to its largest value so far below which a rejected step of the static form is repeated
 # with projected stages
-REPEAT_BELOW = 0.05
+REPEAT_PIVOT = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
 GIVE_UP_BELOW = 0.001  # smallest step size near a singular position, relative to the longest of the last steps
 # ratio of the smallest pivot to its largest value so far below which rounding determines accelerations, and a run ends
-UNDETERMINED = 1e-6
-CHECK_INTERVAL = 16  # number of accepted steps between two checks of the partition, if generated code does not use it
+UNDETERMINED_PIVOT = 1e-6
+CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that steps (generated code) do not use
 # the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
 # freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
@@ -41,7 +41,7 @@ N_CHECKED = 8  # number of equal parts of an accepted step, at whose ends the sm
 CHECKED_BELOW = 0.5  # pivot at an end of a step, relative to its largest value so far, below which the step is checked
 # the smallest pivot counts as zero within a step if its smallest sample is below this fraction of its largest change
 # between two samples
-PASSED_SHARE = 0.6
+PASSED_PIVOT_RATIO = 0.6
 # NEAR_LEAST, NEAR_MOST: smallest and largest result of near_share; SHARE_OF_NOISE: allowed rounding error, in
 # tolerances; EPS: unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
@@ -88,7 +88,7 @@ def retry_projected(f, w, control, clock, size):
     Near a singular position, accelerations of stages off the constraints have large errors. A long step that ends well
     beyond the position may succeed where shorter steps fail: the first repetition has at least the size H_LONG.
     """
-    near = clock[at.PIVOT_HERE] < REPEAT_BELOW * clock[at.LARGEST_PIVOT]
+    near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
     if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
         return False
     clock[at.H_NEXT] = SHRINKAGE * size
@@ -147,7 +147,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
         passed = max(least / largest, EPS)
         clock[at.PIVOT_PASSED] = passed if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], passed)
         return False
-    if least < max(near_share(tolerances) * largest, min(PASSED_SHARE * change, SINGULAR_PIVOT * largest)):
+    if least < max(near_share(tolerances) * largest, min(PASSED_PIVOT_RATIO * change, SINGULAR_PIVOT * largest)):
         w.notes[PIVOT] = before
         return True
     return False
@@ -175,7 +175,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
     if f.flags[FORM] == STATIC:
         clock[at.PIVOT_HERE] = w.notes[PIVOT]
         clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
-        if w.notes[NEARLY_SINGULAR] == PROJECT_STAGES and w.notes[PIVOT] >= REPEAT_BELOW * clock[at.LARGEST_PIVOT]:
+        if w.notes[NEARLY_SINGULAR] == PROJECT_STAGES and w.notes[PIVOT] >= REPEAT_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = 0.0
         return at.CONTINUE
     n = w.Q.size
@@ -208,6 +208,6 @@ def check_partition(f, w, control, clock, size, at_output, state):
         # the partition may have been chosen at a distant state: with a new one an implicit method may still continue
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
+        if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step can cross the singular position, where rounding would determine velocities
     return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

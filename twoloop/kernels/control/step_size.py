@@ -58,8 +58,8 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-# in methods with a trend, a ratio of step sizes from 1 to KEEP_BELOW becomes 1, which saves a factorization
-KEEP_BELOW = 1.2
+# in methods with a trend, a ratio of step sizes from 1 to KEEP_BELOW_RATIO becomes 1, which saves a factorization
+KEEP_BELOW_RATIO = 1.2
 
 
 @compiled
@@ -73,7 +73,7 @@ def factor_of(rule, past, h, error):
         trend = h / past[H_BEFORE] * (past[ERROR_BEFORE] / error) ** rule[EXPONENT]
         factor = min(factor, factor * trend)
     factor = min(rule[FACTOR_MAX], max(rule[FACTOR_MIN], factor))
-    return 1.0 if follows and 1.0 <= factor <= KEEP_BELOW else factor
+    return 1.0 if follows and 1.0 <= factor <= KEEP_BELOW_RATIO else factor
 
 
 @merged

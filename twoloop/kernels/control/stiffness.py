@@ -76,7 +76,7 @@ SEED = 1e-3  # value that replaces a zero component of a direction, relative to 
 STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limit the step of the explicit method
 # least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
 # needs finite differences, which take about eight evaluations per coordinate
-MIN_COST = 64.0
+MIN_COST_PER_COORDINATE = 64.0
 TRIAL = 300.0  # approximate cost of a trial of the implicit method, in its evaluations
 AFFORDED = 3.0  # least cost of the run, relative to the cost of a trial, at which a trial that may be in vain can begin
 SHARE_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
@@ -322,7 +322,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     if np.isfinite(tolerances[GAP]):
         counted_cost = max(counted_cost, SHARE_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
     is_cheap = counted_cost > least_cost and (
-        f.flags[FORCE_BY_Q_GIVEN] == 1 or counted_cost > MIN_COST * w.independent.size
+        f.flags[FORCE_BY_Q_GIVEN] == 1 or counted_cost > MIN_COST_PER_COORDINATE * w.independent.size
     )
     hidden = False
     if memory[PHASE] == EXPLICIT and is_cheap and h_rho > HIDDEN_FROM:

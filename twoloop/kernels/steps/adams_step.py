@@ -166,7 +166,7 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
-    """Store the predicted state in q1 and v1, and in table `new` the differences that follow if it is exact."""
+    """Store the predicted state in q1 and v1, and the differences that belong to it in the table `new`."""
     beta, g, G = _coefficients(memory, BETA), _coefficients(memory, G_VELOCITY), _coefficients(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):

@@ -56,7 +56,7 @@ LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
 # duration of the shortest and longest part of the polynomial that is taken as one step, relative to the polynomial
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 # longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
-UNSEEN = 0.0767
+NODE_GAP = 0.0767
 BACK = 0.4  # duration of the polynomial before the beginning of the step, relative to its whole duration
 ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error in the step size, and factor on the error estimate
 MOVED_WEIGHT = 0.5  # factor on the largest change of a stage by its projection, which counts as an error of the step

@@ -148,7 +148,7 @@ def factor_iteration(f, w, memory, t, q, v, z):
 
 @compiled
 def _solve_iteration(w, memory, x):
-    """Replace the right-hand side x (n_dof) by the solution of the system whose matrix `factor_matrix` has factored."""
+    """Replace the right-hand side x (n_dof) by the solution, with the factors that `factor_matrix` has computed."""
     m = x.size
     H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
     if memory[at.SYMMETRIC] == 1.0:
@@ -245,7 +245,7 @@ def one_stage_of(options):
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
-    """Update the derivatives at (t, Q, V), where F was evaluated last, and factors, unless reused; return a code."""
+    """Update derivatives (at t, Q, V, with accelerations F) and factors, unless they can be reused; return a code."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0

@@ -160,7 +160,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store `scale` times each sum of `values` in the list `sums`, without its constant, in `out` at SUM_INDICES."""
+    """Store `scale` times the sum of `values`, without constant, in `out` for each item of `sums`, see SUM_INDICES."""
     column, coefficient = _integers(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     indices = _integers(options, sums + SUM_INDICES)
     for o in range(column.size):
