@@ -104,10 +104,10 @@ def _limit_steps(control, tolerances, span, longest, within):
     These limit the time between two evaluations of the equations to LONGEST_UNSEEN times the run's duration `span`. If
     `within`, the method also evaluates the equations between its stages, and only `longest` (s) limits the step size.
     """
-    gap = LONGEST_UNSEEN * span
-    tolerances[GAP], tolerances[LOOK] = gap, gap / (GAP_TO_LOOK if control[at.BY_STATE] > 0.0 else 1.0)
-    control[at.MAX_STEP] = longest if within else min(longest, gap / control[at.MAX_EVALUATION_GAP])
-    control[at.APART] = gap / N_SAMPLES
+    max_gap = LONGEST_UNSEEN * span
+    tolerances[GAP], tolerances[LOOK] = max_gap, max_gap / (GAP_TO_LOOK if control[at.BY_STATE] > 0.0 else 1.0)
+    control[at.MAX_STEP] = longest if within else min(longest, max_gap / control[at.MAX_EVALUATION_GAP])
+    control[at.APART] = max_gap / N_SAMPLES
     control[at.SPACING] = control[at.APART] if control[at.BY_TIME] + control[at.BY_STATE] > 0.0 else 0.0
 
 

@@ -268,8 +268,8 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
             for k in range(N_CHECKED):
                 s = CHECKED_AT[k]
                 _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
-                shorter = size_v - 2 if kind == kinds.APART else 0
-                _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter, q_1, v_1)
+                shorter_size = size_v - 2 if kind == kinds.APART else 0
+                _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter_size, q_1, v_1)
                 out[g] = max(out[g], _max_difference(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
             if out[g] <= 1.0 or kind == kinds.VELOCITIES:
                 continue

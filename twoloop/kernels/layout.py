@@ -78,9 +78,9 @@ def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _take_unused(sizes: Sizes) -> Work | None:
-    free = _free.get(sizes)
+    unused = _free.get(sizes)
     try:
-        return free.pop() if free else None
+        return unused.pop() if unused else None
     except IndexError:  # another thread has taken the last one
         return None
 
@@ -97,10 +97,10 @@ def _allocate(sizes: Sizes) -> Work:
 
 def give_back(work: Work) -> None:
     """Keep an unused workspace for later runs of the same sizes, unless it is large; drop old ones beyond MOST_FREE."""
-    free = _free.pop(work.sizes, [])
-    if work.notes.base.size <= LARGEST_FREE and len(free) < MOST_FREE:
-        free.append(work)
-    _free[work.sizes] = free  # insert at the end, so that the dictionary begins with the sizes used longest ago
+    unused = _free.pop(work.sizes, [])
+    if work.notes.base.size <= LARGEST_FREE and len(unused) < MOST_FREE:
+        unused.append(work)
+    _free[work.sizes] = unused  # insert at the end, so that the dictionary begins with the sizes used longest ago
     for oldest in list(_free)[:-1]:
         if sum(map(len, list(_free.values()))) <= MOST_FREE:
             break

@@ -223,8 +223,8 @@ def _find_bend(values, n, slope, least, within):
     """
     low = high = 0.0
     for k in range(1, n + 1):
-        off = values[k] - values[0] - k * slope
-        low, high = min(low, off), max(high, off)
+        deviation = values[k] - values[0] - k * slope
+        low, high = min(low, deviation), max(high, deviation)
     limit = SUDDEN_RATIO * (high - low)
     if high - low > least:
         for k in range(1, n):
@@ -255,8 +255,8 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
     """Return whether two samples differ by more than `limit`, and far more than from `previous` and `following`."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
-    beside = max(sign * (first_value - previous), sign * (following - second_value))
-    return abs(change) > limit and STEEPER * beside < abs(change)
+    neighbouring_change = max(sign * (first_value - previous), sign * (following - second_value))
+    return abs(change) > limit and STEEPER * neighbouring_change < abs(change)
 
 
 @compiled
@@ -267,11 +267,11 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
     for _ in range(HALVINGS):
         time = 0.5 * (low + high)
         _sample(f, w, time, 0.0, q, v, a, changes[MIDDLE])
-        now = changes[MIDDLE, j]
-        if abs(now - before) >= abs(after - now):
-            high, after = time, now
+        value = changes[MIDDLE, j]
+        if abs(value - before) >= abs(after - value):
+            high, after = time, value
         else:
-            low, before = time, now
+            low, before = time, value
     return high
 
 
@@ -413,16 +413,16 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
     """Return the time of the next sudden change that samples in time alone show, or `next_change` if it is earlier."""
-    every = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
+    max_spacing = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
     # closer samples are not needed in multistep methods (ROUGH = 1), whose error estimates show a jump, and not if C_t
     # or b may jump (DRIVEN = 1), because such steps are checked for jumps
     may_resample = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
-    if may_resample and every < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
+    if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
     at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # the next samples must find the same change again
     while begin < min(t + size, last, next_change):
-        present_spacing, at_change = min(every, clock[at.SAMPLED_EVERY]) if at_change else every, False
+        present_spacing, at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], present_spacing)
         first, begin = first_discontinuity(f, w, tolerances, clock, t, begin, present_spacing, last, 0.0, q, v, a)
         next_change = min(next_change, first)

@@ -57,8 +57,8 @@ def near_singular(f, w, control, clock, t, q):
     """
     if control[at.BRIDGE] != 1.0:
         return False
-    old = f.flags[STRAIGHT] == 1 and w.notes[NEARLY_SINGULAR] == 1.0
-    if old and renew_partition(f, w, t, q) != DONE:
+    is_old = f.flags[STRAIGHT] == 1 and w.notes[NEARLY_SINGULAR] == 1.0
+    if is_old and renew_partition(f, w, t, q) != DONE:
         return True
     return w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
 
@@ -144,8 +144,8 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
         return False
     least, change = _least_pivot_within(f, w, t, size, before, end, state, new_state)
     if bridge == at.SUSPENDED:
-        passed = max(least / largest, EPS)
-        clock[at.PIVOT_PASSED] = passed if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], passed)
+        min_ratio = max(least / largest, EPS)
+        clock[at.PIVOT_PASSED] = min_ratio if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], min_ratio)
         return False
     if least < max(near_share(tolerances) * largest, min(PASSED_PIVOT_RATIO * change, SINGULAR_PIVOT * largest)):
         w.notes[PIVOT] = before
@@ -171,7 +171,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
     `size` is the size of the last step, s; `at_output` is true if this step ended at an output time. `state` contains
     all coordinates, so that it need not be converted for a new partition.
     """
-    short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
+    is_short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
     if f.flags[FORM] == STATIC:
         clock[at.PIVOT_HERE] = w.notes[PIVOT]
         clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
@@ -180,12 +180,12 @@ def check_partition(f, w, control, clock, size, at_output, state):
         return at.CONTINUE
     n = w.Q.size
     straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
-    every = 1
+    interval = 1
     if f.flags[FORM] == AUGMENTED:
-        every += w.independent_v.size // FREEDOMS_PER_CHECK
+        interval += w.independent_v.size // FREEDOMS_PER_CHECK
     if straight:
-        every = CHECK_INTERVAL
-    is_checked = w.counters[N_ACCEPTED] % every == 0
+        interval = CHECK_INTERVAL
+    is_checked = w.counters[N_ACCEPTED] % interval == 0
     if is_checked and (straight or f.flags[FORM] != NULL_SPACE):
         find_tangents(f, w, clock[at.T], state[:n])
     if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
@@ -204,10 +204,10 @@ def check_partition(f, w, control, clock, size, at_output, state):
         w.notes[SENSITIVITY] = 1.0  # as far from singular positions: then the partition is renewed again soon
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
-    if short and size < GIVE_UP_BELOW * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
+    if is_short and size < GIVE_UP_BELOW * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
         # the partition may have been chosen at a distant state: with a new one an implicit method may still continue
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step can cross the singular position, where rounding would determine velocities
-    return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE
+    return at.NEAR_SINGULAR if is_short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

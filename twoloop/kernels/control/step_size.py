@@ -67,13 +67,13 @@ def factor_of(rule, past, h, error):
     """Return the ratio of the next step size to h by `rule` and history `past`; `error` of the step: in tolerances."""
     if not error > 0.0:
         return rule[FACTOR_MAX]
-    follows = error <= 1.0 and rule[LEAST_ERROR] > 0.0
+    uses_trend = error <= 1.0 and rule[LEAST_ERROR] > 0.0
     factor = rule[SAFETY] * (1.0 / error if rule[EXPONENT] == 1.0 else error ** -rule[EXPONENT])
-    if follows and past[ERROR_BEFORE] > 0.0:
+    if uses_trend and past[ERROR_BEFORE] > 0.0:
         trend = h / past[H_BEFORE] * (past[ERROR_BEFORE] / error) ** rule[EXPONENT]
         factor = min(factor, factor * trend)
     factor = min(rule[FACTOR_MAX], max(rule[FACTOR_MIN], factor))
-    return 1.0 if follows and 1.0 <= factor <= KEEP_BELOW_RATIO else factor
+    return 1.0 if uses_trend and 1.0 <= factor <= KEEP_BELOW_RATIO else factor
 
 
 @merged
@@ -218,7 +218,7 @@ def defect_ratio(tolerances, h, order, predicted, a, q, v):
     grows as the highest power of the time: its integral over the step is h / order times its value at the end. The
     result is infinite if an acceleration is not finite.
     """
-    rtol, duration, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
+    rtol, duration, largest, ratio = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):
         largest = max(largest, abs(a[j]))
     for j in range(a.size):
@@ -227,5 +227,5 @@ def defect_ratio(tolerances, h, order, predicted, a, q, v):
             return np.inf
         defect = (defect - ROUNDING * largest) * duration
         atol = tolerances[ATOL + j]
-        worst = max(worst, defect / (atol + rtol * abs(v[j])), defect * duration / (atol + rtol * abs(q[j])))
-    return worst
+        ratio = max(ratio, defect / (atol + rtol * abs(v[j])), defect * duration / (atol + rtol * abs(q[j])))
+    return ratio

@@ -166,8 +166,8 @@ def _history(memory):
 
 @inlined
 def _memories(memory, n):
-    split = N_SCALARS + 2 * n + int(memory[FIRST_MEMORY])
-    return memory[N_SCALARS + 2 * n : split], memory[split:]
+    begin_second = N_SCALARS + 2 * n + int(memory[FIRST_MEMORY])
+    return memory[N_SCALARS + 2 * n : begin_second], memory[begin_second:]
 
 
 @compiled
@@ -183,23 +183,23 @@ def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
     largest = 1.0
     for m in range(n):
         largest = max(largest, abs(v[m]) if by_v else abs(q[m]))
-    size = DISPLACEMENT * largest
+    displacement = DISPLACEMENT * largest
     copy(q, Q)
     copy(v, V)
     displaced = V if by_v else Q
     for i in columns:
-        displaced[i] += size * direction[i]
+        displaced[i] += displacement * direction[i]
     if evaluate_near(f, w, t, Q, V, A) != DONE:
         return 0.0
-    image, size = 0.0, 0.0
+    largest_change, displacement = 0.0, 0.0
     for i in columns:
-        image = max(image, abs(A[i] - a[i]))
-        size = max(size, abs(V[i] - v[i]) if by_v else abs(Q[i] - q[i]))
-    if not (image > 0.0 and np.isfinite(image) and size > 0.0):
+        largest_change = max(largest_change, abs(A[i] - a[i]))
+        displacement = max(displacement, abs(V[i] - v[i]) if by_v else abs(Q[i] - q[i]))
+    if not (largest_change > 0.0 and np.isfinite(largest_change) and displacement > 0.0):
         return 0.0
     for i in columns:
-        direction[i] = (A[i] - a[i]) / image
-    return image / size
+        direction[i] = (A[i] - a[i]) / largest_change
+    return largest_change / displacement
 
 
 @compiled
@@ -324,12 +324,12 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     is_cheap = counted_cost > least_cost and (
         f.flags[FORCE_BY_Q_GIVEN] == 1 or counted_cost > MIN_COST_PER_COORDINATE * w.independent.size
     )
-    hidden = False
+    is_hidden = False
     if memory[PHASE] == EXPLICIT and is_cheap and h_rho > HIDDEN_FROM:
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-        hidden = _is_quiet(w, tolerances, state, memory[RATE])
-        if not hidden:
-            hidden = memory[RATE] > HIDDEN_RATIO * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
+        is_hidden = _is_quiet(w, tolerances, state, memory[RATE])
+        if not is_hidden:
+            is_hidden = memory[RATE] > HIDDEN_RATIO * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
     # a run of high cost starts a trial whatever the rates are: if friction is about to reverse, few states show the
     # largest rate. The condition on `cost` excludes the short steps at the start, when the expected cost is unknown
     costs_enough = (
@@ -337,14 +337,14 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     )
     is_due = (
         h_rho > STABILITY_LIMIT
-        or hidden
+        or is_hidden
         or costs_enough
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
     if is_cheap and h_rho <= 1.0:  # N_ABOVE_LIMIT is not reset while a trial is too expensive
         memory[N_ABOVE_LIMIT] = 0.0
-    expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than in the previous explicit phase
-    if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or expensive)):
+    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than in the previous explicit phase
+    if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0
         return ON_TRIAL if memory[PHASE] == EXPLICIT else BACK_ON_TRIAL
@@ -397,12 +397,12 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             _begin_phase(w, options, memory, phase, t)
             if was_explicit != _is_explicit(memory):
                 _clear(second if was_explicit else first)
-    explicit = _is_explicit(memory)
-    w.notes[EXPLICIT_STEP] = 1.0 if explicit else 0.0
+    is_explicit = _is_explicit(memory)
+    w.notes[EXPLICIT_STEP] = 1.0 if is_explicit else 0.0
     begin = N_OPTIONS + int(options[SIZE_1])
-    rule = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
+    rule = options[N_PAIR : N_PAIR + N_OF_EACH] if is_explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
     w.notes[REUSE] = max(rule[REUSE_OF], w.notes[ROUNDED])
-    if explicit:
+    if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
         # a step of fixed size that does not converge cannot be shortened: use the implicit method from now on
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC:
@@ -426,7 +426,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, rule[LEAST_ERROR])
     if factor == 0.0:
         factor = factor_of(rule, _history(memory), h, error)
-    if not explicit:
+    if not is_explicit:
         factor = min(factor, max(tolerances[GAP] / h, 1.0))
     return Attempt(DONE, error, factor)
 

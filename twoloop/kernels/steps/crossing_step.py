@@ -142,22 +142,22 @@ def _error(tolerances, h, state, legendre, a, n_kept):
     """
     n, largest = a.shape[1], 0.0
     for m in range(n):
-        first = before = top = 0.0
+        early_max = middle_max = late_max = 0.0
         for k in range(2, n_kept):
             value = 0.0
             for j in range(S):
                 value += legendre[k, j] * a[j, m]
             if k < n_kept - 4:
-                first = max(first, abs(value))
+                early_max = max(early_max, abs(value))
             elif k < n_kept - 2:
-                before = max(before, abs(value))
+                middle_max = max(middle_max, abs(value))
             else:
-                top = max(top, abs(value))
-        before = max(before, top, TINY)
-        decay, far = top / before, top / max(first, before)
+                late_max = max(late_max, abs(value))
+        middle_max = max(middle_max, late_max, TINY)
+        decay, far = late_max / middle_max, late_max / max(early_max, middle_max)
         if n_kept == S:
             decay *= np.sqrt(decay)
-        largest = max(largest, top * max(decay, far) * h * _weight(tolerances, m, n, h, state))
+        largest = max(largest, late_max * max(decay, far) * h * _weight(tolerances, m, n, h, state))
     return ERROR_FACTOR * largest
 
 
@@ -283,12 +283,12 @@ def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
     copy(stage[0], q1)
     copy(stage[1], v1)
     code = renew_partition(f, w, t, q1)
-    determined = code == DONE and w.notes[PIVOT] >= near
+    is_determined = code == DONE and w.notes[PIVOT] >= near
     if code == DONE:
         store_prediction(w, q1)
         w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
         code = evaluate_state(f, w, t, q1, v1, options[INNER_TOL], a1, lam1)
-    if near > 0.0 and not (determined and code == DONE):
+    if near > 0.0 and not (is_determined and code == DONE):
         if code != DONE:
             copy(state[3 * n :], lam1)
         copy(stage[0], q1)

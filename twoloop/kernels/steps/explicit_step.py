@@ -166,9 +166,9 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     # near a singular position all stages are projected: it matters on which side of the position a stage lies, and how
     # accurate its velocities are
     is_near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
-    free = options[FREE] == 1.0 and not is_near
+    is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)
-    if ratio_to_gap > 0.0 and not free:
+    if ratio_to_gap > 0.0 and not is_free:
         return Attempt(DONE, ratio_to_gap, 1.0 / ratio_to_gap)
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
@@ -176,7 +176,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # entries of dependent coordinates are start values
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
-        if free:
+        if is_free:
             code = evaluate_as_given(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
         else:
             code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
@@ -191,7 +191,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     store_prediction(w, q1)
-    if free:
+    if is_free:
         code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     else:
         code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)

@@ -201,12 +201,12 @@ def begin_operations(options, table, values, z, x, y):
             elif kind == op.PENDING:
                 z[o] = 0.0
         if kind == op.SINE:
-            half = (groups[g + END] - groups[g + BEGIN]) // 2
-            for o in range(groups[g + BEGIN], groups[g + BEGIN] + half):
+            n_sines = (groups[g + END] - groups[g + BEGIN]) // 2
+            for o in range(groups[g + BEGIN], groups[g + BEGIN] + n_sines):
                 z[o] = np.sin(x[o])
-                z[o + half] = np.cos(x[o])
-                y[o], y[o + half] = z[o + half], -z[o]
-                x[o] = x[o + half] = 0.0
+                z[o + n_sines] = np.cos(x[o])
+                y[o], y[o + n_sines] = z[o + n_sines], -z[o]
+                x[o] = x[o + n_sines] = 0.0
 
 
 @merged
@@ -225,9 +225,9 @@ def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
             for o in range(first, last):
                 z[o] = total[o] + x[o] * y0[o]
         elif kind == op.SINE:
-            half = (last - first) // 2
-            for o in range(first, first + half):
-                p = o + half
+            n_sines = (last - first) // 2
+            for o in range(first, first + n_sines):
+                p = o + n_sines
                 u = K * x[o]
                 x[o] = x[p] = u
                 sine, cosine = (total[o] + u * y0[o]) * inverse, (total[p] + u * y0[p]) * inverse
