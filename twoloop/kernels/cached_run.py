@@ -244,7 +244,7 @@ def _evaluate_start(checked_kit, b, t, q, v, sizes, shifts):
 
 @merged
 def _has_all_entries(b):
-    """Return whether b.rows is nonzero exactly where b.kinds is, so that no entry is sought at other positions."""
+    """Return whether b.rows is nonzero exactly where b.kinds is: then it need not be evaluated at other positions."""
     n, is_same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         is_same = is_same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)

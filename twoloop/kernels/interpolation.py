@@ -213,12 +213,12 @@ def _max_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_ot
 def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
     """Store the accelerations of the polynomials at t[i] + s h in a (n_q); arguments: see `_evaluate_polynomials`."""
     for m in range(a.size):
-        value, slope, bend = c[size - 1, m], 0.0, 0.0
+        value, slope, curvature = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
-            bend = bend * (s - z[r]) + 2.0 * slope
+            curvature = curvature * (s - z[r]) + 2.0 * slope
             slope = slope * (s - z[r]) + value
             value = value * (s - z[r]) + c[r, m]
-        a[m] = bend / (h * h)
+        a[m] = curvature / (h * h)
     if kind == kinds.APART:
         for m in range(a.size):
             value, slope = c_v[size_v - 1, m], 0.0

@@ -62,7 +62,7 @@ def empty(sizes: Sizes) -> Work:
 
 
 def copy_of(work: Work) -> Work:
-    """Return a copy of a workspace, of those data that are kept from one step to the next."""
+    """Return a workspace with a copy of the data of `work` that are kept from one step to the next."""
     sizes = work.sizes
     duplicate = _take_unused(sizes) or _allocate(sizes)
     for target, source in zip(lasting(duplicate), lasting(work), strict=True):
@@ -261,7 +261,7 @@ def _layout(
 
 
 def _array_ranges(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Return (first offset, end, shape) of each array by name, aligned to cache lines, and the length of all arrays."""
+    """Return (first offset, end, shape) of each array by name, aligned to cache lines, and the total length."""
     ranges, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)

@@ -720,7 +720,7 @@ def _factor_sparse(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store [M r; G r] in `right`, the right-hand side of the bordered system; redundant rows add stiffness to M."""
+    """Store the right-hand side [M r; G r] of the bordered system in `right`; redundant rows add stiffness to M."""
     mass, jacobian, _, _, counts, stiffness = _sparse_state(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_of(f.newton_program)

@@ -160,7 +160,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store `scale` times the sum of `values`, without constant, in `out` for each item of `sums`, see SUM_INDICES."""
+    """For each item of `sums`, store `scale` times its sum of `values`, without its constant, in `out`."""
     column, coefficient = _integers(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     indices = _integers(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -455,7 +455,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
 
 @compiled
 def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-    """Return whether `defect` is a rounding error, as large as that near the step's beginning, see NOISE_RATIO."""
+    """Return whether `defect` is a rounding error: at most NOISE_RATIO times the defect near the step's beginning."""
     if defect > MAX_NOISE:
         return False
     noise = 0.0
