@@ -22,7 +22,7 @@ from twoloop.generate.program import Arrays, Program
 from twoloop.generate.series import series_for
 from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_short, may_be_steep
 from twoloop.generate.trace import Equations
-from twoloop.kernels.control.discontinuities import LEAST_RANGE, LEAST_VALUE, STEEPER, SUDDEN_RATIO
+from twoloop.kernels.control.discontinuities import LEAST_RANGE, LEAST_VALUE, MIN_STEEPNESS_RATIO, SUDDEN_RATIO
 from twoloop.kernels.control.discontinuities import N_SAMPLES as N_PLACES
 from twoloop.kernels.lanes import layout
 from twoloop.kernels.layout import cached_run
@@ -95,7 +95,11 @@ def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
     direction = np.sign(change)
     beside[1:] = change[:-1] * direction[1:]
     beside[:-1] = np.maximum(beside[:-1], change[1:] * direction[:-1])
-    flanks = (np.abs(change) > SUDDEN_RATIO * within) & (STEEPER * beside < np.abs(change)) & (within > least[:, None])
+    flanks = (
+        (np.abs(change) > SUDDEN_RATIO * within)
+        & (MIN_STEEPNESS_RATIO * beside < np.abs(change))
+        & (within > least[:, None])
+    )
     short = (flanks[:-1] & flanks[1:]).any(axis=(0, 2)) | (flanks[:-2] & flanks[2:]).any(axis=(0, 2))
     return np.asarray(short | ~finite)
 

@@ -37,7 +37,13 @@ from twoloop.generate.series import series_program
 from twoloop.generate.trace import Equations
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, are_cached, generated_functions
-from twoloop.kernels.control.step_size import FLOOR, LEAST, ROUNDING, SHARE_OF_MOTION, SHARE_THROUGH_ZERO
+from twoloop.kernels.control.step_size import (
+    FIXED_FRACTION,
+    FRACTION_AT_SIGN_CHANGE,
+    FRACTION_OF_MOTION,
+    LEAST,
+    ROUNDING,
+)
 from twoloop.kernels.lanes import layout as lanes
 from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
@@ -207,11 +213,11 @@ class LaneSteps:
         for j in range(n):
             distance = emit.larger(emit.multiply(h, magnitude(at.state, n + j)), difference(at.new, at.state, j))
             motion = emit.larger(distance, motion)
-        turned, least = self.turned(emit, at), emit.multiply(emit.constant(SHARE_THROUGH_ZERO), motion)
-        motion = emit.multiply(emit.constant(SHARE_OF_MOTION), motion)
+        turned, least = self.turned(emit, at), emit.multiply(emit.constant(FRACTION_AT_SIGN_CHANGE), motion)
+        motion = emit.multiply(emit.constant(FRACTION_OF_MOTION), motion)
         for j in range(n):
             scale = emit.add(atol[j], emit.multiply(rtol, emit.larger(magnitude(at.new, j), magnitude(at.state, j))))
-            allowed = emit.add(motion, emit.multiply(emit.constant(FLOOR), scale))
+            allowed = emit.add(motion, emit.multiply(emit.constant(FIXED_FRACTION), scale))
             allowed = emit.smaller(scale, allowed)
             if turned is not None:
                 allowed = emit.builder.select(turned, emit.smaller(scale, least), allowed)

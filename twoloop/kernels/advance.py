@@ -25,7 +25,14 @@ from twoloop.kernels.control.singular_positions import (
     record_pivot_at_output,
     retry_projected,
 )
-from twoloop.kernels.control.step_size import EQUAL_SPACINGS, count_step, factor_of, off_grid, on_grid, record_accepted
+from twoloop.kernels.control.step_size import (
+    EQUAL_SPACINGS,
+    count_step,
+    record_accepted_step,
+    size_off_grid,
+    size_on_grid,
+    step_size_ratio,
+)
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
 from twoloop.kernels.data.indices import (
@@ -274,9 +281,9 @@ def advance(
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
         n_grid_steps = 1.0  # number of steps of the grid that this step completes
         if fixed_size:
-            size, n_grid_steps, reaches_goal = on_grid(clock, t, h, target, goal)
+            size, n_grid_steps, reaches_goal = size_on_grid(clock, t, h, target, goal)
         else:
-            size, reaches_goal = off_grid(control, t, h, goal - t, crosses_jump)
+            size, reaches_goal = size_off_grid(control, t, h, goal - t, crosses_jump)
         shortened = reaches_goal or (h > 0.5 * (goal - t) and not fixed_size)
         at_output = reaches_goal and goal == target
         if reaches_goal:
@@ -334,7 +341,7 @@ def advance(
             clock[at.ROUGH_TO] = t + size
         error *= error_factor
         if factor == 0.0:
-            factor = factor_of(control, clock, size, error)
+            factor = step_size_ratio(control, clock, size, error)
         elif error_factor > 1.0 and error > 0.0:  # the method did not include `error_factor` in its `factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
@@ -351,7 +358,7 @@ def advance(
             return at.ROWS_VIOLATED
         count_step(w, tolerances, control, clock, size, out_steps[filled[1]])
         filled[1] += 1
-        record_accepted(control, clock, size, error)
+        record_accepted_step(control, clock, size, error)
         clock[at.N_FIXED] += n_grid_steps
         if reaches_goal:
             clock[at.T] = goal

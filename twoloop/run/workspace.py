@@ -33,7 +33,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     bodies_of,
     factorization_program,
 )
-from twoloop.kernels.steps.stages import LOADED, loaded, without_loading
+from twoloop.kernels.steps.stages import LOADED_STEPS, loaded, step_if_loaded
 from twoloop.methods.plan import Plan
 from twoloop.problem.callbacks import LARGE
 from twoloop.problem.system import ConstrainedSystem
@@ -370,7 +370,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # ids in the key stay unique, as the cached kits keep the objects with these ids alive
     plan_functions = (plan.inner, plan.step, plan.first, plan.second)
-    key = (id(system.functions), flags.tobytes(), *plan_functions, len(LOADED), *map(id, (*plan.own, *numbers)))
+    key = (id(system.functions), flags.tobytes(), *plan_functions, len(LOADED_STEPS), *map(id, (*plan.own, *numbers)))
     run_changes_flags = flags[FORM] == AUGMENTED  # a run may change these flags
     if key in kits:
         return _with_own_flags(kits[key][0]) if run_changes_flags else kits[key][0]
@@ -386,7 +386,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
     """Return a plan's step, and the first and second step of its pair of methods; the second is loaded when needed."""
-    return loaded(plan.step), loaded(plan.first), without_loading(plan.second)
+    return loaded(plan.step), loaded(plan.first), step_if_loaded(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:

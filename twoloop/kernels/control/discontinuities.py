@@ -24,7 +24,7 @@ when the interval is halved. If C_t or b jumps, the difference stays as large as
 import numpy as np
 
 from twoloop.kernels.control import loop_state as at
-from twoloop.kernels.control.step_size import evaluate_near
+from twoloop.kernels.control.step_size import project_and_evaluate
 from twoloop.kernels.data.common import allowed, compiled, finite_vector
 from twoloop.kernels.data.indices import ATOL, DONE, FORM, GAP, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
@@ -33,7 +33,7 @@ from twoloop.kernels.linalg.symbolic_factorization import jacobian_of
 N_PARTS = 12  # number of parts of an interval, at whose ends C_t and b are sampled
 # coefficients of the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
-RATE_HALVINGS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
+MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
 TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, relative to slope times np.spacing(t)
 STEEPNESS = 4.0  # slope of C_t or b, relative to its mean over the step, above which a part of the step is a ramp
@@ -126,7 +126,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     if row < 0:
         return SMOOTH, t, end
     steepest, low, high = 0.0, begin, end
-    for _ in range(RATE_HALVINGS):
+    for _ in range(MAX_BISECTIONS):
         if end - begin <= MIN_SPACINGS * np.spacing(abs(end)):
             break
         middle = begin + 0.5 * (end - begin)
@@ -163,28 +163,34 @@ LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol ti
 # smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too
 # coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
-N_IN_STEP = 8.0  # least number of samples in a step: a force that acts for a quarter of the step may miss all stages
+MIN_SAMPLES_IN_STEP = (
+    8.0  # least number of samples in a step: a force that acts for a quarter of the step may miss all stages
+)
 RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one below which samples ahead are taken again
-LEAST_APART = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
-HALVINGS = 20  # number of bisections that locate the change of a value between two samples
-SAME_CHANGE = 1e-5  # largest time between two changes that count as one, relative to the widest spacing of samples
+MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
+N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
+EQUAL_CHANGES = 1e-5  # largest time between two changes that count as one, relative to the widest spacing of samples
 # time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
 # at zero, such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
-STEEPER = 2.0  # smallest ratio of a sudden change to its neighbouring changes; on a smooth slope, the ratio is smaller
+MIN_STEEPNESS_RATIO = (
+    2.0  # smallest ratio of a sudden change to its neighbouring changes; on a smooth slope, the ratio is smaller
+)
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
-N_IN_SHORT = 4  # number of samples within a short step
+N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # largest change of an acceleration, relative to the largest acceleration, while a velocity changes by its tolerance: if
 # the change is larger, the acceleration decays, see _acceleration_lasts
 MAX_LASTING_CHANGE = 0.5
-AT_CHANGE = 0.01  # time after a step's beginning, in spacings of samples, before which a change counts as passed
-LARGEST = N_SAMPLES + 1  # index of the row of w.changes with the largest absolute values so far; rows above: samples
-MIDDLE = N_SAMPLES + 2  # index of the row of w.changes with values between two samples
+CHANGE_MARGIN = 0.01  # time after a step's beginning, in spacings of samples, before which a change counts as passed
+LARGEST_ROW = (
+    N_SAMPLES + 1
+)  # index of the row of w.changes with the largest absolute values so far; rows above: samples
+MIDDLE_ROW = N_SAMPLES + 2  # index of the row of w.changes with values between two samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
 @compiled
-def _sample(f, w, time, elapsed, q, v, a, values):
+def _sample_forces(f, w, time, elapsed, q, v, a, values):
     """Store forces, C_t and b at `time` in `values`, for the state reached from (q, v) in `elapsed` s at constant a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
@@ -195,7 +201,7 @@ def _sample(f, w, time, elapsed, q, v, a, values):
 
 
 @compiled
-def _largest(values):
+def _largest_value(values):
     """Return the largest of `values`, or 0 if all are negative: a scale, as single components may always be zero."""
     largest = 0.0
     for x in values:
@@ -204,7 +210,7 @@ def _largest(values):
 
 
 @compiled
-def _is_smooth(values, k, n):
+def _is_smooth_bend(values, k, n):
     """Return whether second differences of n + 1 values at index k and beside it have equal signs and similar sizes."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
@@ -218,8 +224,8 @@ def _is_smooth(values, k, n):
 def _find_bend(values, n, slope, least, within):
     """Return the index of the first sudden bend of n + 1 values (0: none), and the limit of second differences.
 
-    The limit is SUDDEN_RATIO times the range of the values, after a line of slope `slope` (per sample) is subtracted.
-    The index is 0 if the range is at most `least`. If `within`, bends of a smooth curve are excluded, see `_is_smooth`.
+    The limit is SUDDEN_RATIO times the range of the values minus a line of slope `slope` (per sample). The index is 0
+    if this range is at most `least`. With `within` = True, bends of a smooth curve are excluded, see `_is_smooth_bend`.
     """
     low = high = 0.0
     for k in range(1, n + 1):
@@ -229,7 +235,7 @@ def _find_bend(values, n, slope, least, within):
     if high - low > least:
         for k in range(1, n):
             second = values[k + 1] - 2.0 * values[k] + values[k - 1]
-            if abs(second) > limit and not (within and _is_smooth(values, k, n)):
+            if abs(second) > limit and not (within and _is_smooth_bend(values, k, n)):
                 return k, limit
     return 0, limit
 
@@ -256,7 +262,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     neighbouring_change = max(sign * (first_value - previous), sign * (following - second_value))
-    return abs(change) > limit and STEEPER * neighbouring_change < abs(change)
+    return abs(change) > limit and MIN_STEEPNESS_RATIO * neighbouring_change < abs(change)
 
 
 @compiled
@@ -264,10 +270,10 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
     """Return the time just after component j changes between `low` and `high`, the times of samples k and k + 1."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
-    for _ in range(HALVINGS):
+    for _ in range(N_BISECTIONS):
         time = 0.5 * (low + high)
-        _sample(f, w, time, 0.0, q, v, a, changes[MIDDLE])
-        value = changes[MIDDLE, j]
+        _sample_forces(f, w, time, 0.0, q, v, a, changes[MIDDLE_ROW])
+        value = changes[MIDDLE_ROW, j]
         if abs(value - before) >= abs(after - value):
             high, after = time, value
         else:
@@ -281,7 +287,7 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 
     Samples k = 0 to n are at begin + k spacing; `column` is the component that bends, `limit` the smallest change.
     """
-    values, margin = w.changes[:, column], max(AT_CHANGE * spacing, SAME_CHANGE * clock[at.WIDEST_SAMPLING])
+    values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
     soonest = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
     for k in range(index - 1, index + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
@@ -289,8 +295,8 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
         if is_recorded or k + 2 > n or low - spacing < soonest:  # a change needs samples on both sides
             continue
         if k == 0:
-            _sample(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE])
-        if _is_sudden_change(values[MIDDLE if k == 0 else k - 1], values[k], values[k + 1], values[k + 2], limit):
+            _sample_forces(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE_ROW])
+        if _is_sudden_change(values[MIDDLE_ROW if k == 0 else k - 1], values[k], values[k + 1], values[k + 2], limit):
             time = _locate_change(f, w, low, high, k, column, q, v, a)
             if clock[at.LAST_CHANGE] > -np.inf:
                 clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], abs(time - clock[at.LAST_CHANGE]))
@@ -309,22 +315,22 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
         time = begin + k * spacing
         if time > last:
             break
-        _sample(f, w, time, follows_motion * (time - t), q, v, a, changes[k])
+        _sample_forces(f, w, time, follows_motion * (time - t), q, v, a, changes[k])
         for j in range(changes.shape[1]):
             if np.isfinite(changes[k, j]):
-                changes[LARGEST, j] = max(changes[LARGEST, j], abs(changes[k, j]))
+                changes[LARGEST_ROW, j] = max(changes[LARGEST_ROW, j], abs(changes[k, j]))
             elif k > 0:
                 t_first = time
         if t_first < np.inf:
             break
         n = k
     least = LEAST_RANGE * tolerances[RTOL]
-    of_forces = max(LEAST_VALUE, least * _largest(changes[LARGEST, : q.size]))
-    of_rates = max(LEAST_VALUE, least * _largest(changes[LARGEST, q.size :]))
+    min_force_range = max(LEAST_VALUE, least * _largest_value(changes[LARGEST_ROW, : q.size]))
+    min_rate_range = max(LEAST_VALUE, least * _largest_value(changes[LARGEST_ROW, q.size :]))
     bend, column, limit = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]
-        index, least = _first_sudden_bend(values, n, follows_motion, of_forces if j < q.size else of_rates)
+        index, least = _first_sudden_bend(values, n, follows_motion, min_force_range if j < q.size else min_rate_range)
         if 0 < index < bend:
             bend, column, limit = index, j, least
     if column >= 0:
@@ -342,19 +348,19 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
         return
     for k, time in enumerate((t - 2.0 * spacing, t - spacing, end + spacing, end + 2.0 * spacing)):
-        _sample(f, w, min(max(time, begin), last), 0.0, q, v, a, changes[k + (k > 1)])
+        _sample_forces(f, w, min(max(time, begin), last), 0.0, q, v, a, changes[k + (k > 1)])
     least = LEAST_RANGE * tolerances[RTOL]
-    of_forces = max(LEAST_VALUE, least * _largest(changes[LARGEST, : q.size]))
-    of_rates = max(LEAST_VALUE, least * _largest(changes[LARGEST, q.size :]))
-    for k in range(N_IN_SHORT):
-        time = t + k * size / N_IN_SHORT
-        _sample(f, w, time, 0.0, q, v, a, changes[2])
+    min_force_range = max(LEAST_VALUE, least * _largest_value(changes[LARGEST_ROW, : q.size]))
+    min_rate_range = max(LEAST_VALUE, least * _largest_value(changes[LARGEST_ROW, q.size :]))
+    for k in range(N_SAMPLES_IN_SHORT_STEP):
+        time = t + k * size / N_SAMPLES_IN_SHORT_STEP
+        _sample_forces(f, w, time, 0.0, q, v, a, changes[2])
         for j in range(changes.shape[1]):
             values = changes[:, j]
             low = min(min(values[0], values[1]), min(values[3], values[4]))
             high = max(max(values[0], values[1]), max(values[3], values[4]))
             excess = max(values[2] - high, low - values[2])
-            if excess > max(STEEPER * (high - low), of_forces if j < q.size else of_rates):
+            if excess > max(MIN_STEEPNESS_RATIO * (high - low), min_force_range if j < q.size else min_rate_range):
                 first = _locate_change(f, w, max(t - spacing, begin), time, 1, j, q, v, a)
                 second = _locate_change(f, w, time, end + spacing, 2, j, q, v, a)
                 clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], second - first)
@@ -376,7 +382,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
         return True
     for m in range(n):
         Q[m], V[m] = q[m], v[m] + time * a[m]
-    if evaluate_near(f, w, t, Q, V, A) != DONE:
+    if project_and_evaluate(f, w, t, Q, V, A) != DONE:
         return True
     for m in range(n):
         change = max(change, abs(A[m] - a[m]))
@@ -386,7 +392,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
     """Store the next sudden change along the motion in `clock`; sample a step, or LEAST_DISTANCE spacings if longer."""
-    if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - AT_CHANGE) * size:
+    if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
     duration = min(max(size, LEAST_DISTANCE * spacing), last - t)
     clock[at.SAMPLES_MOTION] = 1.0
@@ -401,19 +407,19 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
     clock[at.SAMPLES_MOTION] = 0.0
     # close samples along the motion also count as samples in time alone, unless these must continue at a known change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
-    if not change_found and duration <= N_SAMPLES * min(control[at.APART], size / N_IN_STEP):
+    if not change_found and duration <= N_SAMPLES * min(control[at.APART], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
         if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
             clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], duration / N_SAMPLES
             clock[at.DISCONTINUITY] = first
-    if first < clock[at.DISCONTINUITY_OF_MOTION] or clock[at.DISCONTINUITY_OF_MOTION] <= t + AT_CHANGE * spacing:
+    if first < clock[at.DISCONTINUITY_OF_MOTION] or clock[at.DISCONTINUITY_OF_MOTION] <= t + CHANGE_MARGIN * spacing:
         clock[at.DISCONTINUITY_OF_MOTION] = first
 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
     """Return the time of the next sudden change that samples in time alone show, or `next_change` if it is earlier."""
-    max_spacing = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
+    max_spacing = max(min(control[at.APART], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
     # closer samples are not needed in multistep methods (ROUGH = 1), whose error estimates show a jump, and not if C_t
     # or b may jump (DRIVEN = 1), because such steps are checked for jumps
     may_resample = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
@@ -437,14 +443,14 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     shortest = (1.0 if control[at.BY_STATE] == 1.0 else LEAST_DISTANCE) * spacing
-    if control[at.SAMPLE_MOTION] == 1.0 and shortest < size < (N_SAMPLES + AT_CHANGE) * spacing:
+    if control[at.SAMPLE_MOTION] == 1.0 and shortest < size < (N_SAMPLES + CHANGE_MARGIN) * spacing:
         _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A)
-    t_near = t + AT_CHANGE * min(spacing, size / N_IN_STEP)
+    t_near = t + CHANGE_MARGIN * min(spacing, size / MIN_SAMPLES_IN_STEP)
     next_change = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > t_near else np.inf
     next_of_motion = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > t_near else np.inf
     at_change = next_change == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
     # do not sample again near the end of a run: samples of ever shorter spans would find the same change again
-    if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + AT_CHANGE) * clock[at.SAMPLED_EVERY]):
+    if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + CHANGE_MARGIN) * clock[at.SAMPLED_EVERY]):
         next_change = _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = next_change
     size = min(size, representable_step(t, min(next_change, next_of_motion) - t))

@@ -63,7 +63,7 @@ KEEP_BELOW_RATIO = 1.2
 
 
 @compiled
-def factor_of(rule, past, h, error):
+def step_size_ratio(rule, past, h, error):
     """Return the ratio of the next step size to h by `rule` and history `past`; `error` of the step: in tolerances."""
     if not error > 0.0:
         return rule[FACTOR_MAX]
@@ -77,13 +77,13 @@ def factor_of(rule, past, h, error):
 
 
 @merged
-def record_accepted(rule, past, h, error):
+def record_accepted_step(rule, past, h, error):
     """Store size h (s) and `error` (in tolerances) of an accepted step in `past`, the history of step-size control."""
     past[H_BEFORE], past[ERROR_BEFORE] = h, max(error, rule[LEAST_ERROR])
 
 
 @compiled
-def evaluate_near(f, w, t, Q, V, A):
+def project_and_evaluate(f, w, t, Q, V, A):
     """Project (Q, V), a state near the constraints, in place, and store its accelerations in A; return a code."""
     # PROJECT is the cheapest task of generated code, and in the static form the task EVALUATE does not project
     if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
@@ -100,7 +100,7 @@ EQUAL_SPACINGS = 4.0  # largest difference of times that count as equal, in spac
 
 
 @merged
-def on_grid(clock, t, h, target, goal):
+def size_on_grid(clock, t, h, target, goal):
     """Return the size (s) of a step from t, the number of grid steps that it completes, and whether it reaches `goal`.
 
     Grid times are T_START plus multiples of h. `target` is the next output time; if a grid time differs from `target`
@@ -122,7 +122,7 @@ def on_grid(clock, t, h, target, goal):
 
 
 @merged
-def off_grid(control, t, h, left, crosses_jump):
+def size_off_grid(control, t, h, left, crosses_jump):
     """Return the size of a step, at most about h, and whether it reaches its goal, which is `left` seconds ahead."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
@@ -134,7 +134,7 @@ def off_grid(control, t, h, left, crosses_jump):
     return size, reaches_goal
 
 
-FADING = 0.98  # factor by which H_LONG, the longest of the last steps, decreases in each accepted step
+H_LONG_DECAY = 0.98  # factor by which H_LONG, the longest of the last steps, decreases in each accepted step
 
 
 @merged
@@ -151,7 +151,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     elif is_beyond_gap(tolerances, size):  # a step longer than GAP has closely spaced stages
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
-    clock[at.H_LONG] = max(size, FADING * clock[at.H_LONG])
+    clock[at.H_LONG] = max(size, H_LONG_DECAY * clock[at.H_LONG])
     w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
     out_step[at.H] = size
     out_step[at.ERRORS] = w.counters[N_REJECTED_ERROR]
@@ -161,11 +161,11 @@ def count_step(w, tolerances, control, clock, size, out_step):
 
 
 # allowed error of a predicted position, relative to the largest motion of a coordinate in the step
-SHARE_OF_MOTION = 0.1
-SHARE_THROUGH_ZERO = 1e-6  # replaces SHARE_OF_MOTION if the sign of det C_qd changes in the step
+FRACTION_OF_MOTION = 0.1
+FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if the sign of det C_qd changes in the step
 LEAST = 1e-300  # lower bound of the allowed error, which avoids a division by zero
 # part of the allowed error of a predicted position, in tolerances, that does not depend on the motion in the step
-FLOOR = 0.01
+FIXED_FRACTION = 0.01
 
 
 @merged
@@ -179,7 +179,7 @@ def store_prediction(w, q1):
 def departure(w, tolerances, h, q, v, q1):
     """Return the largest difference of a dependent position in w.predicted from q1, relative to the allowed difference.
 
-    The allowed difference is the smaller one of the tolerance and about SHARE_OF_MOTION times the motion in the step.
+    The allowed difference is the smaller of two: the tolerance, and about FRACTION_OF_MOTION times the motion.
     The factors of C_qd in `w` must be those at q1. With steps of fixed size the result is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
@@ -188,9 +188,9 @@ def departure(w, tolerances, h, q, v, q1):
     motion = 0.0
     for m in range(q.size):
         motion = max(motion, h * abs(v[m]), abs(q1[m] - q[m]))
-    fraction, floor = SHARE_OF_MOTION, FLOOR
+    fraction, floor = FRACTION_OF_MOTION, FIXED_FRACTION
     if w.notes[ORIENTATION] * w.notes[ORIENTATION_NEW] < 0.0:
-        fraction, floor = SHARE_THROUGH_ZERO, 0.0
+        fraction, floor = FRACTION_AT_SIGN_CHANGE, 0.0
     largest = 0.0
     for k in range(w.dependent.size):
         m = w.dependent[k]

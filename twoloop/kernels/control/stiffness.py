@@ -34,7 +34,7 @@ from twoloop.kernels.control.loop_state import (
     N_RULE,
     initial_direction,
 )
-from twoloop.kernels.control.step_size import evaluate_near, factor_of
+from twoloop.kernels.control.step_size import project_and_evaluate, step_size_ratio
 from twoloop.kernels.data.common import (
     ATTEMPT,
     SETTLE,
@@ -70,31 +70,33 @@ from twoloop.kernels.linalg.dense import copy
 # FIRST_ESTIMATE: number of evaluations before the first estimate of rho; BETWEEN_ESTIMATES: number between two
 # estimates, which take about eight evaluations each. For the explicit method, both are multiplied by COST_RATIO
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
-ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
-NEGLIGIBLE = 1e-3  # product of step size and eigenvalue of dF/dv below which the power iterations for dF/dv end
-SEED = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
+N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
+NEGLIGIBLE_DAMPING = 1e-3  # product of step size and eigenvalue of dF/dv below which the power iterations for dF/dv end
+ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
 STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limit the step of the explicit method
 # least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
 # needs finite differences, which take about eight evaluations per coordinate
 MIN_COST_PER_COORDINATE = 64.0
-TRIAL = 300.0  # approximate cost of a trial of the implicit method, in its evaluations
-AFFORDED = 3.0  # least cost of the run, relative to the cost of a trial, at which a trial that may be in vain can begin
-SHARE_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
-# cost of the run, relative to AFFORDED trials, at which a trial begins whatever the rates are. This number is doubled
-# after one trial, tripled after two, and so on
+TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in its evaluations
+MIN_COST_IN_TRIALS = (
+    3.0  # least cost of the run, relative to the cost of a trial, at which a trial that may be in vain can begin
+)
+COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
+# cost of the run, in units of MIN_COST_IN_TRIALS trials, at which a trial begins whatever the rates are; this number is
+# multiplied by k + 1 after k trials
 COST_OF_ANY_TRIAL = 100.0
-HIDDEN_RATIO = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
+MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
 QUIET_FACTOR = 10.0  # largest velocities, in tolerances, of oscillations that steps at the stability limit excite
-HIDDEN_FROM = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
+MIN_HIDDEN_RATIO = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method
 TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
-N_UNTYPICAL = 5.0  # number of accepted steps at the beginning of a trial whose cost is not measured
-WINDOW = 10.0  # number of accepted steps over which the cost of the method on trial is measured
+N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial whose cost is not measured
+N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
 MIN_GAIN = 1.2  # ratio of the costs per second (before to on trial) above which the method on trial replaces the other
-PATIENCE = 4.0  # number of estimates of rho from a successful trial to the next trial
+N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
@@ -149,7 +151,7 @@ def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[n
     """Return the initial `memory` of a pair of methods whose initial memories are `first` and `second`."""
     first, second = np.asarray(first), np.asarray(second)
     scalars = np.zeros(N_SCALARS)
-    scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, PATIENCE, first.size
+    scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, N_ESTIMATES_AFTER_SUCCESS, first.size
     directions = np.tile(initial_direction(n_q), 2)
     return np.concatenate([scalars, directions, first, second])
 
@@ -160,12 +162,12 @@ def _is_explicit(memory):
 
 
 @inlined
-def _history(memory):
+def _history_view(memory):
     return memory[HISTORY : HISTORY + N_PAST]
 
 
 @inlined
-def _memories(memory, n):
+def _memory_views(memory, n):
     begin_second = N_SCALARS + 2 * n + int(memory[FIRST_MEMORY])
     return memory[N_SCALARS + 2 * n : begin_second], memory[begin_second:]
 
@@ -189,7 +191,7 @@ def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
     displaced = V if by_v else Q
     for i in columns:
         displaced[i] += displacement * direction[i]
-    if evaluate_near(f, w, t, Q, V, A) != DONE:
+    if project_and_evaluate(f, w, t, Q, V, A) != DONE:
         return 0.0
     largest_change, displacement = 0.0, 0.0
     for i in columns:
@@ -213,17 +215,17 @@ def _largest_rate(f, w, memory, t, state, new_state):
     explicit = memory[PHASE] == EXPLICIT
     if explicit and f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
-    for _ in range(ITERATIONS):
+    for _ in range(N_POWER_ITERATIONS):
         squared = _power_iteration(f, w, t, state, by_q, False, Q, V, A)
-    for _ in range(ITERATIONS):
+    for _ in range(N_POWER_ITERATIONS):
         damping = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
-        if damping * memory[H_MEAN] < NEGLIGIBLE:
+        if damping * memory[H_MEAN] < NEGLIGIBLE_DAMPING:
             break
     for m in range(n):  # a component is zero if its coordinate was dependent in all estimates so far
         if by_q[m] == 0.0:
-            by_q[m] = SEED
+            by_q[m] = ZERO_REPLACEMENT
         if by_v[m] == 0.0:
-            by_v[m] = SEED
+            by_v[m] = ZERO_REPLACEMENT
     return max(np.sqrt(squared), damping)
 
 
@@ -236,7 +238,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
     for m in range(n):
         Q[m] = state[m] + dt * state[n + m]
         V[m] = state[n + m] + dt * state[2 * n + m]
-    if evaluate_near(f, w, t + dt, Q, V, A) != DONE:
+    if project_and_evaluate(f, w, t + dt, Q, V, A) != DONE:
         return np.inf
     for i in w.independent_v:
         fastest = max(fastest, abs(state[n + i]))
@@ -248,7 +250,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 
 @compiled
-def _is_quiet(w, tolerances, state, rate):
+def _has_small_vibrations(w, tolerances, state, rate):
     """Return whether a vibration of angular frequency `rate` (1/s) has velocities up to QUIET_FACTOR tolerances."""
     n = w.Q.size
     for i in w.independent_v:
@@ -259,7 +261,7 @@ def _is_quiet(w, tolerances, state, rate):
 
 
 @compiled
-def _cost(w, options):
+def _cost_of_run(w, options):
     """Return the cost of the run so far, in evaluations; a Jacobian counts as MATRIX_COST evaluations."""
     return w.counters[N_EVALUATIONS] + options[MATRIX_COST] * w.counters[N_JACOBIANS]
 
@@ -267,7 +269,7 @@ def _cost(w, options):
 @compiled
 def _cost_per_second(w, options, memory, t):
     """Return the cost of a second of motion since T_BEGIN, in evaluations of the first method; t: present time."""
-    cost_per_second = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
+    cost_per_second = (_cost_of_run(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
     return cost_per_second if _is_explicit(memory) else options[COST_RATIO] * cost_per_second
 
 
@@ -283,20 +285,20 @@ def _begin_phase(w, options, memory, phase, t):
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0
-    memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+    memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
     memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _evaluations_between_estimates(options, memory)
 
 
 @compiled
 def _judge_trial(w, options, memory, t):
     """Return the phase that follows a trial, EXPLICIT or IMPLICIT, or -1 while the trial continues; t: present time."""
-    if memory[STEPS] == N_UNTYPICAL:
-        memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-    if memory[STEPS] < N_UNTYPICAL + WINDOW:
+    if memory[STEPS] == N_UNMEASURED_STEPS:
+        memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
+    if memory[STEPS] < N_UNMEASURED_STEPS + N_MEASURED_STEPS:
         return -1
     cost_per_second = _cost_per_second(w, options, memory, t)
     is_kept = cost_per_second * MIN_GAIN <= memory[COST_PER_SECOND]
-    memory[WAIT] = PATIENCE if is_kept else 2.0 * memory[WAIT]
+    memory[WAIT] = N_ESTIMATES_AFTER_SUCCESS if is_kept else 2.0 * memory[WAIT]
     memory[ESTIMATES_TO_WAIT] = memory[WAIT]
     if memory[PHASE] == ON_TRIAL:
         return IMPLICIT if is_kept else EXPLICIT
@@ -308,7 +310,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     """Estimate rho and decide whether to try the other method; return the phase of the trial, or -1 for no trial."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
-    cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost(w, options)
+    cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
     memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _evaluations_between_estimates(options, memory)
     memory[ESTIMATES_TO_WAIT] -= 1.0
@@ -318,18 +320,18 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
     # a trial that may be in vain, or that needs finite differences, must cost little compared with the run so far
-    counted_cost, least_cost = cost, AFFORDED * TRIAL * options[COST_RATIO]
+    counted_cost, least_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
-        counted_cost = max(counted_cost, SHARE_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
+        counted_cost = max(counted_cost, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
     is_cheap = counted_cost > least_cost and (
         f.flags[FORCE_BY_Q_GIVEN] == 1 or counted_cost > MIN_COST_PER_COORDINATE * w.independent.size
     )
     is_hidden = False
-    if memory[PHASE] == EXPLICIT and is_cheap and h_rho > HIDDEN_FROM:
+    if memory[PHASE] == EXPLICIT and is_cheap and h_rho > MIN_HIDDEN_RATIO:
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-        is_hidden = _is_quiet(w, tolerances, state, memory[RATE])
+        is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
-            is_hidden = memory[RATE] > HIDDEN_RATIO * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
+            is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
     # a run of high cost starts a trial whatever the rates are: if friction is about to reverse, few states show the
     # largest rate. The condition on `cost` excludes the short steps at the start, when the expected cost is unknown
     costs_enough = (
@@ -352,7 +354,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
 
 
 @compiled
-def _clear(memory):
+def _clear_memory(memory):
     """Set a method's memory to zeros, as at the beginning of a run."""
     for i in range(memory.size):
         memory[i] = 0.0
@@ -361,7 +363,7 @@ def _clear(memory):
 @kernel(SETTLE)
 def settle_switching(f, w, options, memory, tolerances, accepted):
     """Commit or discard the attempted step in the memory of the active method, and count it if it is accepted."""
-    first, second = _memories(memory, w.Q.size)
+    first, second = _memory_views(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
     memory[MAY_ESTIMATE] = 0.0
     if _is_explicit(memory):
@@ -371,7 +373,7 @@ def settle_switching(f, w, options, memory, tolerances, accepted):
     if accepted:
         memory[STEPS] += 1.0
         memory[MAY_ESTIMATE] = 1.0
-        past = _history(memory)
+        past = _history_view(memory)
         past[H_BEFORE], past[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
 
 
@@ -382,9 +384,9 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     The memory of a method is cleared when this method becomes active. The step-size rule is that of the active method.
     """
     n = w.Q.size
-    first, second = _memories(memory, n)
+    first, second = _memory_views(memory, n)
     if np.isnan(memory[T_BEGIN]):  # this is the first step of a run, or the first after a singular position
-        memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+        memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
         memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + FIRST_ESTIMATE * options[COST_RATIO]
     if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:
         phase = -1
@@ -396,7 +398,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             was_explicit = _is_explicit(memory)
             _begin_phase(w, options, memory, phase, t)
             if was_explicit != _is_explicit(memory):
-                _clear(second if was_explicit else first)
+                _clear_memory(second if was_explicit else first)
     is_explicit = _is_explicit(memory)
     w.notes[EXPLICIT_STEP] = 1.0 if is_explicit else 0.0
     begin = N_OPTIONS + int(options[SIZE_1])
@@ -407,7 +409,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         # a step of fixed size that does not converge cannot be shortened: use the implicit method from now on
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC:
             _begin_phase(w, options, memory, IMPLICIT, t)
-            _clear(second)
+            _clear_memory(second)
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
@@ -425,7 +427,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error *= TRIAL_ERROR_FACTOR
     memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, rule[LEAST_ERROR])
     if factor == 0.0:
-        factor = factor_of(rule, _history(memory), h, error)
+        factor = step_size_ratio(rule, _history_view(memory), h, error)
     if not is_explicit:
         factor = min(factor, max(tolerances[GAP] / h, 1.0))
     return Attempt(DONE, error, factor)

@@ -7,7 +7,7 @@ step-size control of Taylor series is part of the code generated for the mechani
 import numpy as np
 
 from twoloop.kernels.control.loop_state import N_PAST, N_RULE
-from twoloop.kernels.control.step_size import factor_of, record_accepted
+from twoloop.kernels.control.step_size import record_accepted_step, step_size_ratio
 from twoloop.kernels.data.common import compiled, inlined, kernel, merged
 from twoloop.kernels.lanes.layout import (
     ACCEPTED,
@@ -65,7 +65,9 @@ ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 # error of a rejected step, in tolerances, above which a force is assumed to jump within the step, as in advance.py
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step, as in advance.py
-END_ROUNDING = 1e-10  # a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `off_grid`
+END_ROUNDING = (
+    1e-10  # a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `size_off_grid`
+)
 LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of a step that failed, as in `Plan`
 LIMIT_MEMORY = 10.0  # number of accepted steps after which H_LIMIT no longer applies, as in `Plan`
 LEAST_FIRST_STEP = 20.0 * SHORTEST  # smallest size of the first step, relative to |t0|
@@ -75,7 +77,7 @@ MOST_STEPS = 100_000  # largest number of steps of a run in a lane, where the us
 
 
 @inlined
-def _history(work, k):
+def _history_view(work, k):
     """Return a view (N_PAST) of the history of step-size control in lane k."""
     return work[PAST * LANES + N_PAST * k : PAST * LANES + N_PAST * (k + 1)]
 
@@ -184,12 +186,12 @@ def _accept_or_shorten(options, work, k):
     if error > SUDDEN_ERROR and not is_accepted:
         work[ROUGH_TO * LANES + k] = t + h
     error *= error_factor
-    past = _history(work, k)
-    h_proposed = min(h * factor_of(options, past, h, error), work[H_LIMIT * LANES + k])
+    past = _history_view(work, k)
+    h_proposed = min(h * step_size_ratio(options, past, h, error), work[H_LIMIT * LANES + k])
     if not is_accepted:
         work[H_NEXT * LANES + k] = min(h_proposed, MAX_RATIO_AFTER_REJECTION * h)
         return False
-    record_accepted(options, past, h, error)
+    record_accepted_step(options, past, h, error)
     work[H_NEXT * LANES + k] = max(h_proposed, work[H_FREE * LANES + k]) if h < work[H_FREE * LANES + k] else h_proposed
     work[LIMIT_AGE * LANES + k] += 1.0
     if work[LIMIT_AGE * LANES + k] > LIMIT_MEMORY:

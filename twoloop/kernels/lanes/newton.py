@@ -51,10 +51,10 @@ from twoloop.kernels.steps.stages import (
     N_EIGEN_SCALARS,
     N_REAL,
     OUTER_TOL,
-    VELOCITIES,
+    TESTS_VELOCITIES,
     count_systems,
     middle_node,
-    newton_options_at,
+    newton_options_index,
     tableau_of,
 )
 from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STEPS_TO_DECAY
@@ -95,7 +95,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 ) = range(15)
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # indices of the blocks (s, n), before the weights (s, s)
 # indices of the matrices (n, n), before the pivots; from SYSTEMS on, a real and an imaginary part for each system
-BY_Q, BY_V, SYSTEMS = range(3)
+DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
@@ -124,7 +124,7 @@ def _weights_at(memory, n, s):
 
 @merged
 def matrix_at(memory, n, s, index):
-    """Return the offset of a matrix (n, n) by an index such as BY_Q; those of system k are SYSTEMS + 2 k and + 1."""
+    """Return the offset of matrix (n, n) number `index`: DERIVATIVE_Q, DERIVATIVE_V, or SYSTEMS + 2 k for system k."""
     return _weights_at(memory, n, s) + s * s + index * n * n
 
 
@@ -158,7 +158,7 @@ def _evaluate_middle(code, settings, control, c, work, new, a, memory):
 
 @compiled
 def find_derivatives(code, settings, control, c, work):
-    """Store the derivatives BY_Q and BY_V of the accelerations in the middle of the step, in lanes with FINE = 1.
+    """Store the derivatives of the accelerations in the middle of the step by q and v, in lanes with FINE = 1.
 
     The middle is the time of a stage, because a force that acts only between two stages has no effect on the step.
     """
@@ -173,7 +173,7 @@ def find_derivatives(code, settings, control, c, work):
             index = (new + column) * LANES + k
             work[index] += RELATIVE_DISPLACEMENT * max(1.0, abs(work[index]))
         code.accelerate(order, control, work)
-        matrix = matrix_at(memory, n, s, BY_Q if column < n else BY_V) + column % n
+        matrix = matrix_at(memory, n, s, DERIVATIVE_Q if column < n else DERIVATIVE_V) + column % n
         for k in range(LANES):
             per_displacement = 1.0 / (work[(new + column) * LANES + k] - work[(middle + column) * LANES + k])
             for i in range(n):
@@ -186,10 +186,10 @@ def factor_systems_of_lanes(settings, method_options, s, work):
     """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one l of each complex pair."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, offset = count_systems(method_options, s), newton_options_at(s)
+    n_systems, offset = count_systems(method_options, s), newton_options_index(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
-    by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
+    by_q, by_v = matrix_at(memory, n, s, DERIVATIVE_Q), matrix_at(memory, n, s, DERIVATIVE_V)
     for system in range(n_systems):
         re, im = method_options[offset], method_options[offset + 1]
         offset += 2 + 4 * s
@@ -278,7 +278,7 @@ def _correct_stages(settings, method_options, s, work):
     """Store the corrections of the stage accelerations in CHANGES; add them to STAGES in lanes with ITERATING = 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, offset = count_systems(method_options, s), newton_options_at(s)
+    n_systems, offset = count_systems(method_options, s), newton_options_index(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
     scratch, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
@@ -413,7 +413,7 @@ def _allowed_error(control, work, state, new, j, entry, k):
 def _embedded_estimate(settings, method_options, A, work, memory):
     """Store the unfiltered error estimate of the embedded formula in E_Q and E_V."""
     n, s = settings[N], A.shape[0]
-    offset = newton_options_at(s)
+    offset = newton_options_index(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
     stage_rows, begin = table(work, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
     e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
@@ -437,9 +437,9 @@ def _embedded_estimate(settings, method_options, A, work, memory):
 def _filter_errors(settings, method_options, s, work, memory):
     """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), z = gamma0 H, where J is the Jacobian of (v, F)."""
     n = settings[N]
-    gamma0 = method_options[newton_options_at(s) + GAMMA0]
+    gamma0 = method_options[newton_options_index(s) + GAMMA0]
     e_q, e_v, scratch = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
-    by_q = matrix_at(memory, n, s, BY_Q)
+    by_q = matrix_at(memory, n, s, DERIVATIVE_Q)
     for i in range(n):
         for k in range(LANES):
             total = 0.0
@@ -514,7 +514,7 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
         has_large_error = has_large_error or error > 1.0
     if not has_large_error:
         return
-    by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
+    by_q, by_v = matrix_at(memory, n, s, DERIVATIVE_Q), matrix_at(memory, n, s, DERIVATIVE_V)
     matrix = matrix_at(memory, n, s, SYSTEMS)
     for i in range(n * n):
         for k in range(LANES):
@@ -539,12 +539,12 @@ def _estimate_error(settings, control, method_options, A, work):
     """Store in ERROR the error estimate, in units of the tolerances, with stiff components suppressed by filters."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    offset = newton_options_at(s)
+    offset = newton_options_index(s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
     _embedded_estimate(settings, method_options, A, work, memory)
     copy_vectors(work, e_v, vector_at(memory, n, UNFILTERED), n)
     _filter_errors(settings, method_options, s, work, memory)
-    tests_velocities = method_options[offset + VELOCITIES] == 1.0
+    tests_velocities = method_options[offset + TESTS_VELOCITIES] == 1.0
     fill_field(work, ERROR, 0.0)
     for j in range(n):
         atol, rtol = control[ATOL + j], control[RTOL]

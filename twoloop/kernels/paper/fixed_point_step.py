@@ -23,7 +23,7 @@ from twoloop.kernels.steps.stages import (
     INNER_TOL,
     MAX_STEP_RATIO,
     STAGES,
-    end_error,
+    estimate_end_error,
     interpolate,
     tableau_of,
 )
@@ -105,14 +105,16 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[at.HAS_TRIAL] = 1.0
     memory[at.H_TRIAL] = h
     if code == DONE and tolerances[ESTIMATE] == 1.0:
-        error = max(error, END_ERROR_WEIGHT * end_error(tolerances, options, h, state, new_state, trial))
+        error = max(error, END_ERROR_WEIGHT * estimate_end_error(tolerances, options, h, state, new_state, trial))
     return Attempt(code, max(error, distance), 0.0)
 
 
 RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # paper_step rejects a step if END_ERROR_WEIGHT `end_error` exceeds this; not part of the paper
+SUDDEN_ERROR = (
+    10.0  # paper_step rejects a step if END_ERROR_WEIGHT `estimate_end_error` exceeds this; not part of the paper
+)
 
 
 @kernel(ATTEMPT)
@@ -158,7 +160,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     if code == DONE and tolerances[ESTIMATE] == 1.0:
-        jump_error = END_ERROR_WEIGHT * end_error(tolerances, options, h, state, new_state, A_full)
+        jump_error = END_ERROR_WEIGHT * estimate_end_error(tolerances, options, h, state, new_state, A_full)
         if error <= 1.0 and jump_error > SUDDEN_ERROR:
             error = jump_error
     return Attempt(code, error, 0.0)

@@ -47,7 +47,7 @@ def _error_constants():
 
 # error constants at equal steps, which are lower bounds of those that are used: after a decrease of h, the constants of
 # unequal steps are smaller, and would underestimate the error if the force jumps
-EQUAL_STEPS = _error_constants()
+ERROR_CONSTANTS = _error_constants()
 
 # indices in `options`. THETA: a projection has converged when its last correction is at most THETA, see `project`
 THETA, N_OPTIONS = range(2)
@@ -69,10 +69,10 @@ PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 def memory_size(n_q: int) -> int:
     """Return the length of `memory` for n_q coordinates."""
-    return N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * _padded(n_q) + 2 * _padded(n_q)
+    return N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * _padded_size(n_q) + 2 * _padded_size(n_q)
 
 
-def _padded(n_q: int) -> int:
+def _padded_size(n_q: int) -> int:
     """Return n_q, rounded up to a multiple of 4."""
     return (n_q + 3) // 4 * 4
 
@@ -268,7 +268,7 @@ def _choose_order(memory, h, k, table, d, n):
             elif above < (0.5 * error if k == 1 else error):
                 order, expected = k + 1, above
     memory[NEXT_ORDER] = float(order)
-    error = max(error, h * EQUAL_STEPS[k] * v0)
+    error = max(error, h * ERROR_CONSTANTS[k] * v0)
     if not np.isfinite(error):
         return np.inf, 0.0
     if error > 1.0:

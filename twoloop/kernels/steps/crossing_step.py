@@ -310,7 +310,7 @@ def state_at(memory, options, t):
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
     fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
     weights = np.array(
-        [_lagrange(c, x) for x in (*(fraction * c), fraction)]
+        [_lagrange_values(c, x) for x in (*(fraction * c), fraction)]
     )  # values at the Gauss nodes of the interval from the beginning to t, then at t
     weights_v = fraction * b @ weights[:-1]
     weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
@@ -318,7 +318,7 @@ def state_at(memory, options, t):
     return np.concatenate([q, v, weights[-1] @ a])
 
 
-def _lagrange(c, x):
+def _lagrange_values(c, x):
     """Return the values (S) at x of the Lagrange polynomials of the nodes c (S)."""
     factors = (x - c) / (c[:, None] - c + np.eye(S))
     np.fill_diagonal(factors, 1.0)

@@ -44,14 +44,14 @@ from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor,
 from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import (
     EQUAL_STEP_TOLERANCE,
-    correct,
-    derivatives_at,
+    correct_stages,
     factor_filter,
     factor_systems,
+    fill_derivatives,
+    fill_tangent_by_q,
+    fill_tangent_by_v,
     filter_error,
     reduce_to_independents,
-    tangent_by_q,
-    tangent_by_v,
 )
 from twoloop.kernels.steps.stages import (
     DIAGONAL_OFFSET,
@@ -89,11 +89,15 @@ def _is_symmetric(A):
 
 
 @compiled
-def _fill_matrix(w, memory, n, m, z, H):
+def _fill_newton_matrix(w, memory, n, m, z, H):
     """Store T^T (M - z^2 K - z D) T in H (m^2 entries, row by row); m is the number of independent coordinates."""
-    N, Kr, Dr = matrix_storage(w, n, at.SYSTEMS), matrix_storage(w, n, at.BY_Q), matrix_storage(w, n, at.BY_V)
+    N, Kr, Dr = (
+        matrix_storage(w, n, at.SYSTEMS),
+        matrix_storage(w, n, at.DERIVATIVE_Q),
+        matrix_storage(w, n, at.DERIVATIVE_V),
+    )
     z2 = z * z
-    if memory[at.DAMPED] == 1.0:
+    if memory[at.HAS_DAMPING] == 1.0:
         for i in range(m * m):
             H[i] = N[i] - z2 * Kr[i] - z * Dr[i]
     else:
@@ -102,24 +106,26 @@ def _fill_matrix(w, memory, n, m, z, H):
 
 
 @compiled
-def factor_matrix(w, memory, z):
+def factor_newton_matrix(w, memory, z):
     """Factor T^T (M - z^2 K - z D) T, with z = gamma h and the tangents K and D computed last; return a code."""
     n, m = w.Q.size, w.independent.size
     storage = matrix_storage(w, n, at.FILTER)
     H = as_matrix(storage, m)
     w.counters[N_FACTORIZATIONS] += 1
-    _fill_matrix(w, memory, n, m, z, storage)
-    memory[at.SYMMETRIC] = 0.0
+    _fill_newton_matrix(w, memory, n, m, z, storage)
+    memory[at.IS_SYMMETRIC] = 0.0
     if _is_symmetric(H):
         if ldl_factor(H):
-            memory[at.SYMMETRIC] = 1.0
+            memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        _fill_matrix(w, memory, n, m, z, storage)  # L D L^T fails if the matrix is indefinite, as in a compressed beam
+        _fill_newton_matrix(
+            w, memory, n, m, z, storage
+        )  # L D L^T fails if the matrix is indefinite, as in a compressed beam
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
 
 @compiled
-def factor_iteration(f, w, memory, t, q, v, z):
+def compute_and_factor_matrix(f, w, memory, t, q, v, z):
     """Compute the tangents K and D at (t, q, v) and factor T^T (M - z^2 K - z D) T; return a code.
 
     The last evaluation must have been at (t, q, v), and w.lam must be the multipliers there.
@@ -130,35 +136,35 @@ def factor_iteration(f, w, memory, t, q, v, z):
     storage = matrix_storage(w, n, at.FILTER)
     K, R = storage.reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
     AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
-    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
+    code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
     if code == DONE:
         code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.BY_Q), m))
-    memory[at.DAMPED] = f.flags[FORCE_BY_V_GIVEN]
-    code = tangent_by_v(f, t, q, v, n - 1, K)
+    reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m))
+    memory[at.HAS_DAMPING] = f.flags[FORCE_BY_V_GIVEN]
+    code = fill_tangent_by_v(f, t, q, v, n - 1, K)
     if code != DONE:
         return code
-    if memory[at.DAMPED] == 1.0:
-        reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.BY_V), m))
+    if memory[at.HAS_DAMPING] == 1.0:
+        reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m))
     reduce_to_independents(w, w.M, AT, as_matrix(matrix_storage(w, n, at.SYSTEMS), m))
-    return factor_matrix(w, memory, z)
+    return factor_newton_matrix(w, memory, z)
 
 
 @compiled
-def _solve_iteration(w, memory, x):
-    """Replace the right-hand side x (n_dof) by the solution, with the factors that `factor_matrix` has computed."""
+def _solve_newton_system(w, memory, x):
+    """Replace the right-hand side x (n_dof) by the solution, with the factors computed by `factor_newton_matrix`."""
     m = x.size
     H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
-    if memory[at.SYMMETRIC] == 1.0:
+    if memory[at.IS_SYMMETRIC] == 1.0:
         ldl_solve(H, x)
     else:
         lu_solve(H, pivots_of(memory, 1, w.Q.size, 0), x)
 
 
 @compiled
-def solve_iteration(w, memory, residual, a):
+def correct_stage(w, memory, residual, a):
     """Replace `residual` (n_q) by the Newton correction of the accelerations a (n_q), and add the correction to a.
 
     Only the entries of independent coordinates are read and changed.
@@ -171,30 +177,30 @@ def solve_iteration(w, memory, residual, a):
         for j in range(m):
             total += N[i, j] * residual[w.independent[j]]
         x[i] = total
-    _solve_iteration(w, memory, x)
+    _solve_newton_system(w, memory, x)
     for i in range(m):
         residual[w.independent[i]] = x[i]
         a[w.independent[i]] += x[i]
 
 
 @compiled
-def filter_by_iteration(w, memory, z, e_q, e_v):
-    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with the factors of `factor_matrix`."""
+def filter_dense_error(w, memory, z, e_q, e_v):
+    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with the factors of `factor_newton_matrix`."""
     n = w.Q.size
     m = e_q.size
-    N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.BY_Q), m)
+    N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
     x = vector(memory, 1, n, at.V_MOVED)[:m]
     for i in range(m):
         total = 0.0
         for j in range(m):
             total += N[i, j] * e_v[j] + z * Kr[i, j] * e_q[j]
         x[i] = total
-    _solve_iteration(w, memory, x)
+    _solve_newton_system(w, memory, x)
     copy(x, e_v)
 
 
 MAX_ITERATIONS = 8  # number of Newton iterations after which a stage has failed
-GROWTH = 2.0  # ratio of successive corrections above which Newton's method has diverged
+DIVERGENCE_RATIO = 2.0  # ratio of successive corrections above which Newton's method has diverged
 LINEAR_FACTOR = 0.01  # factor on Newton's tolerance with derivatives by differences, which make convergence linear
 MAX_CONTRACTION = 0.1  # ratio of successive corrections above which derivatives by differences are computed anew
 VELOCITY_WEIGHT = 0.1  # weight, in the convergence test, of the position error that a correction of velocities causes
@@ -238,7 +244,7 @@ def has_dense_tangents(f, w):
 
 
 @merged
-def one_stage_of(options):
+def stages_at_once(options):
     """Return 1, the number of stages solved at once; with a literal 1, numba would compile newton_systems.py again."""
     return int(options[STAGES])
 
@@ -249,15 +255,15 @@ def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
-        memory[at.FRESH] = 1.0
+        memory[at.IS_FRESH] = 1.0
         memory[at.H_FACTORED] = 0.0
         if has_dense_tangents(f, w):
-            return factor_iteration(f, w, memory, t, Q, V, h * gamma_of(options))
-        code = derivatives_at(f, w, options, memory, one_stage_of(options), t, Q, V, F)
+            return compute_and_factor_matrix(f, w, memory, t, Q, V, h * gamma_of(options))
+        code = fill_derivatives(f, w, options, memory, stages_at_once(options), t, Q, V, F)
         if code != DONE:
             return code
     if abs(memory[at.H_FACTORED] - h) > EQUAL_STEP_TOLERANCE * h:
-        return factor_systems(f, w, options, memory, one_stage_of(options), h)
+        return factor_systems(f, w, options, memory, stages_at_once(options), h)
     return DONE
 
 
@@ -296,11 +302,11 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
             memory[at.HAS_JACOBIAN] = 0.0
             return code
         if has_dense_tangents(f, w):
-            solve_iteration(w, memory, residual[0], a)
+            correct_stage(w, memory, residual[0], a)
         else:
-            correct(f, w, options, memory, one_stage_of(options), residual, A_stage)
+            correct_stages(f, w, options, memory, stages_at_once(options), residual, A_stage)
         change = 0.0
-        weight = max(z / scale_q, VELOCITY_WEIGHT * min(memory[at.DURATION] / scale_q, 1.0 / scale_v))
+        weight = max(z / scale_q, VELOCITY_WEIGHT * min(memory[at.ERROR_DURATION] / scale_q, 1.0 / scale_v))
         for m in w.independent:
             change = max(change, z * abs(residual[0, m]) * weight)
         if not np.isfinite(change):
@@ -312,12 +318,12 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if has_tangents and change <= options[OUTER_TOL]:
             break
         if iteration > 0:
-            if contraction > GROWTH:
+            if contraction > DIVERGENCE_RATIO:
                 return OUTER_DIVERGED
             factor = 1.0 if has_tangents else LINEAR_FACTOR
             if contraction < 1.0 and contraction / (1.0 - contraction) * change <= factor * options[OUTER_TOL]:
                 break
-            if contraction > MAX_CONTRACTION and memory[at.FRESH] == 0.0:
+            if contraction > MAX_CONTRACTION and memory[at.IS_FRESH] == 0.0:
                 memory[at.HAS_JACOBIAN] = 0.0
         if iteration == MAX_ITERATIONS - 1:
             return OUTER_DIVERGED
@@ -334,11 +340,11 @@ N_FILTERS = 3
 
 # largest ratio of |sum_k jump_weights[k] a_k| to the range of the stage accelerations a_k that a single jump can cause:
 # at a smaller ratio, `_error_at_jumps` reduces its estimate in proportion
-MAX_JUMP_RATIO = 0.174
+MAX_RATIO_BY_ONE_JUMP = 0.174
 
 
 @compiled
-def _filter(f, w, options, memory, h, e_q, e_v):
+def _filter_errors(f, w, options, memory, h, e_q, e_v):
     """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, with the factors computed last.
 
     J is the Jacobian of (v, F) by (q_i, v_i). Only the first n_dof numbers of e_q and e_v (n_q) are read and changed.
@@ -346,19 +352,19 @@ def _filter(f, w, options, memory, h, e_q, e_v):
     z = h * gamma_of(options)
     n_dof = w.independent.size
     if has_dense_tangents(f, w):
-        filter_by_iteration(w, memory, z, e_q[:n_dof], e_v[:n_dof])
+        filter_dense_error(w, memory, z, e_q[:n_dof], e_v[:n_dof])
     else:
-        filter_error(f, w, options, memory, one_stage_of(options), h, e_q, e_v)
+        filter_error(f, w, options, memory, stages_at_once(options), h, e_q, e_v)
     for i in range(n_dof):
         e_q[i] += z * e_v[i]
 
 
 @compiled
 def _factor_filter(f, w, options, memory, h):
-    """Factor the matrix that `_filter` needs for errors of steps of size h; return a code."""
+    """Factor the matrix that `_filter_errors` needs for errors of steps of size h; return a code."""
     if has_dense_tangents(f, w):
-        return factor_matrix(w, memory, h * gamma_of(options))
-    return factor_filter(f, w, options, memory, one_stage_of(options), h)
+        return factor_newton_matrix(w, memory, h * gamma_of(options))
+    return factor_filter(f, w, options, memory, stages_at_once(options), h)
 
 
 @compiled
@@ -389,17 +395,17 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
     if code != DONE:
         return code
     multipliers(f, w, t, Q, V, F, w.lam)
-    code = derivatives_at(f, w, options, memory, one_stage_of(options), t, Q, V, F)
+    code = fill_derivatives(f, w, options, memory, stages_at_once(options), t, Q, V, F)
     if code == DONE:
-        code = factor_systems(f, w, options, memory, one_stage_of(options), h)
+        code = factor_systems(f, w, options, memory, stages_at_once(options), h)
     if code == DONE:
         memory[at.HAS_JACOBIAN] = 1.0
-        memory[at.FRESH] = 0.0
+        memory[at.IS_FRESH] = 0.0
     return code
 
 
 @compiled
-def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
+def _estimate_error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
     """Return the largest component of the error estimate of `_store_weighted_sums`, in units of the tolerances.
 
     The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If the derivatives are
@@ -414,26 +420,26 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
     z = h * gamma_of(options)
     _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
     copy(e_v, unfiltered)
-    _filter(f, w, options, memory, h, e_q, e_v)
+    _filter_errors(f, w, options, memory, h, e_q, e_v)
     if f.flags[FORCE_BY_Q_GIVEN] == 0 and not derivatives_agree(
         f, w, options, memory, 1, t + h, z, tolerances, unfiltered, e_q, e_v, state, new_state, A_stage[-1]
     ):
-        memory[at.CHANGED] = 1.0
+        memory[at.DERIVATIVES_RENEWED] = 1.0
         if _renew_derivatives(f, w, options, memory, t + h, h, new_state) != DONE:
             return np.inf
         _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
         copy(e_v, unfiltered)
-        _filter(f, w, options, memory, h, e_q, e_v)
+        _filter_errors(f, w, options, memory, h, e_q, e_v)
     error = 0.0
     for i in range(n_dof):
         j = w.independent[i]
         scale = allowed(tolerances, j, q[j], q1[j])
         error = max(error, abs(e_q[i]) / scale)
-        if options[NEWTON_OFFSET + at.VELOCITIES] == 1.0:
+        if options[NEWTON_OFFSET + at.TESTS_VELOCITIES] == 1.0:
             scale = allowed(tolerances, j, v[j], v1[j])
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, filtered_once)
-    _filter(f, w, options, memory, h, e_q, e_v)
+    _filter_errors(f, w, options, memory, h, e_q, e_v)
     return max(
         error,
         filtered_velocity_error(
@@ -446,11 +452,11 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
 def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
     """Replace (q1, v1), the state at the end of the step, by the result of the embedded formula.
 
-    On entry, E_Q and E_V in `memory` must be the difference of the two formulas, filtered twice by `_error`.
+    On entry, E_Q and E_V in `memory` must be the difference of the two formulas, filtered twice by `_estimate_error`.
     """
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, N_FILTERS):
-        _filter(f, w, options, memory, h, e_q, e_v)
+        _filter_errors(f, w, options, memory, h, e_q, e_v)
     for i in range(w.independent.size):
         q1[w.independent[i]] -= e_q[i]
         v1[w.independent[i]] -= e_v[i]
@@ -465,7 +471,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
     max_duration = motion_time(w, tolerances, state, state[2 * n :])
-    if memory[at.CHANGED] == 1.0:
+    if memory[at.DERIVATIVES_RENEWED] == 1.0:
         max_duration = max(max_duration, motion_time(w, tolerances, state, A_stage[-1]))
     error = velocity_error(w, tolerances, e_v, max_duration, state, new_state)
     if error <= 1.0:
@@ -474,7 +480,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
         e_q[i] = 0.0
     h_longer = STEPS_TO_DECAY * h / gamma_of(options)
     if _factor_filter(f, w, options, memory, h_longer) == DONE:
-        _filter(f, w, options, memory, h_longer, e_q, e_v)
+        _filter_errors(f, w, options, memory, h_longer, e_q, e_v)
         # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
         error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     memory[at.H_FACTORED] = 0.0
@@ -503,8 +509,10 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
         return 0.0
     if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
-    factor = min(1.0, deviation / (MAX_JUMP_RATIO * widest))
-    error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, jump_weights, factor)
+    factor = min(1.0, deviation / (MAX_RATIO_BY_ONE_JUMP * widest))
+    error = _estimate_error(
+        f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, jump_weights, factor
+    )
     if error <= 1.0:
         error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage))
     return error
@@ -517,7 +525,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
         s = int(options[DIAGONAL_OFFSET])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
         copy(A_stage[s - 1], a_end)  # not F at the last stage, which contains Newton's residual times the stiffness
-        memory[at.FRESH] = 0.0
+        memory[at.IS_FRESH] = 0.0
 
 
 @kernel(ATTEMPT, vectorized=True)
@@ -537,7 +545,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
         memory[at.HAS_JACOBIAN] = 0.0
         copy(a, a_end)
-    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > MAX_CONTRACTION:
+    if memory[at.IS_FRESH] == 0.0 and memory[at.CONTRACTION] > MAX_CONTRACTION:
         memory[at.HAS_JACOBIAN] = 0.0
     copy(v, V_stage[0])
     copy(a_end, A_stage[0])
@@ -553,7 +561,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             v_bar[m] = v[m] + h * sum_v
         copy(A_stage[j - 1], A_stage[j])
         code = solve_stage(f, w, options, memory, t + c[j] * h, h, A_stage[j : j + 1])
-        if code != DONE and memory[at.FRESH] == 0.0:
+        if code != DONE and memory[at.IS_FRESH] == 0.0:
             memory[at.HAS_JACOBIAN] = 0.0
             copy(A_stage[j - 1], A_stage[j])
             code = solve_stage(f, w, options, memory, t + c[j] * h, h, A_stage[j : j + 1])
@@ -567,9 +575,11 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     for m in w.independent:
         q1[m] = Q[m]
     error = 0.0
-    memory[at.CHANGED] = 0.0
+    memory[at.DERIVATIVES_RENEWED] = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, 1.0)
+        error = _estimate_error(
+            f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, 1.0
+        )
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
         if options[options.size - 1] == 1.0:

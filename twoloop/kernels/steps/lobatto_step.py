@@ -18,7 +18,7 @@ import math
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.control.singular_positions import COLLAPSED, SHORT_STEP, SINGULAR_PIVOT
-from twoloop.kernels.control.step_size import count_step, departure, off_grid, store_prediction
+from twoloop.kernels.control.step_size import count_step, departure, size_off_grid, store_prediction
 from twoloop.kernels.data import collocation as field
 from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REFUSED, places
 from twoloop.kernels.data.common import (
@@ -89,18 +89,18 @@ _offsets = merged(places)
 
 
 def memory_size(n, n_iterated, n_rows):
-    """Return the length of `memory` for n coordinates, with LANES more numbers for the alignment by `_aligned`."""
+    """Return the length of `memory` for n coordinates, with LANES more numbers for the alignment by `_aligned_view`."""
     return places(n, n_iterated, n_rows)[-1] + LANES
 
 
 @inlined
-def _aligned(memory):
+def _aligned_view(memory):
     """Return a view of `memory` that begins at its first address divisible by the size of LANES numbers."""
     return memory[(-(memory.ctypes.data >> 3)) & (LANES - 1) :]
 
 
 @merged
-def _predict_from_rejected(f, data, state):
+def _reuse_rejected_polynomial(f, data, state):
     """Update `data` so that the polynomial of a step rejected for its error predicts the shorter repeated step."""
     f.retry_nodes(data, state)
     if data[field.KEPT_DEGREE] == 0.0:
@@ -138,7 +138,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         return CONVERGED, 0.0, 1.0
     error = data[field.ERROR]
     if not error <= 1.0:
-        _predict_from_rejected(f, data, state)
+        _reuse_rejected_polynomial(f, data, state)
         return REFUSED, error, min(max(0.9 * data[field.FACTOR_OF_ERROR], 0.3), 0.9)
     max_factor = GROWTH_EARLY if data[field.N_STEPS] < N_EARLY else GROWTH
     if max_factor > GROWTH and n_sweeps == 1:
@@ -150,7 +150,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
             return NOT_COMPUTED, 2.0, DIVERGED_FACTOR
         factor_by_defect = 0.9 * data[field.FACTOR_OF_DEFECT]
         if defect > 1.0:
-            _predict_from_rejected(f, data, state)
+            _reuse_rejected_polynomial(f, data, state)
             return REFUSED, defect, max(0.3, factor_by_defect)
         data[field.DEFECT] = defect
         max_factor = min(max_factor, factor_by_defect)
@@ -191,7 +191,7 @@ def _is_unsuited(w, data, tolerances):
 
 
 @compiled
-def _is_singular_within(f, w, t, h, state, new_state):
+def _passes_singular_position(f, w, t, h, state, new_state):
     """Return whether the smallest pivot of C_q within a step is below MIN_PIVOT_RATIO times that at the beginning.
 
     Another method then has to cross the singular position, near which stages that violate the constraints have wrong
@@ -212,7 +212,7 @@ def _is_singular_within(f, w, t, h, state, new_state):
 @kernel(SETTLE)
 def settle_lobatto(f, w, options, memory, tolerances, accepted):
     """Update `memory` so that the polynomial of an accepted attempt predicts the next step; discard a rejected one."""
-    data = _aligned(memory)
+    data = _aligned_view(memory)
     if accepted and data[field.TRIED] == 1.0:
         _accept_polynomial(data)
     data[field.TRIED] = 0.0
@@ -221,7 +221,7 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
 @kernel(ATTEMPT)
 def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt one step of size h, and project its end onto the constraints."""
-    data, n = _aligned(memory), w.Q.size
+    data, n = _aligned_view(memory), w.Q.size
     data[field.TRIED] = 0.0
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, data, tolerances):
         return Attempt(UNSUITED, math.inf, 0.0)
@@ -240,7 +240,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
     if code == DONE and error <= 1.0 and w.notes[NEARLY_SINGULAR] == 1.0 and tolerances[ESTIMATE] == 1.0:
         w.notes[NEAR_NOW] = 2.0  # 2: `check_partition` renews the partition, and checks its pivots, after the step
-        if _is_singular_within(f, w, t, h, state, new_state):
+        if _passes_singular_position(f, w, t, h, state, new_state):
             code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)
 
@@ -324,7 +324,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
         h_wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
         if not _can_take_next_step(w, data, tolerances, control, clock, h_wanted):
             break
-        h, reaches_goal = off_grid(control, t, h_wanted, goal - t, False)
+        h, reaches_goal = size_off_grid(control, t, h_wanted, goal - t, False)
         if reaches_goal:
             h = goal - t
         result, _, factor = _solve_collocation(f, w, options, data, tolerances, t, h, state)
@@ -355,7 +355,7 @@ def lobatto_steps(
     A group of steps ends when the run's number of accepted steps is a multiple of LANES, so that the results do not
     depend on the times at which the integrator pauses.
     """
-    data, n = _aligned(memory), w.Q.size
+    data, n = _aligned_view(memory), w.Q.size
     if out_t.size < LANES or w.notes[NEARLY_SINGULAR] == 1.0:
         return 0
     if control[at.FIRST_GIVEN] == 1.0:

@@ -23,10 +23,10 @@ from twoloop.kernels.steps.newton_systems import (
     EQUAL_STEP_TOLERANCE,
     MAX_ITERATIONS,
     MAX_ROUNDING_CORRECTION,
-    correct,
-    derivatives_at,
+    correct_stages,
     factor_filter,
     factor_systems,
+    fill_derivatives,
     filter_error,
 )
 from twoloop.kernels.steps.stages import (
@@ -37,7 +37,7 @@ from twoloop.kernels.steps.stages import (
     block,
     interpolate,
     middle_node,
-    newton_options_at,
+    newton_options_index,
     tableau_of,
     vector,
 )
@@ -90,7 +90,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
             for m in w.independent:
                 scale_q = max(scale_q, abs(Q_stage[j, m]))
                 scale_v = max(scale_v, abs(V_stage[j, m]))
-        correct(f, w, options, memory, s, residual, A_stage)
+        correct_stages(f, w, options, memory, s, residual, A_stage)
         largest_q, largest_v = 0.0, 0.0
         for j in range(s):
             change_q, change_v = Q_stage[j], V_stage[j]  # reused as scratch
@@ -125,7 +125,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 
 @compiled
-def _filter(f, w, options, memory, h, e_q, e_v):
+def _filter_errors(f, w, options, memory, h, e_q, e_v):
     """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma0 and the Jacobian J of (v, F) by (q_i, v_i).
 
     Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
@@ -134,7 +134,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
     m = w.independent.size
     filter_error(f, w, options, memory, s, h, e_q, e_v)
     for i in range(m):
-        e_q[i] += h * options[newton_options_at(s) + at.GAMMA0] * e_v[i]
+        e_q[i] += h * options[newton_options_index(s) + at.GAMMA0] * e_v[i]
 
 
 @compiled
@@ -143,7 +143,7 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
-    offset = newton_options_at(s)
+    offset = newton_options_index(s)
     gamma0 = options[offset + at.GAMMA0]
     e = options[offset + at.N_EIGEN_SCALARS : offset + at.N_EIGEN_SCALARS + s]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
@@ -161,17 +161,17 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
         e_q[i] = h * sum_q
         e_v[i] = h * sum_v
     copy(e_v, unfiltered)
-    _filter(f, w, options, memory, h, e_q, e_v)
+    _filter_errors(f, w, options, memory, h, e_q, e_v)
     error = 0.0
     for i in range(w.independent.size):
         j = w.independent[i]
         error = max(error, abs(e_q[i]) / allowed(tolerances, j, q[j], q1[j]))
-        if options[offset + at.VELOCITIES] == 1.0:
+        if options[offset + at.TESTS_VELOCITIES] == 1.0:
             error = max(error, abs(e_v[i]) / allowed(tolerances, j, v[j], v1[j]))
-    if options[offset + at.VELOCITIES] == 1.0:
+    if options[offset + at.TESTS_VELOCITIES] == 1.0:
         return error
     copy(e_v, filtered_once)
-    _filter(f, w, options, memory, h, e_q, e_v)
+    _filter_errors(f, w, options, memory, h, e_q, e_v)
     error = max(
         error,
         filtered_velocity_error(w, memory, tolerances, h * gamma0, unfiltered, filtered_once, e_v, state, new_state, a),
@@ -190,7 +190,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     has an effect of at most 1. E_Q, E_V and the factors of the filter are overwritten.
     """
     s, n = int(options[STAGES]), w.Q.size
-    z = STEPS_TO_DECAY * h / options[newton_options_at(s) + at.GAMMA0]
+    z = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
     max_duration = motion_time(w, tolerances, state, state[2 * n :])
     error = velocity_error(w, tolerances, e_v, max_duration, state, new_state)
@@ -212,7 +212,7 @@ def settle_newton(f, w, options, memory, tolerances, accepted):
     """Store the stage accelerations of an accepted step, from which the next step predicts its own."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted:
-        memory[at.FRESH] = 0.0
+        memory[at.IS_FRESH] = 0.0
         if memory[at.HAS_TRIAL] == 1.0:
             for j in range(s):
                 copy(block(memory, s, n, at.TRIAL)[j], block(memory, s, n, at.PREVIOUS)[j])
@@ -234,7 +234,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if memory[at.PARTITION_NUMBER] != w.notes[GENERATION]:
         memory[at.HAS_JACOBIAN] = 0.0
         memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
-    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > SLOW_CONTRACTION:
+    if memory[at.IS_FRESH] == 0.0 and memory[at.CONTRACTION] > SLOW_CONTRACTION:
         memory[at.HAS_JACOBIAN] = 0.0
     node = middle_node(c)
     while True:
@@ -249,11 +249,11 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
             multipliers(f, w, t + dt, q_mid, v_mid, a_mid, w.lam)
-            code = derivatives_at(f, w, options, memory, s, t + dt, q_mid, v_mid, a_mid)
+            code = fill_derivatives(f, w, options, memory, s, t + dt, q_mid, v_mid, a_mid)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
             memory[at.HAS_JACOBIAN] = 1.0
-            memory[at.FRESH] = 1.0
+            memory[at.IS_FRESH] = 1.0
             memory[at.H_FACTORED] = 0.0
         if abs(memory[at.H_FACTORED] - h) > EQUAL_STEP_TOLERANCE * h:
             code = factor_systems(f, w, options, memory, s, h)
@@ -269,11 +269,11 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         code = _solve_stages(f, w, options, memory, t, h, tolerances, q, v, trial)
         if code == DONE:
             break
-        if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
+        if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
         # the state extrapolated to the middle stage may be wrong, for example if friction is not stiff in this state:
         # repeat with derivatives at the beginning of the step
-        if memory[at.FRESH] == 1.0:
+        if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0
     for m in range(n):

@@ -68,12 +68,12 @@ from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
 from twoloop.kernels.linalg.symbolic_factorization import N_OF_MASS, N_OFF, N_PIVOTS, jacobian_of, mass_of
 from twoloop.kernels.steps.stages import (
     A_NEW,
-    BY_Q,
-    BY_V,
-    DAMPED,
+    DERIVATIVE_Q,
+    DERIVATIVE_V,
     FILTER,
     GAMMA0,
     H_FACTORED,
+    HAS_DAMPING,
     INNER_TOL,
     N_EIGEN_SCALARS,
     N_REAL,
@@ -86,7 +86,7 @@ from twoloop.kernels.steps.stages import (
     complex_vector,
     count_systems,
     matrix_storage,
-    newton_options_at,
+    newton_options_index,
     pivots_of,
     system_storage,
     vector,
@@ -99,17 +99,19 @@ EQUAL_STEP_TOLERANCE = 1e-9
 MAX_ROUNDING_CORRECTION = 0.1
 
 RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to max(1, |value|)
-# if all coordinates are displaced at once, the displacement of coordinate i gets the factor 1 + UNEQUAL (i mod
-# N_UNEQUAL), because the effects of equal displacements might cancel each other
-UNEQUAL, N_UNEQUAL = 0.37, 7
+# if all coordinates are displaced at once, the displacement of coordinate i is multiplied by
+# 1 + DISPLACEMENT_INCREMENT * (i % N_INCREMENTS), because the effects of equal displacements might cancel each other
+DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
 
 # --- tangents K and D, of which only the band |i - j| <= b is computed and read
 
 
 @inlined
 def displace_unequally(value, index):
-    """Return a coordinate or velocity `value` plus a displacement that depends on its `index`, see UNEQUAL."""
-    return value + RELATIVE_DISPLACEMENT * max(1.0, abs(value)) * (1.0 + UNEQUAL * (index % N_UNEQUAL))
+    """Return `value` plus a displacement that depends on the `index` of the coordinate, see DISPLACEMENT_INCREMENT."""
+    return value + RELATIVE_DISPLACEMENT * max(1.0, abs(value)) * (
+        1.0 + DISPLACEMENT_INCREMENT * (index % N_INCREMENTS)
+    )
 
 
 @compiled
@@ -132,7 +134,7 @@ def _check_band_finite(A, b):
 
 @compiled
 def _has_jacobian_changed(f, w, t, q):
-    """Store C_q at (t, q) in w.Gx; return whether w.Gx then differs from w.G."""
+    """Store C_q at (t, q) in w.Gx; return whether it differs from C_q in w.G."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -143,7 +145,7 @@ def _has_jacobian_changed(f, w, t, q):
 
 
 @compiled
-def _subtract_reaction_differences(f, w, t, q, moved, b, K):
+def _subtract_reaction_tangent(f, w, t, q, moved, b, K):
     """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K (n_q, n_q) with |i - j| <= b.
 
     w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... are displaced at once. `moved` (n_q) is scratch.
@@ -168,7 +170,7 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
 
 
 @compiled
-def tangent_by_q(f, w, t, q, v, b, moved, K, R):
+def fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
     """Store the entries with |i - j| <= b of d(Q - C_q^T lam)/dq at (t, q, v) in K (n_q, n_q); return a code.
 
     The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
@@ -182,12 +184,12 @@ def tangent_by_q(f, w, t, q, v, b, moved, K, R):
             for j in range(max(0, i - b), min(q.size, i + b + 1)):
                 K[i, j] -= R[i, j]
     else:
-        _subtract_reaction_differences(f, w, t, q, moved, b, K)
+        _subtract_reaction_tangent(f, w, t, q, moved, b, K)
     return _check_band_finite(K, b)
 
 
 @compiled
-def tangent_by_v(f, t, q, v, b, D):
+def fill_tangent_by_v(f, t, q, v, b, D):
     """Store the entries with |i - j| <= b of dQ/dv in D (n_q, n_q), if the system provides them; return a code."""
     if f.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
@@ -223,43 +225,43 @@ def reduce_to_independents(w, A, AT, B):
 
 
 @compiled
-def _fill_dense_from_tangents(f, w, memory, s, t, q, v):
+def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
     """Store J_q and J_v, computed from K and D at (t, q, v), the last evaluated state, in w.matrices; return a code."""
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
     # K (later D), T^T M T and the products A T overwrite factors of earlier matrices, which are no longer needed
     K, R = as_matrix(matrix_storage(w, n, FILTER), n), as_matrix(matrix_storage(w, n, SYSTEMS), n)
-    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
+    code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
         return code
     AT = matrix_storage(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
     code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
+    Jq, Jv = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, DERIVATIVE_V), m)
     N = as_matrix(matrix_storage(w, n, SYSTEMS), m)
     reduce_to_independents(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
     reduce_to_independents(w, K, AT, Jq)
     ldl_solve_rows(N, Jq)
-    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
-    code = tangent_by_v(f, t, q, v, n - 1, K)
-    if code == DONE and memory[DAMPED] == 1.0:
+    memory[HAS_DAMPING] = f.flags[FORCE_BY_V_GIVEN]
+    code = fill_tangent_by_v(f, t, q, v, n - 1, K)
+    if code == DONE and memory[HAS_DAMPING] == 1.0:
         reduce_to_independents(w, K, AT, Jv)
         ldl_solve_rows(N, Jv)
     return code
 
 
 @compiled
-def _fill_dense_derivatives(f, w, options, memory, s, t, q, v, a):
+def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
     """Store J_q and J_v in w.matrices; return a code. (t, q, v, a): last evaluated state and its accelerations."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
-        return _fill_dense_from_tangents(f, w, memory, s, t, q, v)
+        return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
-    Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
+    Jq, Jv = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, DERIVATIVE_V), m)
     q_moved, v_moved = vector(memory, s, n, Q_MOVED), vector(memory, s, n, V_MOVED)
     a_new = vector(memory, s, n, A_NEW)
     w.counters[N_JACOBIANS] += 1
@@ -283,11 +285,11 @@ def _fill_dense_derivatives(f, w, options, memory, s, t, q, v, a):
     code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
     if code != DONE:
         return code
-    memory[DAMPED] = 0.0
+    memory[HAS_DAMPING] = 0.0
     for i in w.independent:
         if a_new[i] != a[i]:
-            memory[DAMPED] = 1.0
-    if memory[DAMPED] == 0.0:
+            memory[HAS_DAMPING] = 1.0
+    if memory[HAS_DAMPING] == 0.0:
         return DONE
     for column in range(m):
         j = w.independent[column]
@@ -305,11 +307,11 @@ def _fill_dense_derivatives(f, w, options, memory, s, t, q, v, a):
 
 
 @compiled
-def _factor_dense(w, memory, s, which, z, matrix):
-    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, the pivots in pivots_of(..., `which`); return a code."""
+def _factor_dense_matrix(w, memory, s, which, z, matrix):
+    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, and their pivots as number `which`; return a code."""
     n, m = w.Q.size, w.independent.size
-    Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
-    damped = memory[DAMPED] == 1.0
+    Jq, Jv = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, DERIVATIVE_V), m)
+    damped = memory[HAS_DAMPING] == 1.0
     for i in range(m):
         for j in range(m):
             matrix[i, j] = -z * z * Jq[i, j]
@@ -320,12 +322,12 @@ def _factor_dense(w, memory, s, which, z, matrix):
 
 
 @compiled
-def _filter_dense(w, options, memory, s, h, e_q, e_v):
+def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
     """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
     n = w.Q.size
     m = e_q.size
-    gamma0 = options[newton_options_at(s) + GAMMA0]
-    Jq = as_matrix(matrix_storage(w, n, BY_Q), m)
+    gamma0 = options[newton_options_index(s) + GAMMA0]
+    Jq = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m)
     for i in range(m):
         total = 0.0
         for j in range(m):
@@ -338,19 +340,19 @@ def _filter_dense(w, options, memory, s, h, e_q, e_v):
 
 
 @inlined
-def _band(numbers, n, b):
-    """Return a view (n, 2 b + 1) of `numbers`, which store K or D: its element [i, b + j - i] is the entry (i, j)."""
+def _band_view(numbers, n, b):
+    """Return a view (n, 2 b + 1) of `numbers`, which store K or D; its element [i, b + j - i] is K[i, j] or D[i, j]."""
     return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
 
 
 @inlined
-def _border(w, n, r, b):
-    """Return views of three arrays, stored after K, for the state at which K was computed.
+def _border_views(w, n, r, b):
+    """Return views of three arrays stored after K: independent rows of C_q (r, n), D (n - r + 1, r), and indices (r).
 
-    The arrays are the independent rows of C_q (r, n), a copy of w.D (n - r + 1, r), and the indices (r) of the
-    dependent coordinates to which the columns of w.D belong.
+    C_q and D, a copy of w.D, belong to the state at which K was computed; the indices are those of the dependent
+    coordinates to which the columns of D belong.
     """
-    numbers = matrix_storage(w, n, BY_Q)
+    numbers = matrix_storage(w, n, DERIVATIVE_Q)
     start = n * (2 * b + 1)
     Cq = numbers[start : start + r * n].reshape((r, n))
     start += r * n
@@ -374,7 +376,7 @@ def _update_banded_residual(f, w, t, q, v):
 
 @compiled
 def _fill_band_by_differences(f, w, t, q, v, by_v, base, moved, b, band):
-    """Store K, or D if `by_v`, in `band` (n_q, 2 b + 1), computed by differences; return DONE or NOT_FINITE.
+    """Store K, or D if `by_v`, computed by differences, in `band` (n_q, 2 b + 1); return DONE or NOT_FINITE.
 
     Columns j, j + 2 b + 1, ... are computed at once. `base` (n_q) is the residual at (q, v); `moved` (n_q) is scratch.
     """
@@ -399,7 +401,7 @@ def _fill_band_by_differences(f, w, t, q, v, by_v, base, moved, b, band):
 
 @compiled
 def _copy_band(A, b, band):
-    """Copy the entries of A (n, n) with |i - j| <= b to `band` (n, 2 b + 1), see `_band`."""
+    """Copy the entries of A (n, n) with |i - j| <= b to `band` (n, 2 b + 1), see `_band_view`."""
     n = A.shape[0]
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
@@ -407,28 +409,28 @@ def _copy_band(A, b, band):
 
 
 @compiled
-def _fill_band_from_tangents(f, w, memory, s, t, q, v, b):
+def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
     """Store the tangents K and D at (t, q, v), the last evaluated state, as bands in w.matrices; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, FILTER).reshape((n, n)), matrix_storage(w, n, SYSTEMS).reshape((n, n))
-    code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
+    code = fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
         return code
-    _copy_band(K, b, _band(matrix_storage(w, n, BY_Q), n, b))
-    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
-    code = tangent_by_v(f, t, q, v, b, K)
-    if memory[DAMPED] == 1.0:
-        _copy_band(K, b, _band(matrix_storage(w, n, BY_V), n, b))
+    _copy_band(K, b, _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b))
+    memory[HAS_DAMPING] = f.flags[FORCE_BY_V_GIVEN]
+    code = fill_tangent_by_v(f, t, q, v, b, K)
+    if memory[HAS_DAMPING] == 1.0:
+        _copy_band(K, b, _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b))
     return code
 
 
 @compiled
-def _fill_banded_derivatives(f, w, memory, s, t, q, v):
+def _fill_banded_tangents(f, w, memory, s, t, q, v):
     """Store K, D (as bands) and the border in w.matrices; return a code. (t, q, v) is the last evaluated state."""
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
-    Cq, D, columns = _border(w, n, w.rows.size, b)
+    Cq, D, columns = _border_views(w, n, w.rows.size, b)
     for i in range(w.rows.size):
         copy(w.G[w.rows[i]], Cq[i])
     code = find_tangents(f, w, t, q)
@@ -437,35 +439,39 @@ def _fill_banded_derivatives(f, w, memory, s, t, q, v):
     copy_matrix(w.D, D)
     copy(columns_of(w.index), columns)
     if f.flags[FORCE_BY_Q_GIVEN] == 1:
-        return _fill_band_from_tangents(f, w, memory, s, t, q, v, b)
+        return _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b)
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
     _update_banded_residual(f, w, t, q, v)
     copy(w.Q, base)
-    code = _fill_band_by_differences(f, w, t, q, v, False, base, moved, b, _band(matrix_storage(w, n, BY_Q), n, b))
+    code = _fill_band_by_differences(
+        f, w, t, q, v, False, base, moved, b, _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b)
+    )
     if code != DONE:
         return code
     # displace all velocities at once: if this does not change the residual, D is zero
     for j in range(n):
         moved[j] = displace_unequally(v[j], j)
     _update_banded_residual(f, w, t, q, moved)
-    memory[DAMPED] = 0.0
+    memory[HAS_DAMPING] = 0.0
     for i in range(n):
         if w.Q[i] != base[i]:
-            memory[DAMPED] = 1.0
-    if memory[DAMPED] == 0.0:
+            memory[HAS_DAMPING] = 1.0
+    if memory[HAS_DAMPING] == 0.0:
         return DONE
-    return _fill_band_by_differences(f, w, t, q, v, True, base, moved, b, _band(matrix_storage(w, n, BY_V), n, b))
+    return _fill_band_by_differences(
+        f, w, t, q, v, True, base, moved, b, _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b)
+    )
 
 
 @compiled
-def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
-    """Store the factors of M - z^2 K - z D with the border C_q in `numbers`; return a code.
+def _factor_banded_matrix(w, memory, s, b, which, z, numbers, factorize, substitute):
+    """Store the factors of M - z^2 K - z D with the border C_q in `numbers`, and their pivots; return a code.
 
-    The pivots are stored in pivots_of(..., `which`); `factorize` and `substitute` are LAPACK routines, real or complex.
+    `which` is the number of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
     """
     n = w.Q.size
-    K, D = _band(matrix_storage(w, n, BY_Q), n, b), _band(matrix_storage(w, n, BY_V), n, b)
-    damped = memory[DAMPED] == 1.0
+    K, D = _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b), _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b)
+    damped = memory[HAS_DAMPING] == 1.0
     band = lu_band(numbers, n, b)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
@@ -473,7 +479,7 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
             if damped:
                 value -= z * D[i, b + j - i]
             band[j, 2 * b + i - j] = value
-    Cq, _, _ = _border(w, n, w.rows.size, b)
+    Cq, _, _ = _border_views(w, n, w.rows.size, b)
     return factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, which), factorize, substitute)
 
 
@@ -481,7 +487,7 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
 def _multiply_by_T(w, b, x, X):
     """Store T x[:n_dof] in X (n_q)."""
     n_dof = w.independent.size
-    _, D, columns = _border(w, w.Q.size, w.rows.size, b)
+    _, D, columns = _border_views(w, w.Q.size, w.rows.size, b)
     for i in columns:
         X[i] = 0.0
     for k in range(n_dof):
@@ -496,14 +502,14 @@ def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
 
     The other entries of x are scratch.
     """
-    Cq, _, _ = _border(w, x.size, w.rows.size, b)
+    Cq, _, _ = _border_views(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
-    for k in range(w.independent.size):  # ascending, so that no number is overwritten before it is read
+    for k in range(w.independent.size):  # in ascending order, no entry is overwritten before it is read
         x[k] = x[w.independent[k]]
 
 
 @compiled
-def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
+def _solve_banded_system(f, w, b, numbers, pivots, substitute, X, x):
     """Replace x[:n_dof] by (I - z^2 J_q - z J_v)^-1 x[:n_dof], with the factors of the bordered matrix.
 
     The other entries of x (n_q), and X (n_q), are scratch.
@@ -515,15 +521,15 @@ def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
 
 
 @compiled
-def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
+def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
     """Replace e_v[:n_dof] by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)[:n_dof], with z = h gamma0.
 
     The other entries of e_v (n_q) are scratch.
     """
     n = w.Q.size
     b = f.flags[BANDWIDTH]
-    z = h * options[newton_options_at(s) + GAMMA0]
-    K, X = _band(matrix_storage(w, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
+    z = h * options[newton_options_index(s) + GAMMA0]
+    K, X = _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b), vector(memory, s, n, Q_MOVED)
     _multiply_by_T(w, b, e_v, X)
     e_v[:] = 0.0
     add_banded_mass_times(f, w, X, e_v)
@@ -537,15 +543,15 @@ def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# difference between the predicted and the actual change of a residual, relative to the sum of the absolute terms of the
-# prediction, above which the sparsity pattern lacks entries
+# largest difference between the predicted and the actual change of a residual, relative to the sum of the absolute
+# terms of the prediction, for a complete sparsity pattern
 MAX_DEVIATION = 0.2
-NOISE = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
-N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_vectors returns first
+RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
+N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
 
 
 def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: int) -> int:
-    """Return the length of w.matrices for sparse storage: see _sparse_state, _sparse_vectors and _sparse_factors."""
+    """Return the length of w.matrices for sparse storage, whose parts are described at the next three functions."""
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
     n_factors = n + 2 * int(program[N_OFF])
@@ -553,8 +559,8 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 
 @inlined
-def _sparse_state(f, w):
-    """Return views of w.matrices: entries of M, G, K and D, a copy of w.counts, stiffnesses (n_c) of redundant rows."""
+def _sparse_derivative_views(f, w):
+    """Return views of w.matrices: entries of M, G, K and D (one view each), a copy of w.counts, stiffness of rows (n_c)."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_of(f.newton_program)[0].size - n_mass
@@ -571,8 +577,8 @@ def _sparse_state(f, w):
 
 
 @inlined
-def _sparse_vectors(f, w):
-    """Return views of scratch in w.matrices: three vectors (n_q), pivot sizes (N), and two complex vectors (N)."""
+def _sparse_scratch(f, w):
+    """Return scratch views of w.matrices: three vectors (n_q), pivot sizes (N), two complex vectors (N); N = n_q + n_c."""
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
     begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices
@@ -588,8 +594,8 @@ def _sparse_vectors(f, w):
 
 
 @inlined
-def _sparse_factors(f, w, k):
-    """Return a real view of w.matrices: the factors for gamma0 (k = 0), or the complex factors for eigenvalue k - 1."""
+def _sparse_factor_view(f, w, k):
+    """Return a view of w.matrices, as real numbers: the factors for gamma0 (k = 0), or for the eigenvalue k - 1."""
     n = f.newton_program[N_PIVOTS]
     n_factors = n + 2 * f.newton_program[N_OFF]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -622,10 +628,11 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 
 @compiled
-def _fill_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
-    """Store the entries of K, or D if `by_v`, computed by differences, in `entries`; return DONE or NOT_FINITE.
+def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
+    """Store the entries of K, or of D if `by_v`, computed by differences, in `entries`; return DONE or NOT_FINITE.
 
-    All columns of a group are computed at once. `base` (n_q) is the residual at (q, v); `residual`, `moved`: scratch.
+    All columns of a group are computed at once. `base` (n_q) is the residual at (q, v); `residual` and `moved` (n_q)
+    are scratch.
     """
     rows, columns, begins = tangents_of(f.newton_program)
     base_point = v if by_v else q
@@ -662,11 +669,11 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
     largest_excess = 0.0
     for i in range(base.size):
         largest_excess = max(largest_excess, abs(residual[i] - base[i]) - MAX_DEVIATION * predicted[i])
-    return largest_excess <= NOISE * largest
+    return largest_excess <= RESIDUAL_ROUNDING * largest
 
 
 @compiled
-def _fill_sparse_derivatives(f, w, memory, t, q, v):
+def _fill_sparse_tangents(f, w, memory, t, q, v):
     """Store the entries of K and D at (t, q, v), the last evaluated state, in w.matrices; return a code.
 
     The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
@@ -674,14 +681,14 @@ def _fill_sparse_derivatives(f, w, memory, t, q, v):
     if f.newton_program.size == 0:
         return NEEDS_DENSE
     w.counters[N_JACOBIANS] += 1
-    mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
-    base, residual, moved, pivot_sizes, _, _ = _sparse_vectors(f, w)
+    mass, jacobian, K, D, counts, stiffness = _sparse_derivative_views(f, w)
+    base, residual, moved, pivot_sizes, _, _ = _sparse_scratch(f, w)
     copy(w.mass_values, mass)
     copy(w.jacobian_values, jacobian)
     copy(w.counts, counts)
     copy(w.solutions[w.solutions.size - counts.size :], stiffness)
     largest = _fill_sparse_residual(f, w, t, q, v, False, base)
-    code = _fill_entries_by_differences(f, w, t, q, v, False, base, residual, moved, K)
+    code = _fill_tangent_entries_by_differences(f, w, t, q, v, False, base, residual, moved, K)
     if code != DONE:
         return code
     for j in range(q.size):
@@ -692,14 +699,14 @@ def _fill_sparse_derivatives(f, w, memory, t, q, v):
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
     _fill_sparse_residual(f, w, t, q, moved, False, residual)
-    memory[DAMPED] = 0.0
+    memory[HAS_DAMPING] = 0.0
     for i in range(q.size):
         if residual[i] != base[i]:
-            memory[DAMPED] = 1.0
-    if memory[DAMPED] == 0.0:
+            memory[HAS_DAMPING] = 1.0
+    if memory[HAS_DAMPING] == 0.0:
         D[:] = 0.0
         return DONE if is_complete else NEEDS_DENSE
-    code = _fill_entries_by_differences(f, w, t, q, v, True, base, residual, moved, D)
+    code = _fill_tangent_entries_by_differences(f, w, t, q, v, True, base, residual, moved, D)
     if code != DONE:
         return code
     for j in range(q.size):
@@ -710,18 +717,18 @@ def _fill_sparse_derivatives(f, w, memory, t, q, v):
 
 
 @compiled
-def _factor_sparse(f, w, z, factors):
-    """Store the factors of the bordered matrix for z in `factors`, both real or both complex; return a code."""
-    mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
-    _, _, _, pivot_sizes, _, _ = _sparse_vectors(f, w)
+def _factor_sparse_matrix(f, w, z, factors):
+    """Store the factors of the bordered matrix for z in `factors`, real or complex as z is; return a code."""
+    mass, jacobian, K, D, counts, stiffness = _sparse_derivative_views(f, w)
+    _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
     load(f.newton_program, mass, jacobian, K, D, z, stiffness, factors)
     return DONE if factor_lu(f.newton_program, counts, factors, pivot_sizes) else SINGULAR
 
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store the right-hand side [M r; G r] of the bordered system in `right`; redundant rows add stiffness to M."""
-    mass, jacobian, _, _, counts, stiffness = _sparse_state(f, w)
+    """Store the right-hand side [M r; G r] of the bordered system in `right`, with M stiffened by redundant rows."""
+    mass, jacobian, _, _, counts, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_of(f.newton_program)
     for k in range(mass.size):
@@ -733,17 +740,17 @@ def _fill_sparse_right_side(f, w, r, right):
 
 
 @compiled
-def _filter_sparse(f, w, options, s, h, e_q, e_v):
+def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
     """Replace e_v (n_q) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
-    _, _, K, _, _, _ = _sparse_state(f, w)
-    _, _, _, _, right, y = _sparse_vectors(f, w)
-    z, n = h * options[newton_options_at(s) + GAMMA0], y.size
+    _, _, K, _, _, _ = _sparse_derivative_views(f, w)
+    _, _, _, _, right, y = _sparse_scratch(f, w)
+    z, n = h * options[newton_options_index(s) + GAMMA0], y.size
     x = right.view(np.float64)[:n]
     _fill_sparse_right_side(f, w, e_v, x)
     rows, columns, _ = tangents_of(f.newton_program)
     for k in range(rows.size):
         x[rows[k]] += z * K[k] * e_q[columns[k]]
-    solve_lu(f.newton_program, _sparse_factors(f, w, 0), x, y.view(np.float64)[:n])
+    solve_lu(f.newton_program, _sparse_factor_view(f, w, 0), x, y.view(np.float64)[:n])
     copy(x[: e_v.size], e_v)
 
 
@@ -751,83 +758,89 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
 
 
 @compiled
-def derivatives_at(f, w, options, memory, s, t, q, v, a):
+def fill_derivatives(f, w, options, memory, s, t, q, v, a):
     """Store J_q and J_v (dense storage) or K and D in w.matrices; return a code. (t, q, v, a): last evaluated state."""
     if f.flags[FORM] == STATIC:
-        return _fill_sparse_derivatives(f, w, memory, t, q, v)
+        return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.flags[BANDWIDTH] >= 0:
-        return _fill_banded_derivatives(f, w, memory, s, t, q, v)
-    return _fill_dense_derivatives(f, w, options, memory, s, t, q, v, a)
+        return _fill_banded_tangents(f, w, memory, s, t, q, v)
+    return _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a)
 
 
 @compiled
 def factor_filter(f, w, options, memory, s, h):
     """Factor the real matrix I - z^2 J_q - z J_v, z = h gamma0, with which `filter_error` filters; return a code."""
-    n, z = w.Q.size, h * options[newton_options_at(s) + GAMMA0]
+    n, z = w.Q.size, h * options[newton_options_index(s) + GAMMA0]
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
-        return _factor_sparse(f, w, z, _sparse_factors(f, w, 0))
+        return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 0))
     if f.flags[BANDWIDTH] >= 0:
-        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 0, z, matrix_storage(w, n, FILTER), DGBTRF, DGBTRS)
-    return _factor_dense(w, memory, s, 0, z, as_matrix(matrix_storage(w, n, FILTER), w.independent.size))
+        return _factor_banded_matrix(
+            w, memory, s, f.flags[BANDWIDTH], 0, z, matrix_storage(w, n, FILTER), DGBTRF, DGBTRS
+        )
+    return _factor_dense_matrix(w, memory, s, 0, z, as_matrix(matrix_storage(w, n, FILTER), w.independent.size))
 
 
 @compiled
-def _factor_system(f, w, memory, s, k, z):
+def _factor_complex_system(f, w, memory, s, k, z):
     """Factor the complex matrix I - z^2 J_q - z J_v; z is the step size times eigenvalue k of A; return a code."""
     n = w.Q.size
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
-        return _factor_sparse(f, w, z, _sparse_factors(f, w, 1 + k).view(np.complex128))
+        return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 1 + k).view(np.complex128))
     if f.flags[BANDWIDTH] >= 0:
-        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 1 + k, z, system_storage(w, n, k), ZGBTRF, ZGBTRS)
-    return _factor_dense(w, memory, s, 1 + k, z, as_matrix(system_storage(w, n, k), w.independent.size))
+        return _factor_banded_matrix(
+            w, memory, s, f.flags[BANDWIDTH], 1 + k, z, system_storage(w, n, k), ZGBTRF, ZGBTRS
+        )
+    return _factor_dense_matrix(w, memory, s, 1 + k, z, as_matrix(system_storage(w, n, k), w.independent.size))
 
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
     """Factor the matrices of gamma0 and of all eigenvalues of A for steps of size h; return a code."""
-    offset = newton_options_at(s)
+    offset = newton_options_index(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
     offset += N_EIGEN_SCALARS + s
     for k in range(n_systems):
-        if code == DONE and (k > 0 or n_real == 0):  # eigenvalue 0, if real, equals gamma0: its factors exist already
-            code = _factor_system(f, w, memory, s, k, h * complex(options[offset], options[offset + 1]))
+        if code == DONE and (
+            k > 0 or n_real == 0
+        ):  # a first eigenvalue that is real is gamma0, which is factored above
+            code = _factor_complex_system(f, w, memory, s, k, h * complex(options[offset], options[offset + 1]))
         offset += 2 + 4 * s
     memory[H_FACTORED] = h
     return code
 
 
 @compiled
-def _solve_real(f, w, memory, s, x):
+def _solve_real_system(f, w, memory, s, x):
     """Replace x[:n_dof] by (I - z^2 J_q - z J_v)^-1 x[:n_dof], with z = h gamma0; x has n_q entries."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
-        _, _, _, _, right, y = _sparse_vectors(f, w)
+        _, _, _, _, right, y = _sparse_scratch(f, w)
         N = y.size
         _fill_sparse_right_side(f, w, x, right.view(np.float64)[:N])
-        solve_lu(f.newton_program, _sparse_factors(f, w, 0), right.view(np.float64)[:N], y.view(np.float64)[:N])
+        solve_lu(f.newton_program, _sparse_factor_view(f, w, 0), right.view(np.float64)[:N], y.view(np.float64)[:N])
         copy(right.view(np.float64)[:n], x)
     elif f.flags[BANDWIDTH] >= 0:
         X, pivots = vector(memory, s, n, Q_MOVED), pivots_of(memory, s, n, 0)
-        _solve_banded(f, w, f.flags[BANDWIDTH], matrix_storage(w, n, FILTER), pivots, DGBTRS, X, x)
+        _solve_banded_system(f, w, f.flags[BANDWIDTH], matrix_storage(w, n, FILTER), pivots, DGBTRS, X, x)
     else:
         lu_solve(as_matrix(matrix_storage(w, n, FILTER), m), pivots_of(memory, s, n, 0), x[:m])
 
 
 @compiled
-def _solve_complex(f, w, options, memory, s, k, x):
+def _solve_complex_system(f, w, options, memory, s, k, x):
     """Replace x[:n_dof], a complex right-hand side, by the solution of the linear system of eigenvalue number k."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
-        _, _, _, _, right, y = _sparse_vectors(f, w)
+        _, _, _, _, right, y = _sparse_scratch(f, w)
         _fill_sparse_right_side(f, w, x, right)
-        solve_lu(f.newton_program, _sparse_factors(f, w, 1 + k).view(np.complex128), right, y)
+        solve_lu(f.newton_program, _sparse_factor_view(f, w, 1 + k).view(np.complex128), right, y)
         copy(right[:n], x)
     elif f.flags[BANDWIDTH] >= 0:
         X, pivots = complex_vector(memory, s, n, count_systems(options, s), 1), pivots_of(memory, s, n, 1 + k)
-        _solve_banded(f, w, f.flags[BANDWIDTH], system_storage(w, n, k), pivots, ZGBTRS, X, x)
+        _solve_banded_system(f, w, f.flags[BANDWIDTH], system_storage(w, n, k), pivots, ZGBTRS, X, x)
     else:
         lu_solve(as_matrix(system_storage(w, n, k), m), pivots_of(memory, s, n, 1 + k), x[:m])
 
@@ -835,15 +848,15 @@ def _solve_complex(f, w, options, memory, s, k, x):
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
     """Replace x[:n_dof], a complex right-hand side, by the solution of the linear system of eigenvalue number k."""
-    if k == 0 and options[newton_options_at(s) + N_REAL] > 0.0:  # the eigenvalue is real and equals gamma0
+    if k == 0 and options[newton_options_index(s) + N_REAL] > 0.0:  # the first eigenvalue is real: it is gamma0
         real_part = vector(memory, s, w.Q.size, V_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
-        _solve_real(f, w, memory, s, real_part)
+        _solve_real_system(f, w, memory, s, real_part)
         for i in range(x.size):
             x[i] = real_part[i]
     else:
-        _solve_complex(f, w, options, memory, s, k, x)
+        _solve_complex_system(f, w, options, memory, s, k, x)
 
 
 @compiled
@@ -854,22 +867,22 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """
     m = w.independent.size
     if f.flags[FORM] == STATIC:
-        _filter_sparse(f, w, options, s, h, e_q, e_v)
+        _filter_error_sparse(f, w, options, s, h, e_q, e_v)
     elif f.flags[BANDWIDTH] >= 0:
-        _filter_banded(f, w, options, memory, s, h, e_q, e_v)
+        _filter_error_banded(f, w, options, memory, s, h, e_q, e_v)
     else:
-        _filter_dense(w, options, memory, s, h, e_q[:m], e_v[:m])
+        _filter_error_dense(w, options, memory, s, h, e_q[:m], e_v[:m])
 
 
 @compiled
-def correct(f, w, options, memory, s, residual, A_stage):
+def correct_stages(f, w, options, memory, s, residual, A_stage):
     """Replace `residual` (s, n_q) by the Newton corrections of the stage accelerations, and add them to A_stage.
 
     Only the entries of independent coordinates in `residual` and A_stage (s, n_q) are read and changed.
     """
     n = w.Q.size
     m = w.independent.size
-    offset = newton_options_at(s)
+    offset = newton_options_index(s)
     n_real = int(options[offset + N_REAL])
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)

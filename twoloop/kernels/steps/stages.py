@@ -15,8 +15,8 @@ from twoloop.kernels.data.indices import NOT_LOADED
 
 # largest ratio of a step size to the previous one at which the previous step's polynomial predicts the stages
 MAX_STEP_RATIO = 3.0
-# factor on `end_error` in methods that also have Richardson's estimate: these need `end_error` only to detect jumps
-# between an end of the step and the nearest stage
+# factor on the result of `estimate_end_error` in methods with Richardson's estimate, which misses only jumps of the
+# force between an end of the step and the nearest stage
 END_ERROR_WEIGHT = 0.01
 
 # indices of the scalars in `options`. After the scalars, `options` contains A (s, s), A A (s, s), b (s), b A (s), c (s)
@@ -41,11 +41,11 @@ def options_array(
     """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
-    vectors = (b, b @ A, c, _lagrange(c, 0.0), _lagrange(c, 1.0))
+    vectors = (b, b @ A, c, _lagrange_values(c, 0.0), _lagrange_values(c, 1.0))
     return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), *vectors])
 
 
-def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
+def _lagrange_values(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
     """Return the values (s) at x of the Lagrange polynomials of distinct `nodes` (s)."""
     factors = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
     np.fill_diagonal(factors, 1.0)
@@ -91,7 +91,7 @@ def interpolate(c, theta, A_stage, weights, a):
 
 
 @compiled
-def end_error(tolerances, options, h, state, new_state, A_stage):
+def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     """Return an estimate of the error of a step, in units of the tolerances (26), from the stage accelerations (s, n).
 
     The stage accelerations have a range w of order h. At the ends of the step, the polynomial through the stages
@@ -125,28 +125,28 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
     return largest
 
 
-# indices of the scalars that newton_options adds to `options`, counted from `newton_options_at`. N_REAL, N_PAIRS:
-# numbers of real eigenvalues and complex pairs of A; GAMMA0: first real eigenvalue, or least absolute value of all;
-# VELOCITIES: 1 if the error of velocities is tested, too. After the scalars, `options` contains the weights e (s) of
-# the error estimate, and for each eigenvalue its real and imaginary part, its row of T^-1 and its column of T, where T
-# contains the eigenvectors of A (s real parts, then s imaginary parts each)
-N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
+# indices of the scalars that newton_options adds to `options`, counted from `newton_options_index`. N_REAL, N_PAIRS:
+# numbers of real eigenvalues of A and of complex pairs; GAMMA0: first real eigenvalue, or if there is none, smallest
+# absolute value of an eigenvalue; TESTS_VELOCITIES: 1 if the error of velocities is tested, too. After the scalars,
+# `options` contains the weights e (s) of the error estimate, and for each eigenvalue its real and imaginary part, its
+# row of T^-1 and its column of T (for both s real parts, then s imaginary parts); T contains the eigenvectors of A
+N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # indices of the scalars in `memory`
 (
-    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt (diagonal_step.py: an attempt was made)
+    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt; diagonal_step.py: an attempt was made
     H_TRIAL,  # step size of the last attempt, s
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step, s
-    HAS_JACOBIAN,  # 1: derivatives are stored that may be used
-    FRESH,  # 1: the derivatives were computed for this step; 0: for an earlier step, or at the end of this one
+    HAS_JACOBIAN,  # 1: the stored derivatives may be used
+    IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at this step's end
     PARTITION_NUMBER,  # value of GENERATION, see data/indices.py, of the partition of the stored derivatives
     H_FACTORED,  # step size for which the systems are factored, s; 0: none
     CONTRACTION,  # ratio of the last two corrections of Newton's method
-    DAMPED,  # 1: forces depend on v; 0: J_v and D are zero
-    SYMMETRIC,  # factors of the matrix in diagonal_step.py: 1: L D L^T, 0: L U
-    DURATION,  # duration of an error of the velocities, see velocity_errors.py, s; 0: unknown
-    CHANGED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
+    HAS_DAMPING,  # 1: forces depend on v; 0: J_v and D are zero
+    IS_SYMMETRIC,  # kind of factors in diagonal_step.py: 1: L D L^T of a symmetric matrix; 0: L U
+    ERROR_DURATION,  # duration (s) of an error of the velocities, see velocity_errors.py; 0: unknown
+    DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
 # indices of the blocks (s, n_q) in `memory`, and of the vectors (n_q) after the blocks
@@ -154,13 +154,13 @@ PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # indices of the parts of w.matrices, of n_q^2 entries each: derivatives by q and by v, factors of the real filter
 # matrix, and from SYSTEMS on, for each eigenvalue, the factors of a complex matrix in two parts
-BY_Q, BY_V, FILTER, SYSTEMS = range(4)
+DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the entries that Newton's method needs in `options` after those of `options_array`, see N_REAL.
+    """Return the entries of `options` for Newton's method, which follow those of `options_array`; see N_REAL.
 
     A must be diagonalizable. `velocities`: whether the error of velocities is tested, too.
     """
@@ -169,14 +169,14 @@ def newton_options(
     reals = [k for k in range(len(b)) if values[k].imag == 0.0]
     pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
     gamma0 = float(values[reals[0]].real) if reals else float(np.abs(values).min())
-    parts: list[Any] = [[len(reals), len(pairs), gamma0, float(velocities)], _estimate_weights(b, c, gamma0)]
+    parts: list[Any] = [[len(reals), len(pairs), gamma0, float(velocities)], _error_weights(b, c, gamma0)]
     for k in reals + pairs:
         row, column = inverse[k], T[:, k]
         parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
 
 
-def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
+def _error_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
     """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)) with stage values Y_j.
 
     The estimate is the difference of an embedded quadrature of order s and the method (Hairer & Wanner II, (IV.8.16)).
@@ -200,7 +200,7 @@ def memory_size(n_systems: int, s: int, n_q: int) -> int:
 
 
 def n_matrices(n_systems: int) -> int:
-    """Return the number of parts of w.matrices, n_q^2 entries each, for `n_systems` linear systems; see BY_Q."""
+    """Return the number of parts of w.matrices, each with n_q^2 entries, for `n_systems` linear systems."""
     return SYSTEMS + 2 * n_systems
 
 
@@ -235,7 +235,7 @@ def diagonal_options(
 
 
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
-    """Return a new `memory`, filled with zeros, of a diagonally implicit method with s stages.
+    """Return a new array `memory`, filled with zeros, for a diagonally implicit method with s stages.
 
     `memory` begins with the memory of Newton's method for one stage. The velocities and the accelerations of the stages
     (s, n_q each) follow, then the accelerations (n_q) of the last stage of the last accepted step.
@@ -244,15 +244,15 @@ def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
 
 
 @merged
-def newton_options_at(s):
-    """Return the index in `options` at which the entries of newton_options begin, N_REAL first, for s stages."""
+def newton_options_index(s):
+    """Return the index in `options` of the first entry of newton_options, N_REAL, for s stages."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
 @merged
 def count_systems(options, s):
     """Return the number of linear systems of Newton's method: real eigenvalues of A plus pairs of complex ones."""
-    offset = newton_options_at(s)
+    offset = newton_options_index(s)
     return int(options[offset + N_REAL] + options[offset + N_PAIRS])
 
 
@@ -272,7 +272,7 @@ def vector(memory, s, n, which):
 
 @inlined
 def matrix_storage(w, n, which):
-    """Return a view (n^2) of part `which`, such as BY_Q, of w.matrices."""
+    """Return a view (n^2) of part `which`, such as DERIVATIVE_Q, of w.matrices."""
     return w.matrices[which * n * n : (which + 1) * n * n]
 
 
@@ -290,31 +290,31 @@ def system_storage(w, n, k):
 
 
 @inlined
-def _after_vectors(memory, s, n, k):
-    """Return a view (2 n) of `memory` that begins k n numbers after the end of its vectors."""
+def _storage_after_vectors(memory, s, n, k):
+    """Return a view (2 n) of `memory`, k n entries after the end of the vectors."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return the pivot indices (n), a view of `memory`, of the filter (k = 0) or of the system of eigenvalue k - 1."""
-    return _after_vectors(memory, s, n, k)[:n].view(np.int64)
+    """Return a view (n) of `memory`: pivot indices of the filter matrix (k = 0), or for the eigenvalue k - 1 (k > 0)."""
+    return _storage_after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 
 @inlined
 def complex_vector(memory, s, n, n_systems, which):
     """Return a view of complex scratch vector `which` (n), 0 or 1, of `memory`."""
-    return _after_vectors(memory, s, n, 1 + n_systems + 2 * which).view(np.complex128)
+    return _storage_after_vectors(memory, s, n, 1 + n_systems + 2 * which).view(np.complex128)
 
 
 @kernel(ATTEMPT)
-def stop_to_load(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Return an attempt with the code NOT_LOADED, so that the caller of the kernel loads the real step."""
+def request_loading(f, w, options, memory, t, h, tolerances, state, new_state):
+    """Return an attempt with the code NOT_LOADED, so that the caller of the kernel loads the code of the step."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
-PLACEHOLDER = Step(stop_to_load, commit_nothing)
+PLACEHOLDER_STEP = Step(request_loading, commit_nothing)
 
 
 class LazyStep(NamedTuple):
@@ -324,16 +324,16 @@ class LazyStep(NamedTuple):
     name: str
 
 
-LOADED: dict[LazyStep, Step] = {}  # steps whose modules have been imported so far
+LOADED_STEPS: dict[LazyStep, Step] = {}  # steps whose modules have been imported so far
 
 
 def loaded(step: Any) -> Any:
-    """Return `step`; for a LazyStep, import its module if necessary, and return the Step in it."""
-    if isinstance(step, LazyStep) and step not in LOADED:
-        LOADED[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
-    return without_loading(step)
+    """Return `step`; for a LazyStep, return the Step in its module, which is imported if necessary."""
+    if isinstance(step, LazyStep) and step not in LOADED_STEPS:
+        LOADED_STEPS[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
+    return step_if_loaded(step)
 
 
-def without_loading(step: Any) -> Any:
-    """Return `step`; for a LazyStep, return its Step, or PLACEHOLDER if its module is not imported yet."""
-    return LOADED.get(step, PLACEHOLDER) if isinstance(step, LazyStep) else step
+def step_if_loaded(step: Any) -> Any:
+    """Return `step`; for a LazyStep, return the Step in its module, or PLACEHOLDER_STEP if that is not imported yet."""
+    return LOADED_STEPS.get(step, PLACEHOLDER_STEP) if isinstance(step, LazyStep) else step

@@ -104,13 +104,13 @@ def series_accelerations(memory, n):
 
 
 @inlined
-def _integers(options, which):
+def _integer_array(options, which):
     begin, end = int(options[N_SCALARS + which]), int(options[N_SCALARS + which + 1])
     return options[begin:end].view(np.int64)
 
 
 @inlined
-def _floats(options, which):
+def _float_array(options, which):
     return options[int(options[N_SCALARS + which]) : int(options[N_SCALARS + which + 1])]
 
 
@@ -149,11 +149,11 @@ def sum_of_products(X, Y, K, total):
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
     """Store the arguments of the operations of group g, sums of `values` without their constants, in `out`."""
-    column, coefficient = _integers(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
+    column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
-    row, column = _integers(options, sums + ROW), _integers(options, sums + MORE_COLUMN)
-    coefficient = _floats(options, sums + MORE_COEFFICIENT)
+    row, column = _integer_array(options, sums + ROW), _integer_array(options, sums + MORE_COLUMN)
+    coefficient = _float_array(options, sums + MORE_COEFFICIENT)
     for e in range(groups[g + more], groups[g + more + 1]):
         out[row[e]] += coefficient[e] * values[column[e]]
 
@@ -161,12 +161,12 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 @merged
 def _store_sums(options, sums, scale, values, out):
     """For each item of `sums`, store `scale` times its sum of `values`, without its constant, in `out`."""
-    column, coefficient = _integers(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
-    indices = _integers(options, sums + SUM_INDICES)
+    column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
+    indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
         out[indices[o]] = scale * coefficient[o] * values[column[o]]
-    row, column = _integers(options, sums + ROW), _integers(options, sums + MORE_COLUMN)
-    coefficient = _floats(options, sums + MORE_COEFFICIENT)
+    row, column = _integer_array(options, sums + ROW), _integer_array(options, sums + MORE_COLUMN)
+    coefficient = _float_array(options, sums + MORE_COEFFICIENT)
     for e in range(row.size):
         out[row[e]] += scale * coefficient[e] * values[column[e]]
 
@@ -177,8 +177,11 @@ def begin_operations(options, table, values, z, x, y):
 
     Pending products, whose second factor depends on the accelerations, are set to zero.
     """
-    groups = _integers(options, table + GROUPS)
-    constant, constant_2 = _floats(options, table + FIRST + CONSTANT), _floats(options, table + SECOND + CONSTANT)
+    groups = _integer_array(options, table + GROUPS)
+    constant, constant_2 = (
+        _float_array(options, table + FIRST + CONSTANT),
+        _float_array(options, table + SECOND + CONSTANT),
+    )
     for g in range(0, groups.size, N_GROUP):
         kind = groups[g]
         _fill_arguments(options, table + FIRST, groups, g, MORE_FIRST, values, x)
@@ -216,7 +219,7 @@ def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
     x0 and y0 are the coefficients of order 0; `total` is the result of `sum_of_products` for order K. Coefficient K of
     a pending product's second factor is not yet known: the term with this coefficient is left out.
     """
-    groups = _integers(options, table + GROUPS)
+    groups = _integer_array(options, table + GROUPS)
     inverse = 1.0 / K
     for g in range(0, groups.size, N_GROUP):
         kind, first, last = groups[g], groups[g + BEGIN], groups[g + END]
@@ -257,7 +260,7 @@ def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
 @merged
 def _fill_second_factors(options, table, values, y):
     """Store the second factors of pending products in y; they are sums of `values`, which include accelerations."""
-    groups = _integers(options, table + GROUPS)
+    groups = _integer_array(options, table + GROUPS)
     _fill_arguments(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
 
 
@@ -328,8 +331,8 @@ def expand(f, w, options, memory, t, state, unit):
     series = series_of(memory, order, n, memory[TARGET])
     A, LAM = 1 + 2 * n, 1 + 3 * n
     begin_early = LAM + n_rows
-    begin_late = begin_early + _integers(options, EARLY + FIRST + COLUMN).size
-    indices, constant = _integers(options, BALANCE + SUM_INDICES), _floats(options, BALANCE + CONSTANT)
+    begin_late = begin_early + _integer_array(options, EARLY + FIRST + COLUMN).size
+    indices, constant = _integer_array(options, BALANCE + SUM_INDICES), _float_array(options, BALANCE + CONSTANT)
 
     begin_series(options, t, unit, state, N, series, begin_early, X1[0], Y1[0], r, c)
     for k in range(order - 1):
@@ -409,7 +412,7 @@ def _allowed_step(tolerances, series, unit, order, n):
 
 
 @merged
-def _evaluate(series, unit, order, x, q, v, a):
+def _evaluate_series(series, unit, order, x, q, v, a):
     """Set q, v and a (n each) to the values of a series after x units of time, by Horner's scheme.
 
     Four or two coordinates are evaluated at once. The recurrence for the second derivative yields half of it.
@@ -447,7 +450,7 @@ def _evaluate(series, unit, order, x, q, v, a):
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
     """Return the ratio of the defect at t + s h to the allowed one (no value: infinity). q, v, a (n) are scratch."""
     series_a = series_accelerations(memory, q.size)
-    _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
+    _evaluate_series(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
         return np.inf
     return defect_ratio(tolerances, h, order, series_a, a, q, v)
@@ -544,7 +547,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             defect = _first_large_defect(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
                 return Attempt(DONE, min(defect, MAX_DEFECT), _factor_after_large_defect(defect, order))
-    _evaluate(series, unit, order, x, q1, v1, series_a)
+    _evaluate_series(series, unit, order, x, q1, v1, series_a)
     store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code != DONE:
@@ -565,7 +568,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
             if not noise:
                 return Attempt(DONE, min(defect, MAX_DEFECT), _factor_after_large_defect(defect, order))
-            _evaluate(series, unit, order, x, q1, v1, series_a)
+            _evaluate_series(series, unit, order, x, q1, v1, series_a)
             code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)

@@ -37,7 +37,7 @@ def filtered_velocity_error(
 
     `unfiltered` (n_dof) is the velocity error; `filtered_once` and `filtered_twice` (n_dof) are this error after one
     and two filters (I - z J)^-1. `a_end` (n_q) are the accelerations at the end of the step, which show how fast the
-    motion changes after a contact has begun within the step. Stores the duration of the error in memory[DURATION].
+    motion changes after a contact has begun within the step. Stores the duration of the error in ERROR_DURATION.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
@@ -49,8 +49,8 @@ def filtered_velocity_error(
         largest = max(largest, abs(filtered_twice[i]))
         curvature = max(curvature, abs(filtered_twice[i] - 2.0 * filtered_once[i] + unfiltered[i]))  # (z J)^2 e
     if largest > 0.0:
-        memory[at.DURATION] = z * np.sqrt(largest / curvature)
-    duration = memory[at.DURATION]
+        memory[at.ERROR_DURATION] = z * np.sqrt(largest / curvature)
+    duration = memory[at.ERROR_DURATION]
     if duration * largest_a * SLOW_FACTOR > largest_v:
         duration *= min(SLOW_FACTOR, duration * largest_a * SLOW_FACTOR / largest_v) if largest_v > 0.0 else SLOW_FACTOR
     return velocity_error(w, tolerances, filtered_twice, duration, state, new_state)
@@ -93,7 +93,7 @@ def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, 
     lasted `max_duration` (s). Second, the duration computed with J is short, and Newton's method converges so slowly
     that J must have changed by more than OUTDATED_CHANGE.
     """
-    duration = memory[at.DURATION]
+    duration = memory[at.ERROR_DURATION]
     if (
         duration < min(max_duration, FAST_DURATION * z)
         and memory[at.CONTRACTION] * duration * duration > OUTDATED_CHANGE * z * z
