@@ -23,12 +23,12 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import begin_folder, check_folder, end_folder
 from twoloop.run.cached import STEPS, MissedChanges, Output, cached_result, fields_of, set_up
-from twoloop.run.fallbacks import MAX_REPETITIONS, closer_sampling, may_have_missed_changes
+from twoloop.run.fallbacks import MAX_REPETITIONS, gap_for_repetition, may_have_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_record
 from twoloop.run.options import options_of
 from twoloop.run.record import FileStore, MemoryStore, OutputRequest, Status, record_of
-from twoloop.run.run import SMALL, Run
-from twoloop.run.signals import interrupted
+from twoloop.run.run import SMALL_SYSTEM, Run
+from twoloop.run.signals import is_keyboard_interrupt
 
 Array = NDArray[np.float64]
 
@@ -202,7 +202,7 @@ def solve_dae(
     try:
         at_ends = times is not None and times.size <= 2 and set(times.tolist()) <= {t0, t1}
         run, every, spent, repeats = None, np.inf, 0.0, MAX_REPETITIONS
-        in_time = time_limit is None or (time_limit >= LONGEST and system.n_q <= SMALL)
+        in_time = time_limit is None or (time_limit >= LONGEST and system.n_q <= SMALL_SYSTEM)
         if folder is event_functions is options.own_tolerance is None and in_time and not progress:
             is_default = times is time_limit is None and not dense_output
             output = STEPS if is_default else Output(times, at_ends, bool(dense_output), time_limit)
@@ -213,10 +213,10 @@ def solve_dae(
                     warnings.warn(rows_warning, ConstraintWarning, stacklevel=2)
                 return record_of(Result, fields)
             if isinstance(outcome, MissedChanges):
-                every, spent, repeats = outcome.every, outcome.cpu_time, MAX_REPETITIONS - 1
+                every, spent, repeats = outcome.max_gap, outcome.cpu_time, MAX_REPETITIONS - 1
             elif isinstance(outcome, Run):
                 run = outcome
-        interrupts.listen()
+        interrupts.install_handlers()
         q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
         deadline = None
         for left in range(repeats, -1, -1):
@@ -226,7 +226,7 @@ def solve_dae(
                     run.control[run.a.APART] = every
             if left == repeats and run.rows_warning:
                 warnings.warn(run.rows_warning, ConstraintWarning, stacklevel=2)
-            with_code, lands = bool(run.plan.own), run.lands or at_ends
+            with_code, lands = bool(run.plan.own), run.ends_at_outputs or at_ends
             with _progress_bar(options.method.name, t0, t1) if progress else NO_BAR as report:
                 kept = MemoryStore() if folder is None else begin_folder(folder, system.n_q)
                 wanted = OutputRequest(times, lands, bool(dense_output), event_functions, kept)
@@ -234,11 +234,13 @@ def solve_dae(
                     deadline = time.monotonic() + time_limit
                 limit = None if deadline is None else max(0.0, deadline - time.monotonic())
                 last = left == 0 or folder is not None
-                record = IntegrationLoop(run, t1, wanted, report, limit, interrupts, last).to_end(check_derivatives)
+                record = IntegrationLoop(run, t1, wanted, report, limit, interrupts, last).integrate_to_end(
+                    check_derivatives
+                )
             give_back(run.work)
             if last or record.status < 0 or not may_have_missed_changes(run):
                 break
-            every, spent, run = closer_sampling(run), spent + record.stats.cpu_time, None
+            every, spent, run = gap_for_repetition(run), spent + record.stats.cpu_time, None
         if spent > 0.0:
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
         result = record_of(Result, fields_of(record, options, system, with_code, t1))
@@ -246,10 +248,10 @@ def solve_dae(
             end_folder(kept, result)
         return result
     except (KeyboardInterrupt, SystemError) as error:
-        if not (interrupted(error) and interrupts.returns_result()):
+        if not (is_keyboard_interrupt(error) and interrupts.returns_result()):
             raise
     finally:
-        interrupts.leave()
+        interrupts.restore_handlers()
     return record_of(Result, vars(interrupted_record(system, t0, event_functions, options.method.name)))
 
 

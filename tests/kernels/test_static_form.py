@@ -118,7 +118,7 @@ def test_programs_grow_with_the_bodies_and_no_faster(large):
             system, q, _ = make(n)
             updates[n] = int(static_form(system, 0.0, q).program[static_program.N_UPDATES])
             run = started_run(system, q)
-            assert run.static is not None
+            assert run.static_form is not None
             assert run.work.notes.base.size + run.work.counters.base.size < 120 * system.n_q  # nothing n_c x n_q
         assert updates[499] <= (18.0 if make is grid else 5.3) * updates[99]  # of a grid like n^1.5, at best
         assert updates[499] <= (800 if make is grid else 150) * 499
@@ -167,7 +167,7 @@ def test_bodies_whose_mass_matrix_is_singular(any_size, both):
     one, other = both(run)
     system, q = other.system, other.q[:, 0]
     assert one.success and other.success
-    assert (static_form(system, 0.0, q) is not None) and started_run(system, q).static is not None
+    assert (static_form(system, 0.0, q) is not None) and started_run(system, q).static_form is not None
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-11
     assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e-9 * np.abs(one.lam[:, -1]).max()
 
@@ -187,7 +187,7 @@ def test_a_hub_whose_stiffening_row_other_rows_imply(any_size, both, monkeypatch
         model.revolute(f"rocker {k}", "ground", at=(x + 1.2, k, 0.0), axis=axis)
     problem = model.problem((0.0, 0.1))
     one, other = both(lambda: solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", 1e-9, 1e-9))
-    assert one.success and started_run(problem.system, problem.q0).static is not None
+    assert one.success and started_run(problem.system, problem.q0).static_form is not None
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-11
 
 

@@ -170,10 +170,10 @@ def _freedom_of_large(
     if rows_here is None:
         return None
     singular = 0
-    if rows_here.shares and np.abs(rows_here.allowed).max() > 0.0:
-        away = q + PERTURBATION * rows_here.allowed
+    if rows_here.coefficients and np.abs(rows_here.allowed_move).max() > 0.0:
+        away = q + PERTURBATION * rows_here.allowed_move
         moved = project_sparsely(system, t, away, np.zeros(system.n_q), check_assembly=False)
-        nearby = rows_here.onto_constraints(away) if moved is None else moved[0]
+        nearby = rows_here.project_nearby(away) if moved is None else moved[0]
         beside = None if nearby is None else dependence(system, t, nearby)
         if beside is None:
             return None
@@ -181,7 +181,7 @@ def _freedom_of_large(
             singular, rows_here = beside.rank - rows_here.rank, beside
     of_row = {row: name for name, own in rows.items() for row in own}
     groups: list[set[str]] = []
-    for row, share in rows_here.shares.items():
+    for row, share in rows_here.coefficients.items():
         involved = [row, *np.flatnonzero(np.abs(share) > 1e-6 * np.abs(share).max()).tolist()]
         joined = {of_row[k] for k in involved if k in of_row}  # rows of Euler parameters belong to no joint
         joined = joined.union(*(group for group in groups if group & joined))

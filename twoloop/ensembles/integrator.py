@@ -197,7 +197,7 @@ class Integrator:
         if t + dt == t:
             raise ValueError(f"dt must reach the next floating-point number after t = {t!r}; given {dt!r}")
         if inputs is not None:
-            self._sampled.set(inputs)
+            self._sampled.set_parameters(inputs)
         return self._sampled.step(float(dt))
 
     def result(self) -> Result:

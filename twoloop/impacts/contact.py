@@ -18,7 +18,7 @@ from twoloop.kernels.data import indices
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import NEGLIGIBLE
+from twoloop.run.fallbacks import NEGLIGIBLE_RATIO
 from twoloop.run.run import Run
 
 
@@ -185,7 +185,7 @@ class ContactSystem:
         for place, k, coefficient in self._slipping:
             K[:n, first_stop + place] -= coefficient * slides[k]
         right = np.concatenate([Q, *right_sides, -self._rows("bias", t, q, v)])
-        forces = np.linalg.lstsq(K, right, rcond=NEGLIGIBLE)[0][first_stop:]
+        forces = np.linalg.lstsq(K, right, rcond=NEGLIGIBLE_RATIO)[0][first_stop:]
         return Q + sum(coefficient * forces[place] * slides[k] for place, k, coefficient in self._slipping)
 
     def build(self, names: str) -> ConstrainedSystem:

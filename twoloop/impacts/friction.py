@@ -13,7 +13,7 @@ from twoloop.checks.arguments import Array
 from twoloop.impacts.contact import Gap, Gaps
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import NEGLIGIBLE, scaled_equations
+from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, scaled_equations
 
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
@@ -49,7 +49,7 @@ def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
     """Return the velocity changes (n_q, k) by unit impulses: M X + G^T Y = W^T with G X = 0, for all constraints."""
     matrix, lengths, _ = scaled_equations(system, t, q)
     right = np.vstack([W.T, np.zeros((len(lengths), len(W)))])
-    return np.asarray(np.linalg.lstsq(matrix, right, rcond=NEGLIGIBLE)[0][: system.n_q], dtype=float)
+    return np.asarray(np.linalg.lstsq(matrix, right, rcond=NEGLIGIBLE_RATIO)[0][: system.n_q], dtype=float)
 
 
 def solve_complementarity(D: Array, b: Array) -> Array:
@@ -62,7 +62,7 @@ def solve_complementarity(D: Array, b: Array) -> Array:
     x = nnls(*_squares(D, b))[0]
     # nnls finds the active set; the forces are then computed from D, without the rounding of its square root
     active = x > 0.0
-    x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE)[0]
+    x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE_RATIO)[0]
     return np.maximum(x, 0.0)
 
 
@@ -76,7 +76,7 @@ def solve_bounded(D: Array, c: Array, n: int, limit: Array) -> Array:
     B, y = _squares(D, c)
     size = np.sqrt(D.diagonal().max())
     # scale of the forces, so that the unknowns are of order 1
-    unit = max(float(np.linalg.norm(y)) / size, NEGLIGIBLE * float(limit.max()), tiny)
+    unit = max(float(np.linalg.norm(y)) / size, NEGLIGIBLE_RATIO * float(limit.max()), tiny)
     bound = np.maximum(limit / unit, tiny)
     regularisation = np.zeros((len(limit), len(c)))
     regularisation[:, n:] = np.diag(EVEN_WEIGHT * np.sqrt(bound.min() / bound))
@@ -87,7 +87,7 @@ def solve_bounded(D: Array, c: Array, n: int, limit: Array) -> Array:
     )
     x, free = solution.x, solution.active_mask == 0
     residual = (D @ x + c / unit)[free]  # due to the small weight
-    x[free] -= np.linalg.lstsq(D[np.ix_(free, free)], residual, rcond=NEGLIGIBLE)[0]
+    x[free] -= np.linalg.lstsq(D[np.ix_(free, free)], residual, rcond=NEGLIGIBLE_RATIO)[0]
     return np.asarray(unit * np.clip(x, *limits))
 
 
@@ -108,7 +108,7 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     tangent_rows = np.arange(len(c) - n_tangents, len(c))
     moving = tangents.sign != 0
     unknown = np.setdiff1d(np.arange(len(c)), tangent_rows[moving])
-    x, tolerance = np.zeros(len(c)), NEGLIGIBLE * np.abs(c).max(initial=0.0) / D.diagonal().max(initial=1e-300)
+    x, tolerance = np.zeros(len(c)), NEGLIGIBLE_RATIO * np.abs(c).max(initial=0.0) / D.diagonal().max(initial=1e-300)
     for _ in range(MAX_LOAD_ITERATIONS):
         new, load = np.zeros(len(c)), tangents.coefficient * x[tangents.normal]
         new[tangent_rows] = -tangents.sign * load
@@ -141,12 +141,12 @@ def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) ->
     holds[tangent_rows] = (tangents.sign == 0) & pushes[tangents.normal]
     loads[holds, holds] = 1.0
     A = (D @ loads)[np.ix_(holds, holds)]
-    if np.linalg.eigvals(A).real.min(initial=0.0) < -NEGLIGIBLE * np.abs(A).max(initial=0.0):
+    if np.linalg.eigvals(A).real.min(initial=0.0) < -NEGLIGIBLE_RATIO * np.abs(A).max(initial=0.0):
         raise Undetermined("friction of stops is so large that their forces are not unique (P. Painlevé): they may jam")
     fixed = np.where(pushes, 0.0, x)
     fixed[tangent_rows] = 0.0
     y = np.zeros(len(c))
-    y[holds] = np.linalg.lstsq(A, -(c + D @ fixed)[holds], rcond=NEGLIGIBLE)[0]
+    y[holds] = np.linalg.lstsq(A, -(c + D @ fixed)[holds], rcond=NEGLIGIBLE_RATIO)[0]
     return np.asarray(loads @ y + fixed)
 
 
@@ -157,7 +157,7 @@ def _squares(D: Array, b: Array) -> tuple[Array, Array]:
     different rates. B has a small row for it.
     """
     values, vectors = np.linalg.eigh(0.5 * (D + D.T))
-    components, threshold = vectors.T @ b, NEGLIGIBLE * values.max(initial=0.0)
+    components, threshold = vectors.T @ b, NEGLIGIBLE_RATIO * values.max(initial=0.0)
     significant = (values > threshold) | (np.abs(components) > OUTSIDE * np.abs(b).max(initial=0.0))
     roots = np.sqrt(np.maximum(values[significant], threshold))
     return roots[:, None] * vectors[:, significant].T, -components[significant] / roots
@@ -173,7 +173,7 @@ def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents) -> Arra
     """
     shift = np.append(restitution * u[: len(restitution)], 0.0 * tangents.coefficient)
     P = coulomb_forces(D, u + shift, np.zeros(0), tangents)[0]
-    if len(tangents.normal) and P @ (u + 0.5 * (D @ P)) > NEGLIGIBLE * (np.abs(P) @ np.abs(u)):
+    if len(tangents.normal) and P @ (u + 0.5 * (D @ P)) > NEGLIGIBLE_RATIO * (np.abs(P) @ np.abs(u)):
         raise Undetermined("an impact with friction would add energy by the law of impacts; use another restitution")
     return P
 
@@ -241,7 +241,7 @@ class FrictionModes(Modes):
         scale = (W**2).sum(axis=1) / float(np.abs(self.system.mass(t, q)).max())
         for k, friction in enumerate(self._frictions):
             D_before = D[:k, :k]
-            compliance = D[k, k] - D[k, :k] @ np.linalg.lstsq(D_before, D[:k, k], rcond=NEGLIGIBLE)[0]
+            compliance = D[k, k] - D[k, :k] @ np.linalg.lstsq(D_before, D[:k, k], rcond=NEGLIGIBLE_RATIO)[0]
             if not compliance > INDEPENDENT * scale[k]:
                 others = ", ".join(map(repr, self._names[:k]))
                 raise ValueError(
@@ -349,7 +349,7 @@ class StopFriction:
         groups: dict[int, list[int]] = {}
         first: dict[int, int] = {}  # first stop of a group by its row
         for k, row in rows.items():
-            weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE)[0]
+            weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE_RATIO)[0]
             if D[row, row] - D[row, base] @ weights > INDEPENDENT * D[row, row]:
                 base.append(row)
                 groups[k], first[row] = [k], k

@@ -25,7 +25,7 @@ from twoloop.impacts.friction import (
     AT_REST,
     IDLE,
     INDEPENDENT,
-    NEGLIGIBLE,
+    NEGLIGIBLE_RATIO,
     STICKS,
     FrictionModes,
     Mode,
@@ -241,7 +241,7 @@ class Motion:
 
         The friction of an idle joint is constant until one of these releases it; it is zero if stops alone hold it.
         """
-        weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE)[0]
+        weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE_RATIO)[0]
         if D[row, row] - D[row, base] @ weights > INDEPENDENT * D[row, row]:
             base.append(row)
             return STICKS
@@ -476,9 +476,9 @@ class Motion:
             gap = self.gaps.at(self.t, self.q, self.v)
             W, u = gap.W[list(resting)], gap.u[list(resting)]
             X = responses(self.system, self.t, self.q, W)
-            self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE)[0]
+            self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE_RATIO)[0]
         rows, violation = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
-        self.v = self.v - np.linalg.lstsq(rows, violation, rcond=NEGLIGIBLE)[0]
+        self.v = self.v - np.linalg.lstsq(rows, violation, rcond=NEGLIGIBLE_RATIO)[0]
         self.v[np.abs(self.v) < max(ZERO, 1e-16 * float(self.speeds.max()))] = 0.0
 
     def _gap_event(self, k: int, start: Gap) -> Any:

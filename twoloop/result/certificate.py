@@ -377,7 +377,7 @@ class _Checker:
         n_steps = int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)
         max_attempts = MAX_ATTEMPTS + (MAX_ATTEMPTS_PER_STEP * n_steps if factor == 1.0 else 0)
         piece = rerun.integrate(t0, start, times, max_attempts)
-        self.handlers.check()
+        self.handlers.call_delayed()
         if piece is not None:
             self.gap = max(self.gap, piece.longest * rerun.spacing)
         return piece

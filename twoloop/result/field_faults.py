@@ -120,7 +120,7 @@ def _acceleration_faults(
 
     def evaluate(times: Array, rows: Array) -> Array:
         out = np.full(stored.shape, np.nan)
-        interpolator.complete(times, rows, out)
+        interpolator.fill_accelerations(times, rows, out)
         return out
 
     exact = evaluate(t, states)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array, check_path, shown
 from twoloop.kernels.data import indices
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.dense_solution import DenseSolution, Interpolator, Table, ranks_at
-from twoloop.run.record import OF_STEPS, FileStore, Record, Statistics, Status, read
+from twoloop.run.dense_solution import DenseSolution, Interpolator, StateTable, ranks_at
+from twoloop.run.record import STEP_ARRAYS, FileStore, Record, Statistics, Status, read_arrays
 
 FORMAT = "twoloop result 1"
 STATES = ("q", "v", "a", "lam")
@@ -26,7 +26,7 @@ EVENT_FIELDS = ("t_events", "q_events", "v_events")
 REQUIRED = ("t", *STATES, "h")  # arrays of every result
 OPTIONAL = (*COUNTS, "redundant", "atol", "untested")  # arrays that a result may have
 METADATA_FILE = "words.json"  # file of a folder with all fields that are not arrays
-STREAMED = ("t", *OF_STEPS, "sol_t", "sol_states", "sol_kinds")  # arrays that are written to a folder during the run
+STREAMED = ("t", *STEP_ARRAYS, "sol_t", "sol_states", "sol_kinds")  # arrays that are written to a folder during the run
 INTERRUPTED = (
     "The run was interrupted: its process died, or it raised an exception. The result contains what had been stored; "
     "information written at the end of a run, such as its cost and redundant rows, is missing."
@@ -49,7 +49,7 @@ def fields_of(result: Record, inside: bool = True) -> tuple[dict[str, NDArray[An
         arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
         metadata |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}
         if inside:
-            blocks = zip(*interpolator.interiors(table), strict=True)
+            blocks = zip(*interpolator.interior_blocks(table), strict=True)
             arrays["sol_interior_t"], arrays["sol_interior_states"] = map(np.concatenate, blocks)
     return arrays, metadata
 
@@ -93,7 +93,7 @@ def end_folder(store: FileStore, result: Record) -> None:
     arrays, metadata = fields_of(result, inside=False)
     for name in arrays.keys() - {*STREAMED, *STATES}:
         store.add(name, arrays[name])
-    for t, states in () if result.sol is None else result.sol.interpolator.interiors(result.sol.table):
+    for t, states in () if result.sol is None else result.sol.interpolator.interior_blocks(result.sol.table):
         store.add("sol_interior_t", t)
         store.add("sol_interior_states", states)
     metadata |= {"n_q": len(result.q), "untested": None if result.untested is None else bool(result.untested.all())}
@@ -147,7 +147,7 @@ def _read_folder(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """
     try:
         metadata = json.loads((path / METADATA_FILE).read_text(encoding="utf-8"))
-        arrays, n = read(path), int(metadata["n_q"])
+        arrays, n = read_arrays(path), int(metadata["n_q"])
         states = arrays.pop("states").T
     except Exception as error:  # the folder may contain anything
         raise ValueError(
@@ -189,7 +189,7 @@ def _read_file(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 
 def _solution(system: ConstrainedSystem, arrays: dict[str, Any], metadata: dict[str, Any]) -> DenseSolution:
     t, states = (np.ascontiguousarray(arrays[name]) for name in ("sol_t", "sol_states"))
-    table = Table(t, states, arrays["sol_kinds"])
+    table = StateTable(t, states, arrays["sol_kinds"])
     start, row, rtol = float(t[0]), states[0], metadata["sol_rtol"]
     ranks = ranks_at(system, start, row[: system.n_q], row[system.n_q : 2 * system.n_q], rtol)
     if metadata["sol_ranks"] != list(ranks):
@@ -200,7 +200,7 @@ def _solution(system: ConstrainedSystem, arrays: dict[str, Any], metadata: dict[
     atol = arrays.get("atol", np.full(system.n_q, rtol))  # absent in older files
     interpolator = Interpolator(system, start, row, rtol, atol, ranks)
     if "sol_interior_t" in arrays:
-        interpolator.keep(arrays["sol_interior_t"], arrays["sol_interior_states"])
+        interpolator.restore_interior_states(arrays["sol_interior_t"], arrays["sol_interior_states"])
     return DenseSolution(interpolator, table, metadata["sol_end"])
 
 

@@ -178,7 +178,7 @@ def animate(result: Record, path: str | os.PathLike[str], seconds: float | None)
 
 
 def _scene(result: Record, n_frames: int) -> Scene:
-    drawing = result._known("drawing")
+    drawing = result._description_value("drawing")
     times = np.linspace(result.t[0], result.t[-1], n_frames)
     path_times = np.linspace(result.t[0], result.t[-1], PATH_POINTS * (n_frames - 1) + 1)
     all_points = drawing.at(_positions(result, path_times))

@@ -33,8 +33,8 @@ from twoloop.kernels.layout import cached_run, lasting
 from twoloop.kernels.linalg.band import lapack_addresses
 from twoloop.methods.presets import code_for, identity, may_have_code, plans_for
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.dense_solution import DenseSolution, OutputInterpolation, Table, interpolator_of
-from twoloop.run.fallbacks import REPEAT_BELOW, closer_sampling, may_have_missed_changes
+from twoloop.run.dense_solution import DenseSolution, OutputInterpolation, StateTable, interpolator_of
+from twoloop.run.fallbacks import REPEAT_BELOW, gap_for_repetition, may_have_missed_changes
 from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, ignore_progress
 from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
@@ -42,7 +42,7 @@ from twoloop.run.parametric import ParametricRun, SharedSetup
 from twoloop.run.record import (
     DEFAULTS,
     INITIAL_COUNTS,
-    OF_STEPS,
+    STEP_ARRAYS,
     MemoryStore,
     OutputRequest,
     Record,
@@ -60,8 +60,8 @@ from twoloop.run.rerun import (
     find_nondeterminism,
     first_force,
 )
-from twoloop.run.run import CONTRADICTS, Run
-from twoloop.run.singular_positions import TURNED
+from twoloop.run.run import CONTRADICTION, Run
+from twoloop.run.singular_positions import TURN_RATIO
 from twoloop.run.singular_start import Branch, branch_at
 from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
@@ -70,9 +70,9 @@ Array = NDArray[np.float64]
 MAX_IDLE = 4  # largest number of idle integrators with equal options: one for each thread that integrates
 # number of chunks in the first call of compiled code, if no states are sampled for `StiffnessMonitor`: a longer call
 # would delay the answer to Ctrl-C by more than 0.1 s
-FIRST_CHUNKS = 4
-CALLS_SKIPPED = 16  # number of calls that do not use an integrator after a callback raised an exception in it
-STEP_FIELDS = (*OF_STEPS, "stats")  # fields of a result that are computed from the array of steps
+N_FIRST_CHUNKS = 4
+N_SKIPPED_CALLS = 16  # number of calls that do not use an integrator after a callback raised an exception in it
+STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 OTHER_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
 SHORT_RUN = 1e-3  # CPU time of the last run, s, below which elapsed time is recorded, as reading CPU time takes long
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
@@ -87,13 +87,13 @@ class Output(NamedTuple):
     time_limit: float | None  # limit of elapsed time, s
 
     @property
-    def between(self) -> Array | None:
+    def inner_times(self) -> Array | None:
         """Output times if they require interpolation, else None."""
         return None if self.at_ends else self.times
 
-    def request(self, run: Run) -> OutputRequest:
+    def as_request(self, run: Run) -> OutputRequest:
         """Return this output as an OutputRequest for `IntegrationLoop`."""
-        return OutputRequest(self.times, self.at_ends or run.lands, self.dense, None, MemoryStore())
+        return OutputRequest(self.times, self.at_ends or run.ends_at_outputs, self.dense, None, MemoryStore())
 
 
 STEPS = Output(None, False, False, None)  # output at the ends of all steps
@@ -103,7 +103,7 @@ STEPS = Output(None, False, False, None)  # output at the ends of all steps
 class MissedChanges:
     """Request to repeat a run that may have missed short changes of forces."""
 
-    every: float  # largest time between two evaluations in the repetition, s
+    max_gap: float  # largest time between two evaluations in the repetition, s
     cpu_time: float  # CPU time of the run to be repeated, s
 
 
@@ -144,12 +144,14 @@ class CachedIntegrator:
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
         # indices in `arrays.block` at which the states begin, and at which the report of a run with one state begins
-        self.states_from, self.width = self.arrays.report.size, len(run.state)
-        self.one_state_from = self.states_from - self.loops.N_HEAD - 1
+        self.states_begin, self.width = self.arrays.report.size, len(run.state)
+        self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
-        self.at_start = {name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")}
+        self.attributes_at_start = {
+            name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")
+        }
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
-        self.between = OutputInterpolation(run)
+        self.interpolation = OutputInterpolation(run)
         self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether generated code is called
         self.independent = self.arrays.start_rows.tobytes()  # bytes of the indices of independent rows
         self.redundancy = {self.independent: (run.redundant, run.rows_warning)}
@@ -157,15 +159,15 @@ class CachedIntegrator:
     @staticmethod
     def can_start(run: Run) -> bool:
         """Return whether compiled code can start this run: compiled callbacks, dense algebra, and no warning."""
-        return run.static is None and not run.start_warning and not run.system.called_in_python
+        return run.static_form is None and not run.start_warning and not run.system.called_in_python
 
     @staticmethod
     def can_provide(run: Run, output: Output, shared: SharedSetup | None) -> bool:
         """Return whether a cached integrator, which reuses its arrays, can provide the requested `output`."""
         # `sol` and interpolated output must agree; `sol` must not use arrays that are filled for other parameters
-        if output.dense and (output.between is not None or shared is not None):
+        if output.dense and (output.inner_times is not None or shared is not None):
             return False
-        return output.between is None or not (run.lands or run.kit.flags[FORM] == indices.AUGMENTED)
+        return output.inner_times is None or not (run.ends_at_outputs or run.kit.flags[FORM] == indices.AUGMENTED)
 
     def integrate(
         self,
@@ -188,7 +190,7 @@ class CachedIntegrator:
             self.skips -= 1
             return None
         if parametric is not None:
-            if parametric.use(system):
+            if parametric.use_parameters_of(system):
                 self.evaluation.system, arrays.last_start[loops.N_EQUAL] = parametric.system, loops.NEVER
         elif self.check_derivatives and not system.checked:
             return None
@@ -204,7 +206,7 @@ class CachedIntegrator:
             if n == loops.IN_DOUBT and self.evaluation.is_surely_consistent(0, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
         except Exception:  # raised by a callback: `IntegrationLoop` will handle it
-            self.skips, arrays.last_start[loops.N_EQUAL] = CALLS_SKIPPED, loops.NEVER
+            self.skips, arrays.last_start[loops.N_EQUAL] = N_SKIPPED_CALLS, loops.NEVER
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
@@ -214,13 +216,13 @@ class CachedIntegrator:
         if n < 0 or rows_differ or due or not all_steps or parametric is not None:
             if n in (loops.IN_DOUBT, loops.REFUSED):
                 return None
-            interrupts.listen()
+            interrupts.install_handlers()
             n_rows, n = arrays.filled.tolist()
             finished = self._finish(system, t1, q0, v0, output, interrupts, due, fields)
             if not isinstance(finished, tuple):
                 return finished
             (timed_states,) = finished
-        begin, end = self.one_state_from - n_rows - n * N_STEP_COLUMNS, self.states_from
+        begin, end = self.one_state_begin - n_rows - n * N_STEP_COLUMNS, self.states_begin
         data = arrays.block[begin : end if timed_states is not None else end + (1 + n_rows) * self.width].copy()
         fields["later"] = partial(
             _deferred_field, data, timed_states, self.run_fields, self.cpu_time, system, t1, self.options
@@ -247,7 +249,7 @@ class CachedIntegrator:
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
-        begin = self.one_state_from - n_rows - n_steps * N_STEP_COLUMNS
+        begin = self.one_state_begin - n_rows - n_steps * N_STEP_COLUMNS
         report = arrays.report[begin : begin + loops.N_REPORT].tolist()
         t, rows, steps = arrays.t[: 1 + n_rows], arrays.states[: 1 + n_rows], arrays.steps[:n_steps]
         if report[loops.IS_NEW]:
@@ -257,28 +259,28 @@ class CachedIntegrator:
                 return None
         if report[loops.END_CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.NOTHING_TO_CHECK]:
             self.loop_used = True
-            arguments = output.request(run), ignore_progress, output.time_limit, interrupts, False
+            arguments = output.as_request(run), ignore_progress, output.time_limit, interrupts, False
             loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
-            loop.resume(int(report[loops.END_CODE]), t[1:], rows[1:], steps, self.cpu_time)
-            record = loop.to_end(self.check_derivatives)
+            loop.add_first_chunk(int(report[loops.END_CODE]), t[1:], rows[1:], steps, self.cpu_time)
+            record = loop.integrate_to_end(self.check_derivatives)
             if record.status >= 0 and may_have_missed_changes(run):
-                return MissedChanges(closer_sampling(run), record.stats.cpu_time)
+                return MissedChanges(gap_for_repetition(run), record.stats.cpu_time)
             return fields_of(record, self.options, system, self.run_fields[-1], t1)
         timed_states = None
-        kinds = interval_kinds(run, steps) if output.dense or output.between is not None else NO_KINDS
-        if output.between is not None:
+        kinds = interval_kinds(run, steps) if output.dense or output.inner_times is not None else NO_KINDS
+        if output.inner_times is not None:
             began = time.process_time()
-            self.between.interpolate(output.between, t, rows, kinds, self.evaluation.pattern)
+            self.interpolation.interpolate(output.inner_times, t, rows, kinds, self.evaluation.pattern)
             self.cpu_time += time.process_time() - began
         if not self._compare_callbacks(t, rows, t1, bool(report[loops.IN_CHECKED_REGION]), due):
             arrays.last_start[loops.N_EQUAL] = loops.NEVER
             return None
         if output.dense:
-            table = Table(t.copy(), rows[:, : 3 * system.n_q].copy(), kinds)
+            table = StateTable(t.copy(), rows[:, : 3 * system.n_q].copy(), kinds)
             fields["sol"] = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
         if output.times is not None:
             ends = [0 if time == run.t0 else -1 for time in output.times.tolist()]
-            states = rows[ends] if output.at_ends else self.between.complete_rows(output.times)
+            states = rows[ends] if output.at_ends else self.interpolation.complete_rows(output.times)
             if states is None:
                 return None
             timed_states = output.times.copy(), states
@@ -297,15 +299,15 @@ class CachedIntegrator:
             run.redundant, run.rows_warning = self.redundancy[independent]
             self.run_fields, self.independent = (run.rank, run.redundant, self.run_fields[-1]), independent
         mass, derivatives = self.evaluation.mass, self.check_derivatives
-        return self.parametric is None or self.parametric.agrees(run.t0, q0, v0, t1, mass, derivatives)
+        return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _return_to_start(self) -> None:
         """Restore the attributes of the run, other than arrays, that `IntegrationLoop` may have changed."""
         run, self.loop_used = self.run, False
-        if run.plan is self.at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
+        if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
             # the run's own plan is unchanged, but its kit may have been renewed to load a step: use the new kit
-            self.at_start |= {"kit": run.kit, "functions": run.functions}
-        vars(run).update(self.at_start, crossings=[], jumps=[], lengths=[], substituted=False)
+            self.attributes_at_start |= {"kit": run.kit, "functions": run.functions}
+        vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
     def _compare_callbacks(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
         """Check callbacks at sampled states of the run outside the checked region; return whether they are correct.
@@ -380,7 +382,7 @@ RECHECK_PIVOT = 0.1
 
 def first_chunk(run: Run) -> int:
     """Return the largest number of attempted steps, which is the largest number of states, in the first chunk."""
-    return max(LANES, run.chunk * (FIRST_CHUNKS if run.plan.stable_to is None else 1))
+    return max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
 
 
 def arrays_of(
@@ -410,7 +412,7 @@ def arrays_of(
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     start_constants: tuple[float, ...]
     start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
-    start_constants += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
+    start_constants += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTION
     start_constants += mass_kind, RECHECK_PIVOT * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
     step_fields = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
@@ -423,7 +425,7 @@ def arrays_of(
         **{"clock": run.clock, "control": run.control, "tolerances": run.tolerances, "options": run.plan.options},
         **{"state": run.state, "new_state": run.new_state, "lasting": lasting_floats, "lasting_integers": integers},
         **{"saved": np.empty(numbers.size + lasting_floats.size + run.state.size), "saved_integers": integers.copy()},
-        **{"constants": np.array([*start_constants, *step_fields, run.near, TURNED, REPEAT_BELOW])},
+        **{"constants": np.array([*start_constants, *step_fields, run.near_threshold, TURN_RATIO, REPEAT_BELOW])},
         lapack=np.array(lapack_addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
         **{"bounds": BOUNDS, "scratch": np.zeros(pivots.workspace_size(n_rows, system.n_q)), "expected": expected},
         **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
@@ -493,7 +495,7 @@ def cached_result(
         entries = (entry,) if isinstance(entry, CacheEntry) else ()
     run = None
     if not entries and not system.called_in_python:
-        interrupts.listen()
+        interrupts.install_handlers()
         q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
         run, entry = set_up(system, t0, t1, q0, v0, options)
         if entry is None or entry.idle is None or not CachedIntegrator.can_provide(run, output, None):
@@ -505,7 +507,7 @@ def cached_result(
         try:
             integrator = entry.idle.pop()
         except IndexError:
-            interrupts.listen()
+            interrupts.install_handlers()
             run = entry.run.copy() if run is None else run
             integrator = CachedIntegrator(run, system, entry.code, entry.definite, options, entry.shared)
         outcome = integrator.integrate(system, t0, t1, q0, v0, output, interrupts)
@@ -538,7 +540,7 @@ def set_up(
     if entry is not None:
         run, code = entry.run.copy(), entry.code
         if entry.t1 != t1:
-            options.set_sizes(run, t1)
+            options.set_step_sizes(run, t1)
     for each in entries:
         if run is None and each.for_other_starts:
             run, entry, code = _copy_for_start(each, system, t0, t1, q0, v0, options), each, each.code
@@ -565,7 +567,9 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
         system, options.method, options.step_size is not None, options.compiled
     )
     definite = has_definite_mass(system, t0, q0)
-    for_other_starts = run.static is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
+    for_other_starts = (
+        run.static_form is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
+    )
     start = t0, q0.tobytes(), v0.tobytes()
     idle: list[CachedIntegrator] | None = [] if for_other_starts and CachedIntegrator.can_start(run) else None
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
@@ -601,7 +605,7 @@ def _copy_for_start(
         return None
     run = entry.run.from_start(t0, q0, v0) if has_definite_mass(system, t0, q0) == entry.definite else None
     if run is not None:
-        options.set_sizes(run, t1)
+        options.set_step_sizes(run, t1)
     return run
 
 
@@ -620,12 +624,12 @@ def _new_run(
 
     system, derived = with_derived_callbacks(system, check)
     run, code = _run_from(system, t0, q0, v0, options, derived, check)
-    if run.static is None:
+    if run.static_form is None:
         branch = branch_at(system, t0, run.state, run.rank, options.atol + options.rtol * np.abs(v0).max())
         run.starts_singular = branch is not None
         if isinstance(branch, Branch) and not fixed:
             beside, other = _run_from(system, t0, branch.q, branch.v, options, derived, check)
-            if beside.rank == branch.rank and beside.static is None:
+            if beside.rank == branch.rank and beside.static_form is None:
                 run, code = beside, other
                 run.move_to_singular_start(t0, q0, v0, branch.a, branch.length)
     if new:
@@ -636,7 +640,7 @@ def _new_run(
             raise ValueError(difference)
     if first_value is not None and not any("force" in each.kinds for each in run.traced):
         system.derived.setdefault(FIRST_FORCE, [first_value])
-    options.set_sizes(run, t1)
+    options.set_step_sizes(run, t1)
     if options.max_steps is not None:
         run.control[run.a.MAX_STEPS] = options.max_steps
     return run, code

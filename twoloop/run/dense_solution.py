@@ -37,7 +37,7 @@ MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
 N_REPAIR = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
 
 
-class Table(NamedTuple):
+class StateTable(NamedTuple):
     """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), and kinds of the n - 1 intervals."""
 
     t: Array
@@ -58,7 +58,7 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 
 
 class Interpolator:
-    """Interpolator between the states of a `Table`, with a workspace of its own.
+    """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
     Parameters
     ----------
@@ -97,31 +97,31 @@ class Interpolator:
         self.tolerances[RTOL] = rtol
         self.parts = max((plan.parts for plan in self.plans.values()), default=N_REPAIR)
         self.parts = max(self.parts, N_REPAIR)
-        self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
+        self.static_form = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
-        self._prepare()
+        self._create_workspace()
         self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of them
         # interior states of intervals, with both ends: (times, states) by the time at which the interval begins
-        self.filled: dict[float, tuple[Array, Array]] = {}
+        self.interior_states: dict[float, tuple[Array, Array]] = {}
         # memories of crossing steps, which contain their polynomials, by the times at which the intervals begin
-        self.across: dict[float, Array] = {}
-        self.accurate: set[float] = set()  # first times of intervals whose polynomials need no interior states
-        self.judges = True  # whether interior states may be computed; false if they were read from a file
-        self._allocate()
+        self.crossing_memories: dict[float, Array] = {}
+        self.accurate_intervals: set[float] = set()  # first times of intervals that need no interior states
+        self.may_divide = True  # whether interior states may be computed; false if they were read from a file
+        self._allocate_scratch()
 
-    def _prepare(self) -> None:
-        """Create the workspace and the kits for the current form of linear algebra, `self.static`."""
+    def _create_workspace(self) -> None:
+        """Create the workspace and the kits for the current form of linear algebra, `self.static_form`."""
         system, t0, row = self.arguments[:3]
-        q0, static = row[: system.n_q], self.static
+        q0, static = row[: system.n_q], self.static_form
         for plan in self.plans.values():
             loaded(plan.second)  # load the step now: `result.sol` may need it at any time
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
         self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static, self.matrices)
-        self._start()
+        self._initialize_workspace()
 
-    def _start(self) -> None:
+    def _initialize_workspace(self) -> None:
         """Compute the accelerations at the start, which initializes the workspace."""
         from twoloop.kernels import advance
 
@@ -129,23 +129,23 @@ class Interpolator:
         self.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
-        self.repairs: dict[bool, tuple[Plan, Any]] = {}
+        self.repair_plans: dict[bool, tuple[Plan, Any]] = {}
 
-    def begin(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
+    def reset(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
         """Reset the interpolator for another run with the same kits; `pattern`: 1 at entries of [C_q; A], else 0."""
         self.arguments = (system, t0, row.copy(), *self.arguments[3:])
-        self.system, self.judges = system, True
-        self.filled, self.across, self.accurate = {}, {}, set()
+        self.system, self.may_divide = system, True
+        self.interior_states, self.crossing_memories, self.accurate_intervals = {}, {}, set()
         prepare_workspace(self.work, system, self.kit.flags, pattern, row[: system.n_q], self.rtol, 0.0)
-        self._start()
+        self._initialize_workspace()
         self.nodes[:], self.scratch[:], self.rows[:] = 0.0, 0.0, 0.0
 
-    def _become_dense(self) -> None:
+    def _switch_to_dense_form(self) -> None:
         """Replace the static form of linear algebra, after a failure, by the dense form."""
-        self.static = None
-        self._prepare()
+        self.static_form = None
+        self._create_workspace()
 
-    def _allocate(self) -> None:
+    def _allocate_scratch(self) -> None:
         """Allocate scratch arrays for the coefficients of two polynomials."""
         n_nodes = 3 * max(indices.WINDOW, self.parts + 1)
         n = self.system.n_q
@@ -155,20 +155,20 @@ class Interpolator:
         *arguments, plans = self.arguments
         # generated code is called at addresses that are valid in this process only: copies do not use it
         plans = {kind: plan.changed(own=()) if plan.own else plan for kind, plan in plans.items()}
-        state = {name: getattr(self, name) for name in ("parts", "filled", "across", "judges")}
+        state = {name: getattr(self, name) for name in ("parts", "interior_states", "crossing_memories", "may_divide")}
         return type(self), (*arguments, plans), state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._allocate()
+        self._allocate_scratch()
 
-    def states(self, table: Table, times: Array) -> Array:
+    def states(self, table: StateTable, times: Array) -> Array:
         """Return rows [q, v] at `times`, which must be sorted and within the table."""
         if len(times) == 0 or len(table.t) == 1:
             return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
         intervals = np.searchsorted(table.t[1:-1], times, side="right")
         (first,) = np.concatenate([[True], intervals[1:] != intervals[:-1]]).nonzero()
-        groups = _groups(table, intervals[first])
+        groups = _interval_groups(table, intervals[first])
         groups[:, indices.FIRST_TIME], groups[:-1, indices.END_TIME] = first, first[1:]
         groups[-1, indices.END_TIME] = len(times)
         out = np.empty((len(times), 2 * self.system.n_q))
@@ -183,9 +183,9 @@ class Interpolator:
         self._record_failures(failures, len(times))
         return out
 
-    def within(self, table: Table, t: float) -> Callable[[float], Array]:
+    def within(self, table: StateTable, t: float) -> Callable[[float], Array]:
         """Return a function of one time that returns [q, v], for times in the interval of the table that contains t."""
-        groups = _groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
+        groups = _interval_groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, indices.END_TIME] = 1
         self._divide_where_needed(table, groups)
         divided, divided_groups, other_groups = self._split_divided(table, groups)
@@ -204,53 +204,55 @@ class Interpolator:
         if failures > 0 and self.warns:
             _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
-    def _interpolate(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
+    def _interpolate(self, table: StateTable, groups: Groups, times: Array, out: Array) -> int:
         """Store rows [q, v] at the times of the groups in `out` (n, 2 n_q); return the number of failed projections."""
         inputs = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.scratch, out)
         failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
-        if failures > 0 and self.static is not None:
-            self._become_dense()
+        if failures > 0 and self.static_form is not None:
+            self._switch_to_dense_form()
             failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
         return failures
 
-    def _divide_where_needed(self, table: Table, groups: Groups) -> None:
+    def _divide_where_needed(self, table: StateTable, groups: Groups) -> None:
         """Compute and cache interior states of each interval whose polynomial is not accurate without them."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
-        is_new = np.array([t not in self.accurate and t not in self.filled for t in begins])
-        if not self.judges or not is_new.any():
+        is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in begins])
+        if not self.may_divide or not is_new.any():
             return
-        if len(self.filled) > MAX_DIVIDED:
-            self.filled.clear()
-            is_new = np.array([t not in self.accurate for t in begins])
-        if len(self.accurate) > MAX_ACCURATE:
-            self.accurate.clear()
+        if len(self.interior_states) > MAX_DIVIDED:
+            self.interior_states.clear()
+            is_new = np.array([t not in self.accurate_intervals for t in begins])
+        if len(self.accurate_intervals) > MAX_ACCURATE:
+            self.accurate_intervals.clear()
         groups = groups[is_new & (groups[:, indices.KIND] != indices.JUMP)]
         for kind, plan in self.plans.items():
             has_kind = groups[:, indices.KIND] == kind
-            self.filled.update(self._divide(table, plan, self.kits[kind], groups[has_kind, indices.FIRST_OWN]))
+            self.interior_states.update(self._divide(table, plan, self.kits[kind], groups[has_kind, indices.FIRST_OWN]))
         for i in groups[:, indices.FIRST_OWN].tolist():
-            if (memory := self.across.get(float(table.t[i]))) is not None:
-                self.filled[float(table.t[i])] = self._states_of_crossing(table, i, memory)
-        is_divided = np.array([t in self.filled for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool)
+            if (memory := self.crossing_memories.get(float(table.t[i]))) is not None:
+                self.interior_states[float(table.t[i])] = self._states_of_crossing(table, i, memory)
+        is_divided = np.array(
+            [t in self.interior_states for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool
+        )
         divided, own_groups, undivided = self._split_divided(table, groups)
         errors = np.zeros(len(groups))
         errors[is_divided], errors[~is_divided] = self._errors(divided, own_groups), self._errors(table, undivided)
         # if the plan for this kind of interval failed to divide it, the interval is too long for a polynomial
         errors[~is_divided & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
         is_accurate = errors <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
-        self.accurate.update(table.t[groups[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
+        self.accurate_intervals.update(table.t[groups[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
         for k in (~is_accurate).nonzero()[0]:
-            self._repair(table, groups[k], float(errors[k]))
+            self._repair_interval(table, groups[k], float(errors[k]))
 
-    def _errors(self, table: Table, groups: Groups) -> Array:
+    def _errors(self, table: StateTable, groups: Groups) -> Array:
         """Return estimated residuals (one per group) of the polynomials of intervals, relative to the tolerances."""
         out, groups = np.zeros(len(groups)), np.ascontiguousarray(groups)
         arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.scratch, self.rows, out
         entry_point(self.kernels.estimate_errors)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
-    def _repair(self, table: Table, group: Groups, smallest: float) -> None:
+    def _repair_interval(self, table: StateTable, group: Groups, smallest: float) -> None:
         """Cache other states for the polynomial of an interval if they reduce its residual, `smallest` on entry.
 
         Three sets are tried: the states of a step across a singular position, the states of N_REPAIR steps, and only
@@ -266,21 +268,21 @@ class Interpolator:
         for candidate in candidates:
             if smallest <= MAX_ERROR_ACROSS or (interior := candidate()) is None:
                 continue
-            new_table = Table(np.ascontiguousarray(interior[0]), np.ascontiguousarray(interior[1]), table.kinds)
+            new_table = StateTable(np.ascontiguousarray(interior[0]), np.ascontiguousarray(interior[1]), table.kinds)
             new_group, last = group[None, :].copy(), len(new_table.t) - 1
             new_group[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = 0, last, 0, last
             error = float(self._errors(new_table, new_group)[0])
             if error < smallest or not np.isfinite(smallest):
                 smallest = error
-                self.filled[begin] = new_table.t, new_table.states
-        if begin not in self.filled:
-            self.accurate.add(begin)
+                self.interior_states[begin] = new_table.t, new_table.states
+        if begin not in self.interior_states:
+            self.accurate_intervals.add(begin)
 
-    def _cross_interval(self, table: Table, i: int) -> tuple[Array, Array] | None:
+    def _cross_interval(self, table: StateTable, i: int) -> tuple[Array, Array] | None:
         """Return times and states in interval i, computed by a crossing step, see crossing_step.py; None on failure."""
         from twoloop.kernels.steps import crossing_step as kernels
 
-        if self.static is not None:
+        if self.static_form is not None:
             return None
         plan, (begin, end), n = crossing_plan(self.system.n_q), table.t[i : i + 2].tolist(), self.system.n_q
         kernels.begin(plan.memory, 0.0, begin)
@@ -293,7 +295,7 @@ class Interpolator:
         succeeded = plan.memory[-kernels.N_STORED :][kernels.END] > begin
         return self._states_of_crossing(table, i, plan.memory) if succeeded else None
 
-    def _states_of_crossing(self, table: Table, i: int, memory: Array) -> tuple[Array, Array]:
+    def _states_of_crossing(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
         """Return times and states in interval i from the polynomial of a crossing step, which is stored in `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
@@ -307,7 +309,7 @@ class Interpolator:
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
         """Return plan and kit of N_REPAIR steps that divide an interval of this kind with an inaccurate polynomial."""
         is_stiff = kind == indices.VELOCITIES
-        if is_stiff not in self.repairs:
+        if is_stiff not in self.repair_plans:
             from twoloop.methods.dop853 import DOP853
             from twoloop.methods.runge_kutta import RungeKutta
             from twoloop.methods.tableaux import radau_iia
@@ -318,27 +320,27 @@ class Interpolator:
             q0 = self.arguments[2][: self.system.n_q]
             if plan.matrices > self.matrices:
                 self.matrices = plan.matrices
-                if self.static is not None:
-                    self.static = static_form(self.system, self.arguments[1], q0, *self.plans.values(), plan)
-                self._prepare()
-            self.repairs[is_stiff] = plan, kit_of(self.system, self.arguments[1], q0, plan, self.static)
-        return self.repairs[is_stiff]
+                if self.static_form is not None:
+                    self.static_form = static_form(self.system, self.arguments[1], q0, *self.plans.values(), plan)
+                self._create_workspace()
+            self.repair_plans[is_stiff] = plan, kit_of(self.system, self.arguments[1], q0, plan, self.static_form)
+        return self.repair_plans[is_stiff]
 
-    def _split_divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
+    def _split_divided(self, table: StateTable, groups: Groups) -> tuple[StateTable, Groups, Groups]:
         """Return a Table of the cached interior states, the groups of its intervals, and the groups without states."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
-        is_divided = np.array([t in self.filled for t in begins], dtype=bool)
-        pairs = [self.filled[t] for t in begins if t in self.filled]
+        is_divided = np.array([t in self.interior_states for t in begins], dtype=bool)
+        pairs = [self.interior_states[t] for t in begins if t in self.interior_states]
         own_groups = groups[is_divided]
         if not pairs:
-            return Table(table.t[:0], table.states[:0], table.kinds), own_groups, groups
+            return StateTable(table.t[:0], table.states[:0], table.kinds), own_groups, groups
         t, states = zip(*pairs, strict=True)
         sizes = np.array(list(map(len, t)), dtype=np.int64)
         own_groups[:, indices.LAST_OWN] = own_groups[:, indices.HIGH] = np.cumsum(sizes) - 1
         own_groups[:, indices.FIRST_OWN] = own_groups[:, indices.LOW] = own_groups[:, indices.LAST_OWN] - sizes + 1
-        return Table(np.concatenate(t), np.concatenate(states), table.kinds), own_groups, groups[~is_divided]
+        return StateTable(np.concatenate(t), np.concatenate(states), table.kinds), own_groups, groups[~is_divided]
 
-    def _divide(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
+    def _divide(self, table: StateTable, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
         """Divide intervals into `plan.parts` steps, or fewer if steps fail; return {first time: (times, states)}."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
@@ -358,37 +360,37 @@ class Interpolator:
             intervals = intervals[~succeeded]
         return interior_states
 
-    def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
-        """Yield the interior states of all divided intervals, in blocks, for a file; `keep` restores these states.
+    def interior_blocks(self, table: StateTable) -> Iterator[tuple[Array, Array]]:
+        """Yield interior states of all divided intervals, in blocks, for a file; see `restore_interior_states`.
 
         A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q) of m intervals; missing states are NaN.
         """
-        groups = _groups(table, np.arange(len(table.t) - 1))
+        groups = _interval_groups(table, np.arange(len(table.t) - 1))
         for block in _blocks(groups):
             self._divide_where_needed(table, block)
             begins = table.t[block[:, indices.FIRST_OWN]].tolist()
-            pairs = [self.filled[t] for t in begins if t in self.filled]
+            pairs = [self.interior_states[t] for t in begins if t in self.interior_states]
             shape = (len(pairs), self.parts + 1)
             t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
             for row, (own_t, own) in enumerate(pairs):
                 t[row, : len(own_t)], states[row, : len(own)] = own_t, own
             yield t, states
 
-    def keep(self, t: Array, states: Array) -> None:
-        """Replace the cached interior states by those that `interiors` yielded; compute no others from now on."""
-        self.parts, self.judges = t.shape[1] - 1, False
-        self._allocate()
+    def restore_interior_states(self, t: Array, states: Array) -> None:
+        """Replace the cached interior states by those that `interior_plans` yielded; compute no others from now on."""
+        self.parts, self.may_divide = t.shape[1] - 1, False
+        self._allocate_scratch()
         sizes = np.isfinite(t).sum(axis=1).tolist()
-        self.filled = {
+        self.interior_states = {
             float(own_t[0]): (own_t[:n], own[:n]) for own_t, own, n in zip(t, states, sizes, strict=True) if n
         }
 
-    def complete(self, times: Array, states: Array, out: Array) -> None:
+    def fill_accelerations(self, times: Array, states: Array, out: Array) -> None:
         """Store [a, lam] in `out` for states on the constraints, given `times` and rows [q, v]; NaN on failure."""
         complete, times, states = entry_point(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
         failures = complete(self.kit, self.work, times, states, out)
-        if failures > 0 and self.static is not None:
-            self._become_dense()
+        if failures > 0 and self.static_form is not None:
+            self._switch_to_dense_form()
             failures = complete(self.kit, self.work, times, states, out)
         self.failures = failures
         if failures > 0 and self.warns:
@@ -400,7 +402,7 @@ def _blocks(groups: Groups) -> list[Groups]:
     return [groups[begin : begin + MAX_DIVIDED] for begin in range(0, len(groups), MAX_DIVIDED)]
 
 
-def _groups(table: Table, intervals: Groups) -> Groups:
+def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
     """Return groups, rows of indices for kernels, of `intervals` (indices); the indices of output times are 0."""
     groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
@@ -444,13 +446,13 @@ class OutputInterpolation:
         `pattern`: 1 at the entries of the constraint rows at the start, 0 elsewhere.
         """
         run = self.run
-        table = Table(t, rows[:, : 3 * run.system.n_q].copy(), kinds)
+        table = StateTable(t, rows[:, : 3 * run.system.n_q].copy(), kinds)
         interpolator = self._interpolator
         if interpolator is None:
             interpolator = interpolator_of(run, table.states[0])
             interpolator.warns = False
         else:
-            interpolator.begin(run.system, run.t0, table.states[0], pattern)
+            interpolator.reset(run.system, run.t0, table.states[0], pattern)
         self._interpolator, self._rows = interpolator, interpolator.states(table, times)
 
     def complete_rows(self, times: Array) -> Array | None:
@@ -459,8 +461,8 @@ class OutputInterpolation:
         if interpolator is None or interpolator.failures > 0:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
-        interpolator.complete(times, rows, a_and_lam)
-        if interpolator.static is not None or interpolator.repairs:  # its workspace may not suit another run
+        interpolator.fill_accelerations(times, rows, a_and_lam)
+        if interpolator.static_form is not None or interpolator.repair_plans:  # its workspace may not suit another run
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 
@@ -468,7 +470,7 @@ class OutputInterpolation:
 def interpolator_of(run: Run, row: Array) -> Interpolator:
     """Return a new interpolator for the states of a run; `row` is [q, v, a] at its start."""
     ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[indices.ATOL :]
-    interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
+    interiors = {kind: plan.fresh() for kind, plan in run.interior_plans.items()}
     return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)
 
 
@@ -501,22 +503,22 @@ class DenseState:
         return columns if np.ndim(self.t) else columns[:, 0]
 
     @cached_property
-    def _completed(self) -> Array:
+    def _a_and_lam(self) -> Array:
         system, times = self._interpolator.system, np.atleast_1d(self.t)[self._order]
         out = np.empty((len(times), system.n_q + system.n_c + system.n_a))
         with signals_of(system):
-            self._interpolator.complete(times, self._rows, out)
+            self._interpolator.fill_accelerations(times, self._rows, out)
         return out
 
     @property
     def a(self) -> Array:
         """Accelerations."""
-        return self._unsorted(self._completed[:, : self._interpolator.system.n_q])
+        return self._unsorted(self._a_and_lam[:, : self._interpolator.system.n_q])
 
     @property
     def lam(self) -> Array:
         """Multipliers."""
-        return self._unsorted(self._completed[:, self._interpolator.system.n_q :])
+        return self._unsorted(self._a_and_lam[:, self._interpolator.system.n_q :])
 
 
 class DenseSolution:
@@ -556,7 +558,7 @@ class DenseSolution:
     True
     """
 
-    def __init__(self, interpolator: Interpolator, table: Table, t_max: float):
+    def __init__(self, interpolator: Interpolator, table: StateTable, t_max: float):
         self.interpolator, self.table = interpolator, table
         self.t_min, self.t_max = float(table.t[0]), t_max
 

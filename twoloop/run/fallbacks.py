@@ -17,7 +17,7 @@ from twoloop.methods.plan import Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import warn_user
 from twoloop.run.run import Run
-from twoloop.run.singular_positions import Place, least_singular_value
+from twoloop.run.singular_positions import TimedState, least_singular_value
 from twoloop.run.workspace import kit_for_plan, kit_of
 
 # limits of a ratio: shortest change of forces or drives in a run, over the longest time between two evaluations. Below
@@ -35,7 +35,7 @@ def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
     return bool(clock[a.SHORTEST_CHANGE] < limit * clock[a.WIDEST_SAMPLING])
 
 
-def closer_sampling(run: Run) -> float:
+def gap_for_repetition(run: Run) -> float:
     """Return the largest time between evaluations, s, for a repetition of a run that may have missed short changes."""
     a, clock = run.a, run.clock
     return float(max(clock[a.SHORTEST_CHANGE] / EVALUATIONS_PER_CHANGE, clock[a.WIDEST_SAMPLING] / MAX_REFINEMENT))
@@ -56,8 +56,8 @@ def warn_of_missed_changes(run: Run) -> str:
 
 Array = NDArray[np.float64]
 
-CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
-NEGLIGIBLE = 1e-12  # singular value, relative to the largest, below which it counts as zero (because of redundant rows)
+N_CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
+NEGLIGIBLE_RATIO = 1e-12  # largest singular value that counts as zero (as of redundant rows), relative to the largest
 MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to their right-hand side
 
 
@@ -70,16 +70,16 @@ def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     q = corrected_positions(system, t, q)
     equations, norms, largest = scaled_equations(system, t, q)
     right_side = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / norms * largest])
-    change = np.linalg.lstsq(equations, right_side, rcond=NEGLIGIBLE)[0]
+    change = np.linalg.lstsq(equations, right_side, rcond=NEGLIGIBLE_RATIO)[0]
     if not np.abs(equations @ change - right_side).max() <= MAX_RESIDUAL * np.abs(right_side).max():
         return None
     return np.concatenate([q, v + change[: system.n_q]])
 
 
 def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """Return positions projected onto the constraints by CORRECTIONS steps of Newton's method."""
-    for _ in range(CORRECTIONS if system.n_c > 0 else 0):
-        q = q - np.linalg.lstsq(system.jacobian(t, q), system.constraint(t, q), rcond=NEGLIGIBLE)[0]
+    """Return positions projected onto the constraints by N_CORRECTIONS steps of Newton's method."""
+    for _ in range(N_CORRECTIONS if system.n_c > 0 else 0):
+        q = q - np.linalg.lstsq(system.jacobian(t, q), system.constraint(t, q), rcond=NEGLIGIBLE_RATIO)[0]
     return q
 
 
@@ -97,8 +97,8 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
 STEP_RATIOS = tuple(0.85**k for k in range(28))
 # larger step sizes, relative to H_LONG, to try if too few nodes of a step are beyond the singular position
 LARGER_RATIOS = tuple(1.4**k for k in range(1, 7))
-# The distance of a state from a singular position is its smallest pivot of C_q over the largest such pivot so far.
-FAR = 0.2  # distance from a singular position from which on a state may be the base of the polynomial across it
+# distances from a singular position: smallest pivot of C_q at a state, relative to the largest such pivot so far
+FAR_BEFORE = 0.2  # smallest distance from a singular position of a base, at which the polynomial across it begins
 # limits of steps across a singular position. STRICT: those of the run. WIDER: the longest time without an evaluation
 # is GAP_FACTOR times as long, or unlimited if forces cannot be short. LOOSER: as WIDER, with larger tolerances
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
@@ -109,20 +109,21 @@ class Origin(NamedTuple):
     """Origin and limits of polynomials across a singular position, for one series of attempts."""
 
     earliest: float  # earliest time at which nodes may lie, s
-    base: Place | None  # earlier state through which the polynomial goes; None: it begins at the current state
+    base: TimedState | None  # earlier state through which the polynomial goes; None: it begins at the current state
     limits: int = STRICT  # STRICT, WIDER or LOOSER
-    beyond: bool = False  # whether the polynomial may end beyond the end of the run
+    may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# largest age of a base, s: LONGEST_PAST times H_LONG, or if longer, FARTHEST times the mirrored step size of _find_base
-LONGEST_PAST, FARTHEST = 1.5, 4.0
+# largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times a step from the
+# current state to its mirror image beyond the singular position (see _find_base)
+MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
 # ratio of the distance of an earlier state to that of the base below which it is beyond another singular position
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
-CLEAR = 0.3  # distance (see FAR) from a singular position from which on the run continues with its own method
+FAR_BEYOND = 0.3  # smallest distance beyond a singular position at which the run continues with its own method
 
 
-def may_cross(run: Run, code: int) -> bool:
+def requires_crossing(run: Run, code: int) -> bool:
     """Return whether the code that `advance` returned requires steps across a singular position."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
@@ -140,7 +141,7 @@ def switch_method(run: Run) -> None:
     run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` never changes, and needs no copy
     _renew_kit(run)
     run.substituted = True
-    run.control_by(run.plan)
+    run.write_step_control(run.plan)
     run.limit_steps()
     run.clock[run.a.FAILURE_CODE] = indices.DONE
     run.clock[run.a.H_NEXT] = run.clock[run.a.H_FAILED]
@@ -155,14 +156,14 @@ def load_next_step(run: Run) -> None:
 
 def _renew_kit(run: Run) -> None:
     """Replace the kit of a run by one that calls the steps of the run's current plan."""
-    if run.static is None:
+    if run.static_form is None:
         run.kit = kit_for_plan(run.system, run.functions.flags, run.plan)
     else:
-        run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static)
+        run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static_form)
     run.functions = run.kit.functions
 
 
-def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
+def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     """Return the plan and the array `control` of steps across a singular position, and prepare the first step.
 
     See kernels/steps/crossing_step.py. `past`: states of the last accepted steps, oldest first; may be empty.
@@ -172,9 +173,9 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
 
     plan = crossing_plan(run.system.n_q)
     earliest, fixed = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
-    base, run.mirrored = None, 0.0
+    base, run.mirrored_size = None, 0.0
     if not fixed:
-        base, run.mirrored = _find_base(run, [place for place in past if place[0] >= earliest])
+        base, run.mirrored_size = _find_base(run, [place for place in past if place[0] >= earliest])
     # try several origins: earlier accelerations may precede a jump of a force; there may be too few of them near the
     # start, or too few later ones near the end; from an old base the polynomial may be too long
     longest, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
@@ -190,7 +191,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
-    run.pieces = []  # an earlier run of a cached integrator may have ended within a polynomial
+    run.piece_ends = []  # an earlier run of a cached integrator may have ended within a polynomial
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else NODE_GAP / (1.0 - BACK)
     clock[a.LIMIT_AGE] = 0.0
@@ -205,29 +206,31 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     a, clock = run.a, run.clock
     earliest, base, limits, beyond = run.origins.pop(0)
     begin(plan.memory, clock[a.LARGEST_PIVOT], earliest, base)
-    run.looser = run.tolerances
+    run.crossing_tolerances = run.tolerances
     if limits != STRICT:
-        run.looser = run.tolerances.copy()
-        run.looser[indices.GAP] *= GAP_FACTOR if any(run.short_forces) else np.inf
+        run.crossing_tolerances = run.tolerances.copy()
+        run.crossing_tolerances[indices.GAP] *= GAP_FACTOR if any(run.short_forces) else np.inf
     if limits == LOOSER:
-        run.looser[[indices.RTOL, indices.LEAST]] *= TOLERANCE_FACTOR
-        run.looser[indices.ATOL :] *= TOLERANCE_FACTOR
+        run.crossing_tolerances[[indices.RTOL, indices.LEAST]] *= TOLERANCE_FACTOR
+        run.crossing_tolerances[indices.ATOL :] *= TOLERANCE_FACTOR
     if control[a.FIXED_STEP] == 0.0:
-        control[a.MAX_STEP] = min(run.max_step, run.looser[indices.GAP] / control[a.MAX_EVALUATION_GAP])
+        control[a.MAX_STEP] = min(run.max_step, run.crossing_tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     longest, allowed, time_left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
     min_size = time_left if beyond else 0.0
     if not beyond and control[a.FIXED_STEP] == 0.0:
         allowed = min(allowed, time_left)
-    first_size = max(longest, min(run.mirrored, LARGER_RATIOS[-1] * longest))
-    run.lengths = [size for size in sizes_across(first_size, allowed) if size > min_size]
-    run.longer = [longest * part for part in LARGER_RATIOS if max(first_size, min_size) < longest * part <= allowed]
-    if not run.lengths:
-        run.lengths, run.longer = run.longer or [min(first_size, allowed)], []
-    clock[a.H_NEXT], clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
-    run.crossed = float(clock[a.H_NEXT])
+    first_size = max(longest, min(run.mirrored_size, LARGER_RATIOS[-1] * longest))
+    run.sizes_to_try = [size for size in sizes_across(first_size, allowed) if size > min_size]
+    run.larger_sizes = [
+        longest * part for part in LARGER_RATIOS if max(first_size, min_size) < longest * part <= allowed
+    ]
+    if not run.sizes_to_try:
+        run.sizes_to_try, run.larger_sizes = run.larger_sizes or [min(first_size, allowed)], []
+    clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
+    run.crossing_size = float(clock[a.H_NEXT])
 
 
-def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
+def _find_base(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
     """Return the base of the polynomial, and the mirrored step size, s.
 
     The base is the latest state in `past` that is far from the singular position; else the farthest one, or None if the
@@ -238,16 +241,20 @@ def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     singular_value = least_singular_value(run.system, t, run.state[:n], run.rank)
     farthest = distance_now = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
     scale = distance_now / singular_value if singular_value > 0.0 else np.inf
-    base: Place | None = None
-    step_size, max_age = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
+    base: TimedState | None = None
+    step_size, max_age = 0.0, MAX_AGE_IN_H_LONG * float(run.clock[a.H_LONG])
     for time, state in reversed(past):
         distance = scale * least_singular_value(run.system, time, state[:n], run.rank)
-        if (farthest >= FAR and step_size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > max_age:
+        if (
+            (farthest >= FAR_BEFORE and step_size > 0.0)
+            or distance < MIN_DISTANCE_RATIO * farthest
+            or t - time > max_age
+        ):
             break
         if distance > farthest:
             step_size = 2.0 * distance_now * (t - time) / (distance - distance_now)
-            max_age = max(max_age, FARTHEST * step_size)
-            if farthest < FAR:
+            max_age = max(max_age, MAX_AGE_IN_MIRRORED * step_size)
+            if farthest < FAR_BEFORE:
                 farthest, base, step_size = distance, (time, state.copy()), step_size + t - time
     return base, step_size
 
@@ -268,7 +275,7 @@ def crossing_kit(kit: Kit) -> Kit:
     return attributes["crossing"]  # type: ignore[no-any-return]
 
 
-def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: int) -> tuple[Plan, Array, int]:
+def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: int) -> tuple[Plan, Array, int]:
     """Return plan, controls and code with which the loop continues after an attempt to cross a singular position.
 
     The next step is the next piece of the polynomial, an attempt with another size, or a step of the run's own method.
@@ -278,42 +285,42 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
     a, clock = run.a, run.clock
     end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # time at which the polynomial ends; -inf: none
     # the current time, with a margin because the end of a piece may have a rounding error
-    now = float(clock[a.T] + kernels.ROUNDING * run.crossed + 4.0 * np.spacing(abs(clock[a.T])))
+    now = float(clock[a.T] + kernels.ROUNDING * run.crossing_size + 4.0 * np.spacing(abs(clock[a.T])))
     if code in (a.PAUSED, a.RANK_LOST) and end > now:
-        if not run.pieces:
-            run.pieces = kernels.piece_ends(plan.memory, plan.options[-kernels.S :], float(clock[a.T]))
+        if not run.piece_ends:
+            run.piece_ends = kernels.piece_ends(plan.memory, plan.options[-kernels.S :], float(clock[a.T]))
             if end > run.t1 - (now - clock[a.T]):
-                run.pieces = [*[piece for piece in run.pieces if piece < run.t1 - now + clock[a.T]], run.t1]
+                run.piece_ends = [*[piece for piece in run.piece_ends if piece < run.t1 - now + clock[a.T]], run.t1]
             if clock[a.T] > clock[a.T_START]:
                 run.state[: 3 * run.system.n_q] = kernels.state_at(plan.memory, plan.options, float(clock[a.T]))
         elif n_accepted == 0:
-            run.pieces.pop(0)
-        run.pieces = [piece for piece in run.pieces if piece > now]
-        if run.pieces:
-            clock[a.H_NEXT], clock[a.H_LIMIT] = run.pieces[0] - clock[a.T], np.inf
+            run.piece_ends.pop(0)
+        run.piece_ends = [piece for piece in run.piece_ends if piece > now]
+        if run.piece_ends:
+            clock[a.H_NEXT], clock[a.H_LIMIT] = run.piece_ends[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
-    run.pieces, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
+    run.piece_ends, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
     at_singular_start = run.starts_singular and clock[a.T] == run.t0  # no partition can be renewed at such a state
     if at_singular_start and code == a.RANK_LOST:
         code = a.PAUSED
     if n_accepted > 0:  # the whole polynomial counts as one step
-        clock[a.H_LONG] = max(clock[a.H_LONG], run.crossed)
-        clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossed)
+        clock[a.H_LONG] = max(clock[a.H_LONG], run.crossing_size)
+        clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossing_size)
     if code == a.PAUSED and n_accepted == 0:
         if clock[a.FAILURE_CODE] not in (indices.SINGULAR, indices.OUTER_DIVERGED):
-            run.longer = []
-        if run.longer or run.lengths:
-            clock[a.H_NEXT], clock[a.H_LIMIT] = (run.longer or run.lengths).pop(0), np.inf
-            run.crossed = float(clock[a.H_NEXT])
+            run.larger_sizes = []
+        if run.larger_sizes or run.sizes_to_try:
+            clock[a.H_NEXT], clock[a.H_LIMIT] = (run.larger_sizes or run.sizes_to_try).pop(0), np.inf
+            run.crossing_size = float(clock[a.H_NEXT])
             return plan, control, code
         if run.origins:
             _prepare_next_origin(run, plan, control)
             return plan, control, code
-    if code == a.PAUSED and n_accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * clock[a.LARGEST_PIVOT]):
+    if code == a.PAUSED and n_accepted > 0 and (run.work.notes[indices.PIVOT] < FAR_BEYOND * clock[a.LARGEST_PIVOT]):
         proposed_size = min(float(clock[a.H_NEXT]), run.t1 - float(clock[a.T]))
         run.origins = [Origin(float(clock[a.T]), None, limits) for limits in (STRICT, WIDER, LOOSER)]
         _prepare_next_origin(run, plan, control)
-        clock[a.H_NEXT] = run.crossed = proposed_size
+        clock[a.H_NEXT] = run.crossing_size = proposed_size
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
@@ -344,5 +351,5 @@ def apply_jump(run: Run, t1: float) -> bool:
     clock[a.APPLIES_JUMP] = 1.0
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = run.plan.limit_start, 0.0
     if t_after < t1:
-        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(t_after, t1, run.new_state))
+        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.choose_first_step(t_after, t1, run.new_state))
     return True

@@ -28,33 +28,33 @@ from twoloop.problem.events import SAMPLES
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import interpolator_of
 from twoloop.run.fallbacks import (
-    after_crossing,
     apply_jump,
     cross_singularity,
     crossing_kit,
+    handle_crossing,
     load_next_step,
-    may_cross,
+    requires_crossing,
     switch_method,
     warn_of_missed_changes,
 )
 from twoloop.run.messages import (
     INTERRUPTED,
-    OUT_OF_REACH,
+    MAX_STEPS_LEFT,
     OUT_OF_TIME,
     STAGNATED,
     StallDetector,
     StiffnessMonitor,
     describe_stiffness,
     message_of,
-    outcome,
     reject_turned_velocities,
+    status_and_message,
     warn_of_passage_by_ordinary_steps,
     warn_user,
 )
 from twoloop.run.record import (
     DEFAULTS,
     INITIAL_COUNTS,
-    OF_STEPS,
+    STEP_ARRAYS,
     OutputRequest,
     Record,
     Recorder,
@@ -68,9 +68,9 @@ from twoloop.run.record import (
     step_fields,
 )
 from twoloop.run.rerun import compare_callbacks
-from twoloop.run.run import SMALL, Buffers, Run
-from twoloop.run.signals import SignalHandlers, within_a_users_function
-from twoloop.run.singular_positions import Place, velocities_turned_last
+from twoloop.run.run import SMALL_SYSTEM, Buffers, Run
+from twoloop.run.signals import SignalHandlers, is_in_user_function
+from twoloop.run.singular_positions import TimedState, velocities_turned_last
 
 Array = NDArray[np.float64]
 
@@ -78,9 +78,9 @@ MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next one
 
 
 class Interrupts:
-    """Handler of Ctrl-C that replaces Python's own between `listen` and `leave`, but never a handler of the user.
+    """Handler of Ctrl-C that replaces Python's own (never a user's) until `restore_handlers` is called.
 
-    Before `listen`, Ctrl-C raises KeyboardInterrupt as usual, because there is no result yet that would be lost.
+    Before `install_handlers`, Ctrl-C raises KeyboardInterrupt, because there is no result yet that would be lost.
 
     Attributes
     ----------
@@ -88,34 +88,34 @@ class Interrupts:
         Number of signals so far.
     """
 
-    n_signals, _installed = 0, False
+    n_signals, _is_installed = 0, False
     handlers: SignalHandlers | None = None
 
-    def listen(self) -> "Interrupts":
+    def install_handlers(self) -> "Interrupts":
         """Install the handlers, which store signals, or raise within functions of the user; return self."""
         if self.handlers is None:
             self.handlers = SignalHandlers()
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             with suppress(ValueError):  # raised in threads other than the main one, which get no signals
                 _signal.signal(signal.SIGINT, self._on_signal)
-                self._installed = True
+                self._is_installed = True
         return self
 
     def returns_result(self) -> bool:
         """Return whether a run that Ctrl-C ended returns a result; else a handler has raised KeyboardInterrupt."""
-        self.listen()  # a handler of the user is not replaced, and raises; so does `_on_signal` after many signals
-        return self._installed and self.n_signals <= MAX_STORED_SIGNALS
+        self.install_handlers()  # a user's handler is not replaced, and raises; so does `_on_signal` after many signals
+        return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
-    def leave(self) -> None:
+    def restore_handlers(self) -> None:
         """Restore all handlers; if a user's handler raised an exception, raise it again."""
-        if self._installed:
+        if self._is_installed:
             _signal.signal(signal.SIGINT, signal.default_int_handler)
         if self.handlers is not None:
-            self.handlers.leave()
+            self.handlers.restore()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.n_signals += 1
-        if self.n_signals > MAX_STORED_SIGNALS or within_a_users_function(frame):
+        if self.n_signals > MAX_STORED_SIGNALS or is_in_user_function(frame):
             raise KeyboardInterrupt
 
 
@@ -157,12 +157,12 @@ CHUNK_TIME = 0.05  # CPU time of a chunk, s, from which on the next chunk is not
 # statuses whose message may say that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 MAX_BASE_CANDIDATES = 16  # largest number of last states that may be the base of a step across a singular position
-# attempts across a singular position are not shortened to end at t1, but at t1 + FAR_BEYOND times the run's duration
-FAR_BEYOND = 100.0
+# attempts across a singular position need not end at t1, but at t1 + CROSSING_OVERSHOOT times the run's duration
+CROSSING_OVERSHOOT = 100.0
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 # largest number of sets of buffers kept for later runs, and of floats in the buffer of states of such a set
 MAX_SPARE, MAX_SPARE_FLOATS = 16, 250_000
-_spare: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for later runs, by their sizes
+_spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for later runs, by their sizes
 
 
 class IntegrationLoop:
@@ -171,7 +171,7 @@ class IntegrationLoop:
     Parameters
     ----------
     run : Run
-        A run at its start, or after a first chunk of steps, which `resume` then records.
+        A run at its start, or after a first chunk of steps, which `add_first_chunk` then records.
     t1 : float
         End of the run, s.
     request : OutputRequest
@@ -180,7 +180,7 @@ class IntegrationLoop:
     time_limit : float or None
         Limit of elapsed time, s.
     interrupts : Interrupts
-    last : bool
+    is_final_attempt : bool
         Whether the run warns if it may have missed short changes; else the caller repeats it.
     start : ndarray, optional
         The row [q, v, a, lam] at the start. None: the state of the run, which must be at its start.
@@ -196,18 +196,18 @@ class IntegrationLoop:
         report: Callable[[float], object],
         time_limit: float | None,
         interrupts: Interrupts,
-        last: bool = True,
+        is_final_attempt: bool = True,
         start: Array | None = None,
         system: ConstrainedSystem | None = None,
     ):
-        self.run, self.t1, self.request, self.last = run, t1, request, last
+        self.run, self.t1, self.request, self.is_final_attempt = run, t1, request, is_final_attempt
         run.t1 = t1
         self.start, self.system = run.state if start is None else start, run.system if system is None else system
         self.report, self.interrupts = report, interrupts
         self.deadline = np.inf if time_limit is None else time.monotonic() + time_limit
-        self.recorder = self._recorder()
+        self.recorder = self._new_recorder()
         self.outputs = np.array([t1])
-        if request.times is not None and request.lands:
+        if request.times is not None and request.ends_at_outputs:
             self.outputs = np.append(request.times[(request.times > run.t0) & (request.times < t1)], t1)
         run.control[run.a.STORE_ALL] = request.every_step
         self.largest_chunk = BUFFER_STEPS
@@ -218,38 +218,38 @@ class IntegrationLoop:
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # others while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
-        self.latest: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
+        self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet
-        if self.request.store.finished:
+        if self.request.store.append_only:
             self._store_step_fields()
-        self.filled = np.zeros(2, dtype=np.int64)
+        self.n_filled = np.zeros(2, dtype=np.int64)
         may_end_before_t1 = has_terminal or time_limit is not None  # users of such runs may choose a very late t1
-        self.stall = StallDetector(run.t0, np.inf if may_end_before_t1 else OUT_OF_REACH)
-        self.stiffness = StiffnessMonitor(run.plan)
+        self.stall_detector = StallDetector(run.t0, np.inf if may_end_before_t1 else MAX_STEPS_LEFT)
+        self.stiffness_monitor = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
-        self.cpu = 0.0
-        self.raised: Exception | None = None
+        self.cpu_time = 0.0
+        self.callback_error: Exception | None = None
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
 
-    def resume(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
+    def add_first_chunk(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
         """Record copies of the first chunk's times, states and steps, and act on the code that `advance` returned."""
-        self.code, self.cpu = code, cpu_time
+        self.code, self.cpu_time = code, cpu_time
         self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._interval_kinds(steps, False, False))
         self._handle_code(steps, False, cpu_time)
 
-    def to_end(self, check_derivatives: bool) -> Record:
+    def integrate_to_end(self, check_derivatives: bool) -> Record:
         """Integrate to the end, check callbacks at states of the run, and return the record of the run."""
         run, recorder = self.run, self.recorder
         a, clock = run.a, run.clock
         if run.starts_singular and self.code == a.PAUSED:
             self.code = a.NEAR_SINGULAR if run.branch_known else a.ROWS_VIOLATED
             self._choose_method(False, 0)
-        buffers, is_copied = self._buffers(), True
+        buffers, is_copied = self._next_buffers(), True
         while self.code == a.PAUSED:
             across, over_jump = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
             began = time.process_time()
             self._advance(buffers)
-            n_rows, n_steps = self.filled.tolist()
+            n_rows, n_steps = self.n_filled.tolist()
             t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
             is_copied = 2 * n_rows < len(buffers[0])  # a copy of a buffer that is less than half full saves memory
             if is_copied:
@@ -258,29 +258,29 @@ class IntegrationLoop:
                 self.recorder.store_crossing(self.plan.memory)
             self._store_chunk(t, rows, steps, self._interval_kinds(steps, across, over_jump))
             spent = time.process_time() - began
-            self.cpu += spent
-            if recorder.ended is not None:
+            self.cpu_time += spent
+            if recorder.end_event is not None:
                 break
             self._handle_code(steps, across, spent)
             if not is_copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
-                buffers = self._buffers()
+                buffers = self._next_buffers()
         if is_copied and buffers[1].size <= MAX_SPARE_FLOATS:
-            _spare[buffers[0].size, buffers[1].size, len(buffers[2])] = buffers
-            for oldest in list(_spare)[:-MAX_SPARE]:
-                _spare.pop(oldest, None)
+            _spare_buffers[buffers[0].size, buffers[1].size, len(buffers[2])] = buffers
+            for oldest in list(_spare_buffers)[:-MAX_SPARE]:
+                _spare_buffers.pop(oldest, None)
         if self.request.between_steps:
             began = time.process_time()
             recorder.finish()
-            self.cpu += time.process_time() - began
-        if self.raised is not None and recorder.ended is None:
-            raise self.raised
-        return self._record(check_derivatives)
+            self.cpu_time += time.process_time() - began
+        if self.callback_error is not None and recorder.end_event is None:
+            raise self.callback_error
+        return self._build_record(check_derivatives)
 
     def _handle_code(self, steps: Array, across: bool, spent: float) -> None:
         """Act on `self.code`; set it to PAUSED if the loop is to continue. `spent`: CPU time of the chunk, s."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
-            if self.stiffness.samples:
-                self.stiffness.add_steps(steps[:, self.run.a.H])
+            if self.stiffness_monitor.samples:
+                self.stiffness_monitor.add_steps(steps[:, self.run.a.H])
             self.report(self.t1)
             return
         self._check_progress(steps, across, spent)
@@ -290,36 +290,36 @@ class IntegrationLoop:
     def _advance(self, buffers: Buffers) -> None:
         """Take one chunk of steps by the compiled `advance`, which fills `buffers`; store its code in `self.code`."""
         run, a = self.run, self.run.a
-        run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.attempts()))
+        run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.n_attempts()))
         outputs = self.outputs
-        is_crossing = self.plan is not run.plan and not run.pieces and run.control[a.FIXED_STEP] == 0.0
+        is_crossing = self.plan is not run.plan and not run.piece_ends and run.control[a.FIXED_STEP] == 0.0
         if is_crossing:  # the next output time does not shorten attempts across a singular position
-            outputs = np.append(outputs[:-1], self.t1 + FAR_BEYOND * (self.t1 - run.t0))
-        self.filled[:] = 0  # Ctrl-C may arrive before `advance` sets these numbers
+            outputs = np.append(outputs[:-1], self.t1 + CROSSING_OVERSHOOT * (self.t1 - run.t0))
+        self.n_filled[:] = 0  # Ctrl-C may arrive before `advance` sets these numbers
         try:
-            with self._stopped_in_time():
-                self.code = run.advance(outputs, buffers, self.filled, (self.plan, self.control, self.kit))
+            with self._deadline_timer():
+                self.code = run.advance(outputs, buffers, self.n_filled, (self.plan, self.control, self.kit))
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:
             # Raised by a callback. A sample of forces ahead may be at a state that the motion never reaches: then
-            # continue without such samples. Else `to_end` raises the exception again, unless an event has ended the run
+            # continue without such samples. Else raise the exception at the end, unless an event has ended the run
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
                 run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # a node may be beyond the reach of the motion
             else:
-                self.code, self.raised = INTERRUPTED, None if self.interrupts.n_signals else error
+                self.code, self.callback_error = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:
                     error.add_note(_error_note(run.system.name, float(run.clock[a.T]), error))
         if self.interrupts.handlers is not None:
-            self.interrupts.handlers.check()
+            self.interrupts.handlers.call_delayed()
 
     @contextmanager
-    def _stopped_in_time(self) -> Iterator[None]:
+    def _deadline_timer(self) -> Iterator[None]:
         """Return a context in which a timer stops machine code at the deadline, if a single attempt may take long."""
         run, notes = self.run, self.run.work.notes
-        if self.deadline == np.inf or (run.system.n_q <= SMALL and not run.system.called_in_python):
+        if self.deadline == np.inf or (run.system.n_q <= SMALL_SYSTEM and not run.system.called_in_python):
             yield
             return
         timer = threading.Timer(self.deadline - time.monotonic(), notes.__setitem__, (indices.TIME_IS_UP, 1.0))
@@ -337,11 +337,11 @@ class IntegrationLoop:
         run = self.run
         self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
-        if self.request.store.finished:
+        if self.request.store.append_only:
             self._store_step_fields()
         self.recorder.add(t, rows, kinds)
         if len(t):
-            self.latest = [*self.latest[-1:], (t, rows)]
+            self.latest_chunks = [*self.latest_chunks[-1:], (t, rows)]
 
     def _store_step_fields(self) -> None:
         """Add the fields with one row per step to the store, for steps that are not stored yet."""
@@ -353,14 +353,14 @@ class IntegrationLoop:
         """Choose the number of attempts of the next chunk; change `self.code` if the run stalls, or has to stop."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
-        self.stiffness.add_steps(h)
-        self.stall.add_steps(h)
-        if self.code == a.PAUSED and run.attempts() >= self.next_check:
+        self.stiffness_monitor.add_steps(h)
+        self.stall_detector.add_steps(h)
+        if self.code == a.PAUSED and run.n_attempts() >= self.next_check:
             self.check_interval = min(2 * self.check_interval, self.largest_chunk)
-            self.next_check = run.attempts() + self.check_interval
+            self.next_check = run.n_attempts() + self.check_interval
             if not across:
-                self.stiffness.sample_state(float(run.clock[a.T]), run.state, run.system.n_q)
-            if self.stall.is_stalled(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
+                self.stiffness_monitor.sample_state(float(run.clock[a.T]), run.state, run.system.n_q)
+            if self.stall_detector.is_stalled(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
                 self.code = STAGNATED
         if spent < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
@@ -373,17 +373,17 @@ class IntegrationLoop:
     def _choose_method(self, across: bool, n_steps: int) -> None:
         """If `self.code` requires it, change plan, controls or kit of the next steps, and set the code to PAUSED."""
         run, a = self.run, self.run.a
-        if self.code == a.NEEDS_DENSE or run.is_lost_without_dense(self.code):
+        if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
-        elif may_cross(run, self.code):
+        elif requires_crossing(run, self.code):
             self.plan, self.control = cross_singularity(run, self._last_states())
             self.kit = crossing_kit(run.kit)
             self.code = a.PAUSED
         elif self.code == a.SWITCH_METHOD or self._is_stalled(across):
             switch_method(run)
             if self.code == a.STEP_TOO_SMALL:
-                run.clock[a.H_NEXT] = run.first_step(float(run.clock[a.T]), self.t1, run.state)
+                run.clock[a.H_NEXT] = run.choose_first_step(float(run.clock[a.T]), self.t1, run.state)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.NEEDS_COMPILATION:
             began = time.monotonic()
@@ -393,19 +393,19 @@ class IntegrationLoop:
         elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
-            had_pieces = bool(run.pieces)
-            self.plan, self.control, self.code = after_crossing(run, self.plan, self.control, self.code, n_steps)
-            if run.pieces and not had_pieces:
+            had_pieces = bool(run.piece_ends)
+            self.plan, self.control, self.code = handle_crossing(run, self.plan, self.control, self.code, n_steps)
+            if run.piece_ends and not had_pieces:
                 self._correct_last_state()
             if self.plan is run.plan:
                 self.kit = run.kit
 
-    def _last_states(self) -> list[Place]:
+    def _last_states(self) -> list[TimedState]:
         """Return the last MAX_BASE_CANDIDATES states (time, row), oldest first; [] if not all states are recorded."""
         if not self.request.every_step:
             return []
-        states = [(self.run.t0, self.start)] if len(self.latest) < 2 else []
-        for t, rows in self.latest:
+        states = [(self.run.t0, self.start)] if len(self.latest_chunks) < 2 else []
+        for t, rows in self.latest_chunks:
             states += zip(t[-MAX_BASE_CANDIDATES:].tolist(), rows[-MAX_BASE_CANDIDATES:], strict=True)
         return states[-MAX_BASE_CANDIDATES:]
 
@@ -414,8 +414,8 @@ class IntegrationLoop:
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)
-        if self.latest and len(self.latest[-1][0]) and self.latest[-1][0][-1] == t:
-            self.latest[-1][1][-1, : len(row)] = row
+        if self.latest_chunks and len(self.latest_chunks[-1][0]) and self.latest_chunks[-1][0][-1] == t:
+            self.latest_chunks[-1][1][-1, : len(row)] = row
 
     def _is_stalled(self, across: bool) -> bool:
         """Return whether a method with a substitute plan cannot take a step, and no singular position is near."""
@@ -423,81 +423,83 @@ class IntegrationLoop:
         is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return is_too_small and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
 
-    def _record(self, check_derivatives: bool) -> Record:
+    def _build_record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
         t, table = recorder.output()
-        stats, store = statistics(run.work.counters, self.cpu), self.request.store
+        stats, store = statistics(run.work.counters, self.cpu_time), self.request.store
         self._store_step_fields()
         time_reached = float(run.clock[run.a.T])
-        if recorder.ended is not None or recorder.interrupted_at is not None:
-            for name in OF_STEPS:
-                store.cut(name, recorder.n_steps)
+        if recorder.end_event is not None or recorder.interrupted_at is not None:
+            for name in STEP_ARRAYS:
+                store.truncate(name, recorder.n_steps)
             stats = replace(stats, n_accepted=recorder.n_steps)
-        if recorder.ended is not None:
-            event, end = recorder.ended
+        if recorder.end_event is not None:
+            event, end = recorder.end_event
             if recorder.n_steps > 0:
-                store.cut("h", recorder.n_steps - 1)
-                store.add("h", np.array([recorder.last_step]))
+                store.truncate("h", recorder.n_steps - 1)
+                store.add("h", np.array([recorder.last_step_size]))
             status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
         if recorder.interrupted_at is not None:
             time_reached = recorder.interrupted_at
         try:
-            if recorder.ended is None:
-                status, message = outcome(run, code, self.t1, self.stall)
+            if recorder.end_event is None:
+                status, message = status_and_message(run, code, self.t1, self.stall_detector)
             if status >= 0:
-                end = time_reached if recorder.ended is None else recorder.ended[1]
+                end = time_reached if recorder.end_event is None else recorder.end_event[1]
                 places = self._suspicious_last_step(t, table), self._suspicious_outputs(t, table)
                 status, message = reject_turned_velocities(run, *places, end, status, message)
             if code != INTERRUPTED:
                 end = time_reached
-                if recorder.last is not None:
-                    self.sample.end(*recorder.last)
-                    end = recorder.last[0]
+                if recorder.end_state is not None:
+                    self.sample.end(*recorder.end_state)
+                    end = recorder.end_state[0]
                 status, message = compare_callbacks(run, self.sample, end, check_derivatives, status, message)
-            if self.last and status >= 0:
+            if self.is_final_attempt and status >= 0:
                 message += warn_of_missed_changes(run) + warn_of_passage_by_ordinary_steps(run)
             if status >= 0 and run.start_warning:
                 message += warn_user(run.start_warning)
             if status in EXPLAINED_BY_STIFFNESS:
-                message += describe_stiffness(self.stiffness, run.kit, run.work)
+                message += describe_stiffness(self.stiffness_monitor, run.kit, run.work)
         except KeyboardInterrupt:
             code = INTERRUPTED
-        if self.interrupts.n_signals or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
+        if self.interrupts.n_signals or recorder.interrupted or (code == INTERRUPTED and recorder.end_event is None):
             status, message = Status.INTERRUPTED, describe_interrupt(time_reached, table)
         t_events, q_events, v_events = recorder.events()
-        fields = fields_of_run(run, t, table) | {name: store.array(name) for name in OF_STEPS}
+        fields = fields_of_run(run, t, table) | {name: store.array(name) for name in STEP_ARRAYS}
         fields |= message_of(run, message + failure_link(status), self.system)
         fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": self.system}
         fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}
         return record_of(Record, DEFAULTS | fields)
 
-    def _suspicious_last_step(self, t: Array, table: Array) -> list[Place]:
+    def _suspicious_last_step(self, t: Array, table: Array) -> list[TimedState]:
         """Return [state before the last step] if velocities turned in that step, as at a singular position; else []."""
         run = self.run
-        if self.request.times is not None or self.recorder.ended is not None:
+        if self.request.times is not None or self.recorder.end_event is not None:
             return []
         if run.plan.watchful and run.work.notes[indices.NEARLY_SINGULAR] != 1.0:
             return []
         return [(float(t[-2]), table[-2])] if velocities_turned_last(t, table, run.system.n_q) else []
 
-    def _suspicious_outputs(self, t: Array, table: Array) -> list[Place]:
+    def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
         """Return all states at which steps had to end if the run passed near a singular position; else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
-        if not run.passed_near_singular() or not (equal_steps or (request.times is not None and request.lands)):
+        if not run.passed_near_singular() or not (
+            equal_steps or (request.times is not None and request.ends_at_outputs)
+        ):
             return []
         return list(zip(t.tolist(), table, strict=True))
 
-    def _buffers(self) -> Buffers:
+    def _next_buffers(self) -> Buffers:
         """Return buffers for the times, states and steps of a chunk; each attempt fills at most one row of each."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
-        spare_buffers = _spare.pop((n_rows, n_rows * width, n_steps), None)
+        spare_buffers = _spare_buffers.pop((n_rows, n_rows * width, n_steps), None)
         if spare_buffers is not None:
             return spare_buffers
         return np.empty(n_rows), np.empty((n_rows, width)), np.empty((n_steps, self.run.a.N_STEP_COLUMNS))
 
-    def _recorder(self) -> Recorder:
+    def _new_recorder(self) -> Recorder:
         """Return a new Recorder, with an Interpolator if states between steps are requested."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None

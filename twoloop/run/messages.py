@@ -20,14 +20,14 @@ from twoloop.kernels.control.loop_state import DISPLACEMENT, INNER_TOL, initial_
 from twoloop.kernels.control.singular_positions import EPS
 from twoloop.kernels.data import indices
 from twoloop.methods.plan import Plan
-from twoloop.run.record import Later, Status
+from twoloop.run.record import Deferred, Status
 from twoloop.run.singular_positions import (
-    WEAK,
-    Place,
+    WEAK_RATIO,
+    TimedState,
     describe_crossings,
     describe_turn,
-    ratio_in_any_units,
     singular_ratio,
+    unit_free_ratio,
     velocity_rounding_errors,
 )
 
@@ -40,8 +40,8 @@ Array = NDArray[np.float64]
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of ends of runs, besides those that `advance` returns
 STAGNATION_STEPS = 20_000  # smallest number of accepted steps over which the mean step size is computed
 # A run stalls if its mean step size is below STAGNATION_PACE times the largest one, and the rest of the run would take
-# more than STAGNATION_LEFT steps. It also stalls if the rest would take more than OUT_OF_REACH steps, which take days.
-STAGNATION_PACE, STAGNATION_LEFT, OUT_OF_REACH = 1e-3, 1e7, 1e11
+# more than STAGNATION_LEFT steps; or if the rest would take more than MAX_STEPS_LEFT steps, that is, days.
+STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
 
 
 class StallDetector:
@@ -51,40 +51,40 @@ class StallDetector:
     ----------
     t0 : float
         Start of the run, s.
-    most : float
+    max_steps_left : float
         Largest number of steps that the rest of the run may take, with the mean size of the last steps.
     """
 
-    def __init__(self, t0: float, most: float = OUT_OF_REACH):
-        self.most = most
+    def __init__(self, t0: float, max_steps_left: float = MAX_STEPS_LEFT):
+        self.max_steps_left = max_steps_left
         self.window_t, self.window_n = t0, 0
-        self.longest = self.mean = 0.0
+        self.longest_step = self.mean_step = 0.0
 
     def add_steps(self, h: Array) -> None:
         """Add the sizes of accepted steps, s."""
-        self.longest = max(self.longest, float(h.max(initial=0.0)))
+        self.longest_step = max(self.longest_step, float(h.max(initial=0.0)))
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
         """Return whether a run from t to t1 would take too many steps; evaluated once in STAGNATION_STEPS steps."""
         if self.window_n < STAGNATION_STEPS:
             return False
-        self.mean = (t - self.window_t) / self.window_n
+        self.mean_step = (t - self.window_t) / self.window_n
         self.window_t, self.window_n = t, 0
-        return t1 - t > (STAGNATION_LEFT if self.has_slowed else self.most) * self.mean
+        return t1 - t > (STAGNATION_LEFT if self.has_slowed else self.max_steps_left) * self.mean_step
 
     @property
     def has_slowed(self) -> bool:
         """Whether the steps were much longer earlier in the run."""
-        return self.mean < STAGNATION_PACE * self.longest
+        return self.mean_step < STAGNATION_PACE * self.longest_step
 
 
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
-LAST_STEPS = 8  # number of steps before a sampled state, the median of which is the step size of the sample
-ITERATIONS = 6  # number of power iterations at each sampled state
+N_LAST_STEPS = 8  # number of steps before a sampled state, the median of which is the step size of the sample
+N_ITERATIONS = 6  # number of power iterations at each sampled state
 INITIAL_FACTOR = 0.1  # `initial_direction` times this is added to the last eigenvectors, so that no component stays 0
-# the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -ALIGNED
-ALIGNED = 0.9
+# the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -MIN_ALIGNMENT
+MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # number of accepted steps below which a message does not mention stiffness
 # stability limits the steps if the median of step size times rate, over the stability limit, is at least this value; in
 # smooth motion the ratio is 0.4
@@ -107,29 +107,29 @@ class StiffnessMonitor:
     """Monitor that samples states of a run, so that `describe_stiffness` can decide whether stability limited steps."""
 
     def __init__(self, plan: Plan):
-        self.plan, self.every, self.n_seen, self.n_steps = plan, 1, 0, 0
-        self.last = np.zeros(0)  # sizes of the last LAST_STEPS steps, s
+        self.plan, self.sampling_interval, self.n_calls, self.n_steps = plan, 1, 0, 0
+        self.last_sizes = np.zeros(0)  # sizes of the last N_LAST_STEPS steps, s
         self.samples: list[StiffnessSample] = []
 
     def add_steps(self, steps: Array) -> None:
         """Add the sizes of accepted steps, s."""
         self.n_steps += steps.size
-        last = steps[-LAST_STEPS:]
-        self.last = last if last.size == LAST_STEPS else np.concatenate([self.last, last])[-LAST_STEPS:]
+        last = steps[-N_LAST_STEPS:]
+        self.last_sizes = last if last.size == N_LAST_STEPS else np.concatenate([self.last_sizes, last])[-N_LAST_STEPS:]
 
     def sample_state(self, t: float, state: Array, n_q: int) -> None:
         """Add the state after the last steps as a sample; in long runs only at every second, fourth, ... call."""
-        if self.plan.stable_to is None or self.last.size < LAST_STEPS:
+        if self.plan.stable_to is None or self.last_sizes.size < N_LAST_STEPS:
             return
-        self.n_seen += 1
-        if self.n_seen % self.every != 0:
+        self.n_calls += 1
+        if self.n_calls % self.sampling_interval != 0:
             return
         q, v, a = state[: 3 * n_q].reshape(3, n_q).copy()
         limits = self.plan.stable_to(self.plan.memory)
-        self.samples.append(StiffnessSample(t, q, v, a, float(np.median(self.last)), *limits))
+        self.samples.append(StiffnessSample(t, q, v, a, float(np.median(self.last_sizes)), *limits))
         if len(self.samples) > MAX_SAMPLES:
             self.samples = self.samples[1::2]
-            self.every *= 2
+            self.sampling_interval *= 2
 
 
 def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
@@ -182,7 +182,7 @@ def _dominant_eigenvalue(
     displacement = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))
     eigenvalue, is_negative = 0.0, False
     a = np.zeros_like(sample.a)
-    for _ in range(ITERATIONS):
+    for _ in range(N_ITERATIONS):
         Q, V = sample.q.copy(), sample.v.copy()
         (V if by_v else Q)[independent] += displacement * direction[independent]
         if kit.inner(kit, work, tasks.EVALUATE, sample.t, Q, V, INNER_TOL, a, work.lam) != indices.DONE:
@@ -193,15 +193,17 @@ def _dominant_eigenvalue(
             return 0.0, False
         old_direction = direction[independent]
         cosine = float(image @ old_direction) / float(np.linalg.norm(image) * np.linalg.norm(old_direction))
-        eigenvalue, is_negative = largest / (displacement * float(np.abs(old_direction).max())), cosine < -ALIGNED
+        eigenvalue, is_negative = largest / (displacement * float(np.abs(old_direction).max())), cosine < -MIN_ALIGNMENT
         direction[independent] = image / largest
     return eigenvalue, is_negative
 
 
-NEARLY_SINGULAR = 1e-3  # ratio of singular values of C_q (or of inertias) up to which messages call C_q (or M) singular
+# ratio of singular values of C_q (or of inertias) up to which messages call C_q (or M) singular
+MAX_SINGULAR_RATIO = 1e-3
 # ratio of the rounding error of velocities (or accelerations) to the tolerance above which a run is not trusted further
 MAX_LASTING_ERROR = 100.0
-LOST_AT_END = 1e-6  # ratio of singular values up to which constraints do not determine velocities at the end of a run
+# ratio of singular values up to which the constraints do not determine the velocities at the end of a run
+MAX_RATIO_AT_END = 1e-6
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
@@ -222,11 +224,13 @@ _FAILURE_REASONS = {
 
 def _describe_jumps_and_crossings(run: "Run") -> str:
     """Return a sentence about the jumps of a run, and CROSSINGS if steps crossed singular positions; else ""."""
-    text = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(run.jumps)
+    text = f" At t = {_format_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(
+        run.jumps
+    )
     return text + (CROSSINGS if run.crossings else "")
 
 
-def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later | None = None) -> dict[str, Any]:
+def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Deferred | None = None) -> dict[str, Any]:
     """Return the field `message` as a dict, or the field `later` with a function that computes the message when read.
 
     The message is deferred if it describes crossings, because that takes longer than many runs. Until then `system`
@@ -246,7 +250,7 @@ def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later
 
 
 def reject_turned_velocities(
-    run: "Run", last_step: list[Place], landed: list[Place], end: float, status: Status, message: str
+    run: "Run", last_step: list[TimedState], landed: list[TimedState], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
     """Return `status` and `message`, or RANK_LOST and a reason if rounding or a change of branch changed velocities.
 
@@ -262,13 +266,13 @@ def reject_turned_velocities(
     return (Status.RANK_LOST, reason) if reason else (status, message)
 
 
-def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
+def describe_rounding(run: "Run", places: list[TimedState], end: float) -> str:
     """Return words on the first of the states `places`, before `end`, whose velocities rounding changed, else ""."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
         at_singular_start = t == run.t0 and run.starts_singular  # positions and velocities at the start are given
-        if t >= end or at_singular_start or surely_above(run.near, system.rows(t, q), run.rank):
+        if t >= end or at_singular_start or surely_above(run.near_threshold, system.rows(t, q), run.rank):
             continue
         excess = _velocity_error_ratio(run, t, q, v)
         if excess > MAX_LASTING_ERROR:
@@ -285,7 +289,7 @@ def describe_arrival(t: float, fixed: bool) -> str:
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 
-def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Status, str]:
+def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Status, str]:
     """Return the status and the message of a run, given the code of its end (of `advance`, or of this module)."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
@@ -350,17 +354,17 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
 
 def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
     """Return sentences about how short the steps are, how many more would be needed, and the likely reason."""
-    n_left = (t1 - float(run.clock[run.a.T])) / stall.mean
+    n_left = (t1 - float(run.clock[run.a.T])) / stall.mean_step
     earlier_steps, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
     if stall.has_slowed:
-        earlier_steps = f", after steps of up to {stall.longest:.2g} s"
+        earlier_steps = f", after steps of up to {stall.longest_step:.2g} s"
         advice = "Look for a singular position or a stiff force near this time, or take another method. "
         advice = _describe_near_singular(run, t1) or advice
     elif run.control[run.a.FIXED_STEP] > 0.0:
         advice = "Take a larger step_size, or shorten t_span. "
     return (
-        f"the last {STAGNATION_STEPS} steps were {stall.mean:.2g} s long on average{earlier_steps}, and the rest needs "
-        f"{n_left:.1g} of them. {advice}With max_steps the run goes on up to that number of steps."
+        f"the last {STAGNATION_STEPS} steps were {stall.mean_step:.2g} s long on average{earlier_steps}, and the rest "
+        f"needs {n_left:.1g} of them. {advice}With max_steps the run goes on up to that number of steps."
     )
 
 
@@ -389,10 +393,10 @@ def warn_of_singular_end(run: "Run") -> str:
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
     q, v = run.state[:n], run.state[n : 2 * n]
-    if surely_above(WEAK, system.rows(t, q), run.rank):
+    if surely_above(WEAK_RATIO, system.rows(t, q), run.rank):
         return ""
-    ratios = [ratio(system, t, q, run.rank) for ratio in (singular_ratio, ratio_in_any_units)]
-    if max(ratios) <= LOST_AT_END:
+    ratios = [ratio(system, t, q, run.rank) for ratio in (singular_ratio, unit_free_ratio)]
+    if max(ratios) <= MAX_RATIO_AT_END:
         text = (
             f"the run ends where the constraints lose rank ({_ratio_text(run, t, q)}): they do not determine "
             "velocities and accelerations there. End t_span a little before, or beyond"
@@ -460,7 +464,7 @@ def _describe_near_end(run: "Run", t1: float) -> str:
 def _describe_near_singular(run: "Run", t1: float) -> str:
     """Return sentences if C_q is close to losing rank at the last state, else ""."""
     ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
-    if ratio > NEARLY_SINGULAR:
+    if ratio > MAX_SINGULAR_RATIO:
         return ""
     return (
         f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
@@ -472,7 +476,7 @@ def _describe_near_massless(run: "Run") -> str:
     """Return a sentence if some allowed motion has almost no inertia at the last state, else ""."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     ratio, words = least_inertia(run.system, t, q)
-    return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
+    return f"There {words}. " if ratio < MAX_SINGULAR_RATIO else ""
 
 
 def describe_not_finite(run: "Run") -> str:
@@ -497,5 +501,5 @@ def describe_not_finite(run: "Run") -> str:
     return "the callbacks are finite at the start of the step, but not at a state within it"
 
 
-def _times(times: list[float]) -> str:
+def _format_times(times: list[float]) -> str:
     return ", ".join(f"{t:.4g}" for t in times[:3]) + (", ..." if len(times) > 3 else "")

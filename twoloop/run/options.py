@@ -18,7 +18,7 @@ SMALLEST_TOLERANCE = 1e-15  # rtol and atol must not both be smaller: rounding w
 
 
 @lru_cache(maxsize=1024)
-def _key(*_: Any) -> object:
+def _unique_key(*_: Any) -> object:
     """Return one object for all equal arguments: as a key of a dict it is faster than a tuple of the arguments."""
     return object()
 
@@ -42,7 +42,7 @@ class Options:
         """Key in caches of integrators: the same object for equal options."""
         step_options = self.first_step, self.max_step, self.max_steps, self.step_size
         tolerances = self.rtol, self.atol.tobytes()
-        return _key(identity(self.method), *tolerances, *step_options, self.compiled, self.check_derivatives)
+        return _unique_key(identity(self.method), *tolerances, *step_options, self.compiled, self.check_derivatives)
 
     @cached_property
     def own_tolerance(self) -> float | None:
@@ -55,11 +55,11 @@ class Options:
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
-    def set_sizes(self, run: Run, t1: float) -> None:
+    def set_step_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
         run.work.notes[indices.KINK_AFTER] = t1  # next jump of C_t: none is known before t1
         if self.step_size is None:
-            run.set_sizes(self.first_step, self.max_step, t1)
+            run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
 NO_OPTIONS: Any = (None,) * 12, None  # arguments and options of the last call, if there was none

@@ -28,8 +28,8 @@ from twoloop.run.workspace import is_diagonal, kit_for_plan
 
 Array = NDArray[np.float64]
 
-NUMBERS = ("options", "numbers", "own_numbers")  # fields of a plan: arrays that may depend on parameters
-SUBPLANS = ("interior", "substitute", "within_newton")  # fields of a plan whose values are plans
+NUMBER_FIELDS = ("options", "numbers", "own_numbers")  # fields of a plan: arrays that may depend on parameters
+PLAN_FIELDS = ("interior", "substitute", "within_newton")  # fields of a plan whose values are plans
 
 
 class SharedSetup:
@@ -52,25 +52,26 @@ class SharedSetup:
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
         system, t, q = run.system, run.t0, run.state[: run.system.n_q]
-        self.family, self._regions = trace_cache_of(system), dict[bool, CheckedRegion]()
+        self.trace_cache, self._regions = trace_cache_of(system), dict[bool, CheckedRegion]()
         form, banded = run.kit.flags[FORM], run.kit.flags[BANDWIDTH] >= 0
-        if run.static is not None or form == AUGMENTED or banded or system.entries:
+        if run.static_form is not None or form == AUGMENTED or banded or system.entries:
             raise ValueError("for large systems, more choices depend on the numbers")
         symbolic = copy.copy(system)  # a system whose numbers are expressions in the parameters
-        symbolic.derived = {("family", trace_cache_of): self.family, ("numbers", self.family): lambda array: array}
+        cache = self.trace_cache
+        symbolic.derived = {("family", trace_cache_of): cache, ("numbers", cache): lambda array: array}
         symbolic_code = code_for(symbolic, method, fixed, compiled, t, q, unchecked)
-        self.plan, self.interiors = plans_for(
+        self.plan, self.interior_plans = plans_for(
             symbolic, method, run.rtol, run.least_atol, fixed, symbolic_code, unchecked
         )
-        self.exact = exact_derivatives(symbolic)
-        self.definite = has_definite_mass(system, t, q)
-        untraced = system.given.keys() - self.family.traced
-        self.family.traced |= {kind for kind in untraced if runs_on_symbols(system, kind, self.family.parameters)}
+        self.exact_derivatives = exact_derivatives(symbolic)
+        self.has_definite_mass = has_definite_mass(system, t, q)
+        untraced = system.given.keys() - cache.traced
+        cache.traced |= {kind for kind in untraced if runs_on_symbols(system, kind, cache.parameters)}
         share_checked_bounds(system)
-        if not self.family.within_bounds >= system.given.keys():
+        if not cache.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
         evaluated_run = ParametricRun(self, run.copy()).run
-        if (code is None) is not (symbolic_code is None) or _plan_values(evaluated_run) != _plan_values(run):
+        if (code is None) is not (symbolic_code is None) or _values_of_plans(evaluated_run) != _values_of_plans(run):
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
@@ -79,7 +80,7 @@ class SharedSetup:
 
 
 class ParametricRun:
-    """Run whose arrays `use` fills with the parameters of one system after another.
+    """Run whose arrays `use_parameters_of` fills with the parameters of one system after another.
 
     Parameters
     ----------
@@ -89,22 +90,22 @@ class ParametricRun:
 
     Attributes
     ----------
-    given : ConstrainedSystem
+    current_system : ConstrainedSystem
         The system whose parameters the arrays contain.
     system : ConstrainedSystem
-        A copy of `given` with the arrays of this run, and with a cache of its own.
+        A copy of `current_system` with the arrays of this run, and with a cache of its own.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
-        self.shared, self.run, self._formulas = shared, run, ParameterArrays()
-        functions, array = run.system.functions, self._formulas.array
+        self.shared, self.run, self._expression_arrays = shared, run, ParameterArrays()
+        functions, array, exact = run.system.functions, self._expression_arrays.array, shared.exact_derivatives
         self._functions = functions._replace(p=functions.p.copy(), flags=functions.flags.copy())
-        run.plan = self._numbered(shared.plan).fresh()
-        run.interiors = {kind: self._numbered(each) for kind, each in shared.interiors.items()}
+        run.plan = self._with_parameter_arrays(shared.plan).fresh()
+        run.interior_plans = {kind: self._with_parameter_arrays(each) for kind, each in shared.interior_plans.items()}
         run.traced, run.varied_parameters = run.plan.traced, self._functions.p
-        self._remembered: dict[Any, Any] = {
-            ("family", trace_cache_of): shared.family,
-            ("derivatives", trace_cache_of): None if shared.exact is None else shared.exact.with_numbers(array),
+        self._initial_cache: dict[Any, Any] = {
+            ("family", trace_cache_of): shared.trace_cache,
+            ("derivatives", trace_cache_of): None if exact is None else exact.with_numbers(array),
             ("kit", id(self._functions)): Kit(self._functions),
             "kits": {},
         }
@@ -112,31 +113,31 @@ class ParametricRun:
         run.kit = kit_for_plan(self.system, run.kit.flags, run.plan)
         run.functions = run.kit.functions
 
-    def use(self, system: ConstrainedSystem) -> bool:
+    def use_parameters_of(self, system: ConstrainedSystem) -> bool:
         """Fill the arrays with the parameters of a system; return False if they contained these parameters already."""
-        if system is self.given:
+        if system is self.current_system:
             return False
         self._fill_arrays(system)
         return True
 
     def _fill_arrays(self, system: ConstrainedSystem) -> None:
-        self.given = system
+        self.current_system = system
         self._functions.p[:] = system.functions.p
-        self._formulas.write(self.shared.family.products(self._functions.p))
+        self._expression_arrays.write(self.shared.trace_cache.products(self._functions.p))
         self.system = self.run.system = copy.copy(system)
-        self.system.functions, self.system.derived = self._functions, self._remembered.copy()
-        self.system.within_bounds.update(self.shared.family.within_bounds)
+        self.system.functions, self.system.derived = self._functions, self._initial_cache.copy()
+        self.system.within_bounds.update(self.shared.trace_cache.within_bounds)
         self.system.checked, self._mass_agrees = False, not system.constant_mass
         self.system.bandwidth = None  # the banded form is not used by these runs
         for traced in self.run.traced:
             traced.trusted = False
 
-    def agrees(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
+    def callbacks_agree(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
         """Return whether callbacks agree with traces near the start, and M keeps its structure (definite, diagonal)."""
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
-            structure = self.shared.definite, bool(run.kit.flags[DIAGONAL_MASS])
+            structure = self.shared.has_definite_mass, bool(run.kit.flags[DIAGONAL_MASS])
             self._mass_agrees = structure == (has_definite_mass(system, t0, q), is_diagonal(mass))
         try:
             if with_derivatives:
@@ -146,17 +147,23 @@ class ParametricRun:
             return False
         return self._mass_agrees
 
-    def _numbered(self, plan: Plan) -> Plan:
+    def _with_parameter_arrays(self, plan: Plan) -> Plan:
         """Return a copy of a plan in which arrays that `_fill_arrays` fills replace arrays of expressions."""
-        array, plan_fields = self._formulas.array, vars(plan)
-        changes: dict[str, Any] = {name: array(plan_fields[name]) for name in NUMBERS if plan_fields[name] is not None}
-        changes |= {name: self._numbered(plan_fields[name]) for name in SUBPLANS if plan_fields[name] is not None}
+        array, plan_fields = self._expression_arrays.array, vars(plan)
+        changes: dict[str, Any] = {
+            name: array(plan_fields[name]) for name in NUMBER_FIELDS if plan_fields[name] is not None
+        }
+        changes |= {
+            name: self._with_parameter_arrays(plan_fields[name])
+            for name in PLAN_FIELDS
+            if plan_fields[name] is not None
+        }
         return plan.changed(traced=tuple(each.with_numbers(array) for each in plan.traced), **changes)
 
 
-def _plan_values(run: Run) -> list[Any]:
+def _values_of_plans(run: Run) -> list[Any]:
     """Return a list of all values in the plans of a run, with arrays as bytes, to compare plans exactly."""
-    plans = [run.plan, *run.interiors.values()]
+    plans = [run.plan, *run.interior_plans.values()]
     return [run.kit.flags.tobytes(), *(each for plan in plans for each in _values_of_plan(plan))]
 
 

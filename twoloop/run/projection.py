@@ -62,7 +62,7 @@ class _SparseProjection:
         self.run_task(tasks.SOLVE, zero, residual, change)
         return displacement - change
 
-    def onto_constraints(self, q: Array) -> Array | None:
+    def project_nearby(self, q: Array) -> Array | None:
         """Return q projected by the independent rows of C_q; None on failure, or if other constraints are violated.
 
         The independent rows are not chosen anew: beside the constraints the other rows are only nearly dependent.
@@ -97,9 +97,9 @@ class Dependence(NamedTuple):
     """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    shares: dict[int, Array]  # by index of a dependent row: coefficients (n_c,) of the independent rows that sum to it
-    allowed: Array  # displacement (n_q,) that C_q allows; its largest entry is 1 in the units of the coordinates
-    onto_constraints: Callable[[Array], Array | None]  # returns a projected nearby position, or None on failure
+    coefficients: dict[int, Array]  # by index of a dependent row: its coefficients (n_c,) in terms of the others
+    allowed_move: Array  # displacement (n_q,) that C_q allows; its largest entry is 1 in units of coordinates
+    project_nearby: Callable[[Array], Array | None]  # returns a projected nearby position, or None on failure
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
@@ -115,16 +115,18 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
     if code != indices.DONE or projection.work.notes[indices.PIVOT] < MIN_SINE:
         return None
     independent, unused = set(projection.work.rows_v.tolist()), np.zeros_like(q)
-    shares: dict[int, Array] = {}
+    coefficients: dict[int, Array] = {}
     for row in range(system.n_c):
         if row not in independent:
-            shares[row] = np.zeros(system.n_c)
-            projection.run_task(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), unused, shares[row])
+            coefficients[row] = np.zeros(system.n_c)
+            projection.run_task(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), unused, coefficients[row])
     projection.position = q
     columns = units(system, t, q, all_rows, typical_sizes(q))
-    allowed = projection.allowed_part(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
-    norm = float((np.abs(allowed) / columns).max())
-    return Dependence(len(independent), shares, allowed / norm if norm > 0.0 else allowed, projection.onto_constraints)
+    allowed_move = projection.allowed_part(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
+    norm = float((np.abs(allowed_move) / columns).max())
+    return Dependence(
+        len(independent), coefficients, allowed_move / norm if norm > 0.0 else allowed_move, projection.project_nearby
+    )
 
 
 def project_sparsely(
@@ -175,12 +177,12 @@ def _other_guesses_agree(projection: _SparseProjection, position: Array, change:
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-CONVERGED = 1e-2  # violation that ends the Gauss-Newton iteration, relative to the violation allowed at a start
-# singular values, relative to the largest, below which they count as zero: SINGULAR for ranks, NEGLIGIBLE for
-# least-squares solutions, WEAK for least-squares solutions with redundant rows
-SINGULAR, NEGLIGIBLE, WEAK = 1e-10, 1e-13, 1e-2
-DEAD_CENTRE = 0.01  # ratio of the smallest to the largest singular value up to which a position is near a dead centre
-SAME_POSITION = 0.1  # distance of two positions, relative to the change by the projection, up to which they are equal
+CONVERGED_VIOLATION = 1e-2  # violation that ends the iteration, relative to the violation allowed at a start
+# singular values, relative to the largest, below which they count as zero: RANK_CUTOFF for ranks, LSTSQ_CUTOFF for
+# least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
+RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
+DEAD_CENTRE_RATIO = 0.01  # ratio of the smallest to the largest singular value up to which a dead centre is near
+MAX_SAME_DISTANCE = 0.1  # largest distance of equal positions, relative to the change by the projection
 MAX_CHANGE = 1e8  # change of a coordinate, in units of `Scales.columns`, above which the iteration counts as diverged
 
 
@@ -288,7 +290,7 @@ def _consistent_state(
         raise ValueError(f"q and v cannot be projected: {reason} at t = {t:g}")
     sparse_result = None if kept else project_sparsely(system, t, guess, speeds, check_assembly)
     if sparse_result is not None:
-        return _state_of_large(system, t, guess, speeds, *sparse_result)
+        return _large_state(system, t, guess, speeds, *sparse_result)
     position = _projected_position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
     jacobian = system.rows(t, position)
     change = _least_change(jacobian, free, -system.velocity_constraint(t, position, speeds))
@@ -320,7 +322,7 @@ class _LargeState(ConsistentState):
         return vars(self)[name]
 
 
-def _state_of_large(
+def _large_state(
     system: ConstrainedSystem, t: float, guess: Array, speeds: Array, position: Array, velocity: Array
 ) -> ConsistentState:
     state = _LargeState((position, velocity))
@@ -337,13 +339,13 @@ def _projected_position(
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
     violation = Violation.of_position(system, t, guess, jacobian, scales)
-    if violation.excess > CONVERGED and _rank(scaled[:, free]) < _rank(scaled):
+    if violation.excess > CONVERGED_VIOLATION and _rank(scaled[:, free]) < _rank(scaled):
         why = f"max|C| stays at {_format_largest(violation.values)}"
         raise ValueError(_describe_no_freedom(system, t, scaled, free, kept, why))
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     redundant = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
-    cutoff = WEAK if redundant else NEGLIGIBLE
-    if redundant:  # beside the constraints, redundant rows are only nearly dependent: project again with WEAK
+    cutoff = REDUNDANT_CUTOFF if redundant else LSTSQ_CUTOFF
+    if redundant:  # beside the constraints, redundant rows are only nearly dependent
         position, excess, iterations = _gauss_newton(system, t, guess, free, cutoff)
     if position is None or not excess <= 1.0:
         has_diverged = position is None
@@ -415,7 +417,7 @@ def _describe_other_assembly(
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
         if mixed_projected is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
-        if distance(mixed_projected, position) > SAME_POSITION * largest_move or sign_at(mixed_projected) != sign:
+        if distance(mixed_projected, position) > MAX_SAME_DISTANCE * largest_move or sign_at(mixed_projected) != sign:
             return f"ends on another one, which differs by {_describe_change(position, mixed_projected, scales)}"
     return None
 
@@ -429,7 +431,7 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 
 
 def _gauss_newton(
-    system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = NEGLIGIBLE
+    system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = LSTSQ_CUTOFF
 ) -> tuple[Array | None, float, int]:
     """Return the projected q (None: diverged), its violation over the allowed violation, and the iteration count."""
     best, nearest, guess = np.inf, q, q
@@ -443,17 +445,17 @@ def _gauss_newton(
         step = _least_change(jacobian, free, -values, cutoff)
         scales = scales_of(system, t, q, jacobian)
         excess = Violation.of_position(system, t, q, jacobian, scales).excess
-        if excess == 0.0 or (excess <= CONVERGED and excess >= 0.5 * best):
+        if excess == 0.0 or (excess <= CONVERGED_VIOLATION and excess >= 0.5 * best):
             return q, excess, iteration  # as close as rounding allows
         if excess < best:
             best, nearest = excess, q
         q = q + step
         if not (np.abs(q - guess) <= MAX_CHANGE * scales.columns).all():  # also true for NaN
             return None, np.inf, iteration
-    return nearest if best <= 1.0 else q, best, MAX_ITERATIONS  # rounding may keep the violation above CONVERGED
+    return nearest if best <= 1.0 else q, best, MAX_ITERATIONS  # rounding may keep it above CONVERGED_VIOLATION
 
 
-def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff: float = NEGLIGIBLE) -> Array:
+def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff: float = LSTSQ_CUTOFF) -> Array:
     """Return the smallest change (n_q,) of q in its `free` coordinates with C_q times the change equal to `values`."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
@@ -464,7 +466,7 @@ def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff
 
 def _rank(scaled: Array) -> int:
     values = np.linalg.svd(scaled, compute_uv=False)
-    return int((values > SINGULAR * max(float(values.max(initial=0.0)), 1e-300)).sum())
+    return int((values > RANK_CUTOFF * max(float(values.max(initial=0.0)), 1e-300)).sum())
 
 
 def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
@@ -484,7 +486,7 @@ def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], i
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
     """Return the right singular vector (n_q,) of the smallest nonzero singular value; its largest entry is 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
-    nonzero = values > SINGULAR * values.max()
+    nonzero = values > RANK_CUTOFF * values.max()
     direction = np.zeros(scaled.shape[1])
     direction[free] = rows[nonzero][-1] / np.abs(rows[nonzero][-1]).max()
     return direction
@@ -496,7 +498,7 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]
     ratios = [float(each.min()) / max(float(each.max()), 1e-300) for each in values]
-    if max(ratios) > DEAD_CENTRE:
+    if max(ratios) > DEAD_CENTRE_RATIO:
         return ""
     without = f" without the columns of keep={kept}" if kept else ""
     return (

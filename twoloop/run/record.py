@@ -22,13 +22,13 @@ from twoloop.kernels.layout import cached_run
 from twoloop.problem.description import Description
 from twoloop.problem.events import Event, EventSearch
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.dense_solution import DenseSolution, Interpolator, Table
+from twoloop.run.dense_solution import DenseSolution, Interpolator, StateTable
 
 if TYPE_CHECKING:
     from twoloop.run.run import Run
 
 MAGIC, HEADER_SIZE = b"\x93NUMPY\x01\x00", 128  # first bytes of a file in NumPy's format, and size of its header, bytes
-OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # fields with one row per step
+STEP_ARRAYS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # fields with one row per step
 
 
 class MemoryStore:
@@ -36,11 +36,11 @@ class MemoryStore:
 
     Attributes
     ----------
-    finished : bool
+    append_only : bool
         Whether added rows must be complete, because they cannot be changed later.
     """
 
-    finished = False
+    append_only = False
 
     def __init__(self) -> None:
         self._parts: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
@@ -49,7 +49,7 @@ class MemoryStore:
         """Append rows to an array; the part may be stored without a copy."""
         self._parts[name].append(part)
 
-    def cut(self, name: str, n: int) -> None:
+    def truncate(self, name: str, n: int) -> None:
         """Keep the first n rows of an array."""
         self._parts[name] = [self.array(name)[:n]]
 
@@ -72,7 +72,7 @@ class FileStore:
         In `add`, if the disk is full.
     """
 
-    finished = True
+    append_only = True
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir()
@@ -87,7 +87,7 @@ class FileStore:
             file.write(np.ascontiguousarray(part).data)
             self._write_header(file, name, dtype, (n + len(part), *width))
 
-    def cut(self, name: str, n: int) -> None:
+    def truncate(self, name: str, n: int) -> None:
         """Keep the first n rows of an array."""
         dtype, (n_before, *width) = self._shapes[name]
         with self._path(name).open("r+b") as file:
@@ -123,10 +123,10 @@ def memory_map(path: Path) -> NDArray[Any]:
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
-def read(folder: Path) -> dict[str, NDArray[Any]]:
+def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays in a folder by name; arrays with one row per state or per step are cut to equal lengths."""
     arrays = {path.stem: memory_map(path) for path in sorted(folder.glob("*.npy"))}
-    for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
+    for group in (("t", "states"), STEP_ARRAYS, ("sol_t", "sol_states")):
         present = [name for name in group if name in arrays]
         n = min((len(arrays[name]) for name in present), default=0)
         arrays |= {name: arrays[name][:n] for name in present}
@@ -146,7 +146,7 @@ class OutputRequest:
     ----------
     times : ndarray or None
         Output times; None: the ends of all accepted steps.
-    lands : bool
+    ends_at_outputs : bool
         Whether steps end at all output times, so that no states are interpolated.
     dense : bool
         Whether the dense solution is requested.
@@ -157,7 +157,7 @@ class OutputRequest:
     """
 
     times: Array | None
-    lands: bool
+    ends_at_outputs: bool
     dense: bool
     events: list[Event] | None
     store: Store
@@ -170,14 +170,14 @@ class OutputRequest:
     @property
     def between_steps(self) -> bool:
         """Whether states within steps are needed: for output times, the dense solution, or events."""
-        return (self.times is not None and not self.lands) or self.dense or self.events is not None
+        return (self.times is not None and not self.ends_at_outputs) or self.dense or self.events is not None
 
 
 class _TableInterpolation(NamedTuple):
     """Interpolation in a table of states, with the methods that `EventSearch` calls."""
 
     interpolator: Interpolator
-    table: Table
+    table: StateTable
 
     def at(self, times: Array) -> Array:
         return self.interpolator.states(self.table, times)
@@ -196,7 +196,7 @@ class Recorder:
     ----------
     search : EventSearch or None
         Search for events, which contains the events so far.
-    n_steps, last_step : int, float
+    n_steps, last_step_size : int, float
         Number of steps searched so far, at most up to a terminal event; time, s, from the beginning of the last step to
         this event, else 0.
     interrupted : bool
@@ -207,18 +207,18 @@ class Recorder:
         self, request: OutputRequest, interpolator: Interpolator | None, n_q: int, t0: float, state: Array, every: float
     ):
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
-        self.n_steps, self.last_step = 0, 0.0
+        self.n_steps, self.last_step_size = 0, 0.0
         self.interrupted = False
         # states at the ends of intervals still to be searched for events, and earlier nodes of their polynomials
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
-        self._next = 0  # index of the first interval between these states that has not been searched
+        self._next_interval = 0  # index of the first interval between these states that has not been searched
         self._n_outputs = 0
         may_end_run = request.events is not None and any(event.terminal < np.inf for event in request.events)
-        self._max_pending = 0 if may_end_run or request.store.finished else MAX_PENDING
+        self._max_pending = 0 if may_end_run or request.store.append_only else MAX_PENDING
         self.search = None if request.events is None else EventSearch(request.events, t0, state[: 2 * n_q], every)
         self._store_output(self._t, self._rows, self._kinds)
-        if request.times is not None and not request.lands:
+        if request.times is not None and not request.ends_at_outputs:
             self._store(self._t[:0], self._rows[:0, : 2 * self._n_q])
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
@@ -232,7 +232,7 @@ class Recorder:
         self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
         self._kinds = np.concatenate([self._kinds, kinds])
         if len(self._t) > self._max_pending:
-            self._search(len(self._t) - WINDOW)
+            self._search_intervals(len(self._t) - WINDOW)
 
     def correct_last_state(self, t: float, row: Array) -> None:
         """Replace [q, v, a] of the last state, as a node of interpolation, by `row`, if the time of this state is t."""
@@ -244,13 +244,13 @@ class Recorder:
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
-            self.interpolator.across[float(self._t[-1])] = memory.copy()
+            self.interpolator.crossing_memories[float(self._t[-1])] = memory.copy()
 
     def _store_output(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         request, store = self.request, self.request.store
         if request.times is None:
             self._store(t, rows)
-        elif request.lands:  # steps also end at the ends of the run, which may not be output times
+        elif request.ends_at_outputs:  # steps also end at the ends of the run, which may not be output times
             is_output = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
             self._store(t[is_output], rows[is_output])
         if request.dense:
@@ -261,37 +261,39 @@ class Recorder:
     def _store(self, t: Array, rows: Array) -> None:
         """Store times and rows [q, v, a, lam], or rows [q, v]; [a, lam] are then computed now or at the end."""
         self.request.store.add("t", t)
-        self.request.store.add("states", self._with_accelerations(t, rows) if self.request.store.finished else rows)
+        self.request.store.add("states", self._with_accelerations(t, rows) if self.request.store.append_only else rows)
 
     def finish(self) -> None:
         """At the end of the run, search the remaining intervals for events, and interpolate at their output times."""
-        self._search(len(self._t) - 1)
+        self._search_intervals(len(self._t) - 1)
 
     @property
-    def last(self) -> tuple[float, Array] | None:
+    def end_state(self) -> tuple[float, Array] | None:
         """Time and row [q, v] of the event that ended the run, or None."""
-        return None if self.search is None or self.ended is None else self.search.found[self.ended[0].number][-1]
+        return (
+            None if self.search is None or self.end_event is None else self.search.found[self.end_event[0].number][-1]
+        )
 
     @property
     def interrupted_at(self) -> float | None:
         """Time at which Ctrl-C interrupted the search for events, or None; the result ends at this time."""
-        ended_early = self.interrupted and self.search is not None and self.ended is None
+        ended_early = self.interrupted and self.search is not None and self.end_event is None
         return self.search.reached if ended_early and self.search is not None else None
 
     @property
-    def ended(self) -> tuple[Event, float] | None:
+    def end_event(self) -> tuple[Event, float] | None:
         """Event that ended the run, and its time, or None."""
         return None if self.search is None else self.search.ended
 
-    def _search(self, end: int) -> None:
+    def _search_intervals(self, end: int) -> None:
         """Search the intervals before the state with index `end` for events; store states at output times in them."""
         interpolator = self.interpolator
-        if interpolator is None or self.ended is not None or self.interrupted:
+        if interpolator is None or self.end_event is not None or self.interrupted:
             return
-        if end < self._next or (end == self._next and len(self._t) > 1):
+        if end < self._next_interval or (end == self._next_interval and len(self._t) > 1):
             return
-        table = Table(self._t, np.ascontiguousarray(self._rows[:, : 3 * self._n_q]), self._kinds)
-        node_times = self._t[self._next : end + 1]
+        table = StateTable(self._t, np.ascontiguousarray(self._rows[:, : 3 * self._n_q]), self._kinds)
+        node_times = self._t[self._next_interval : end + 1]
         if self.search is not None:
             try:
                 self.search.search(_TableInterpolation(interpolator, table), node_times)
@@ -299,12 +301,12 @@ class Recorder:
                 self.interrupted = True
                 self.search.break_off()
                 node_times = node_times[node_times <= self.search.reached]
-            if self.ended is not None:
-                n_before = int(np.searchsorted(node_times, self.ended[1]))
-                self.last_step = float(self.ended[1] - node_times[max(n_before - 1, 0)])
-                node_times = np.append(node_times[:n_before], self.ended[1])
+            if self.end_event is not None:
+                n_before = int(np.searchsorted(node_times, self.end_event[1]))
+                self.last_step_size = float(self.end_event[1] - node_times[max(n_before - 1, 0)])
+                node_times = np.append(node_times[:n_before], self.end_event[1])
         self.n_steps += len(node_times) - 1
-        if self.request.times is not None and not self.request.lands:
+        if self.request.times is not None and not self.request.ends_at_outputs:
             times = self.request.times[self._n_outputs :]
             times = times[times <= node_times[-1]]
             try:
@@ -314,19 +316,19 @@ class Recorder:
                 self.interrupted = True
         n_dropped = max(0, end - WINDOW)
         self._t, self._rows, self._kinds = self._t[n_dropped:], self._rows[n_dropped:], self._kinds[n_dropped:]
-        self._next = end - n_dropped
+        self._next_interval = end - n_dropped
 
     def output(self) -> tuple[Array, Array]:
         """Return times and rows [q, v, a, lam] of the result, up to the event or interruption that ended the run."""
-        store, end = self.request.store, self.interrupted_at if self.ended is None else self.ended[1]
+        store, end = self.request.store, self.interrupted_at if self.end_event is None else self.end_event[1]
         if end is not None:
             n = int(np.searchsorted(store.array("t"), end, side="right"))
-            store.cut("t", n)
-            store.cut("states", n)
+            store.truncate("t", n)
+            store.truncate("states", n)
         t = store.array("t")
-        if self.request.times is None and self.last is not None and t[-1] < self.last[0]:
-            end_time = np.array([self.last[0]])
-            self._store(end_time, self._with_accelerations(end_time, self.last[1][None, :]))
+        if self.request.times is None and self.end_state is not None and t[-1] < self.end_state[0]:
+            end_time = np.array([self.end_state[0]])
+            self._store(end_time, self._with_accelerations(end_time, self.end_state[1][None, :]))
             t = store.array("t")
         return t, self._with_accelerations(t, store.array("states"))
 
@@ -336,7 +338,7 @@ class Recorder:
             return rows
         a_and_lam = np.full((len(times), self._width - rows.shape[1]), np.nan)
         try:
-            self.interpolator.complete(times, rows, a_and_lam)
+            self.interpolator.fill_accelerations(times, rows, a_and_lam)
         except KeyboardInterrupt:
             self.interrupted = True
             a_and_lam[np.isnan(a_and_lam).any(axis=1)] = np.nan  # a row may be half written
@@ -346,9 +348,9 @@ class Recorder:
         """Return the dense solution, or None if it is not requested."""
         if not self.request.dense or self.interpolator is None:
             return None
-        table = Table(*(self.request.store.array(f"sol_{name}") for name in ("t", "states", "kinds")))
+        table = StateTable(*(self.request.store.array(f"sol_{name}") for name in ("t", "states", "kinds")))
         end = float(table.t[-1]) if self.interrupted_at is None else self.interrupted_at
-        return DenseSolution(self.interpolator, table, end if self.ended is None else self.ended[1])
+        return DenseSolution(self.interpolator, table, end if self.end_event is None else self.end_event[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
         """Return times, coordinates and velocities of the events: three lists with one array per event function."""
@@ -361,7 +363,7 @@ class Recorder:
 
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
-Later = Callable[[str], dict[str, Any]]  # takes the name of a deferred field; returns this and related fields by name
+Deferred = Callable[[str], dict[str, Any]]  # computes a deferred field by its name, with related fields
 
 
 class Status(IntEnum):
@@ -528,9 +530,9 @@ class Record:
         ValueError
             If no energy is known: the system was solved without a `Problem`, or the result has no system.
         """
-        return np.asarray(self._known("energy")(self.t, self.q, self.v))
+        return np.asarray(self._description_value("energy")(self.t, self.q, self.v))
 
-    def _known(self, what: str) -> Any:
+    def _description_value(self, what: str) -> Any:
         """Return the attribute `what` of the description; if it is None, raise a ValueError that says how to set it."""
         value = getattr(self.description, what)
         if value is None:
@@ -601,7 +603,7 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
-    return dict(zip(OF_STEPS, (h, *changes, untested), strict=True))
+    return dict(zip(STEP_ARRAYS, (h, *changes, untested), strict=True))
 
 
 def statistics(counters: Integers, cpu: float) -> Statistics:

@@ -195,8 +195,10 @@ def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[
     return status, message
 
 
-CHUNK = 256  # largest number of attempted steps in one call of `advance`
-FIRST_STEP = 0.1  # first step size in a piece, relative to the piece's duration, unless the last piece proposes one
+CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
+FIRST_STEP_FRACTION = (
+    0.1  # first step size in a piece, relative to the piece's duration, unless the last piece proposes one
+)
 TOLERANCE_FACTOR = 0.1  # ratio of the tolerances of a rerun to those of the run
 FINEST = 1e-13  # smallest tolerance of a rerun, relative or absolute: rounding hides smaller errors
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
@@ -259,11 +261,11 @@ class IndependentRerun:
         self.run = Run(system, plan, t, q, v, rtol, atol, None)
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
-        control[a.MAX_ATTEMPTS] = CHUNK
+        control[a.MAX_ATTEMPTS] = CHUNK_ATTEMPTS
         self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run checked the accuracy of gamma by differences
-        n_rows = max(2, min(CHUNK, MAX_BUFFER_SIZE // len(self.run.state)))
+        n_rows = max(2, min(CHUNK_ATTEMPTS, MAX_BUFFER_SIZE // len(self.run.state)))
         rows = (np.empty(n_rows), np.empty((n_rows, len(self.run.state))))
-        self.buffers, self.filled = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
+        self.buffers, self.n_filled = (*rows, np.empty((CHUNK_ATTEMPTS, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
 
     def integrate(self, t0: float, state: Array, times: Array, max_attempts: int) -> RerunPiece | None:
@@ -273,11 +275,11 @@ class IndependentRerun:
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:
             return None
         t1 = float(times[-1])
-        run.clock[a.H_NEXT] = proposed_step if proposed_step < np.inf else FIRST_STEP * (t1 - t0)
+        run.clock[a.H_NEXT] = proposed_step if proposed_step < np.inf else FIRST_STEP_FRACTION * (t1 - t0)
         run.work.notes[indices.KINK_AFTER] = t1
         states: list[Array] = []
         longest, n_total = 0.0, 0
-        buffers, filled = self.buffers, self.filled
+        buffers, filled = self.buffers, self.n_filled
         for _ in range(0, max_attempts + len(times), len(buffers[0])):
             code = run.advance(times, buffers, filled)
             n_rows, n_steps = filled.tolist()

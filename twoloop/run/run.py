@@ -28,7 +28,13 @@ from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import describe_not_finite
-from twoloop.run.singular_positions import LEAST, MARGIN, WEAK, describe_singular_start, singular_threshold
+from twoloop.run.singular_positions import (
+    PIVOT_FACTOR,
+    SMALL_PIVOT,
+    WEAK_RATIO,
+    describe_singular_start,
+    singular_threshold,
+)
 from twoloop.run.workspace import kit_for_plan, kit_of, prepare_workspace, static_form, with_newton, workspace
 
 Array = NDArray[np.float64]
@@ -37,10 +43,10 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 # largest number of attempts in the first chunk of a small system; after each chunk, checks in Python take 0.2 ms
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of attempts in the first chunk if callbacks are slow Python functions
-SMALL = 32  # number of coordinates up to which a system is small; larger systems have proportionally smaller chunks
+SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
 TRIAL_STEPS = 10  # number of first steps: a short step size among these replaces a method that needs long steps
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
-CONTRADICTS = 1e-6  # residual of a row of C_q a = gamma, relative to its terms, from which on constraints contradict
+CONTRADICTION = 1e-6  # smallest residual of a row of C_q a = gamma, relative to its terms, that contradicts other rows
 
 
 class Run:
@@ -70,17 +76,17 @@ class Run:
         self.kernels, self.a = advance, loop_state
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
-        self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
+        self.rtol, self.reuse, self.interior_plans, self.traced = rtol, plan.reuse, interiors, plan.traced
         self.least_atol = float(atol.min())
         plans = plan, *plan.substitutes
-        self.static = static_form(system, t0, q0, *plans)
+        self.static_form = static_form(system, t0, q0, *plans)
         self.matrices = max(each.matrices for each in plans)
-        self.kit = kit_of(system, t0, q0, plan, self.static)
+        self.kit = kit_of(system, t0, q0, plan, self.static_form)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
         # ranks are computed at every start; those of the last start are a guess that often saves a second workspace
-        self.work = self._workspace(*(system.derived.get("ranks", ()) if self.static is None else ()))
+        self.work = self._workspace(*(system.derived.get("ranks", ()) if self.static_form is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
         self.tolerances[indices.RTOL] = rtol
@@ -91,16 +97,16 @@ class Run:
         self.control[loop_state.MAX_STEP], self.control[loop_state.MAX_EVALUATION_GAP] = np.inf, 1.0
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
-        self.control[loop_state.BRIDGE], self.control[loop_state.SAMPLE_MOTION] = self.static is None, 1.0
+        self.control[loop_state.BRIDGE], self.control[loop_state.SAMPLE_MOTION] = self.static_form is None, 1.0
         rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # C_t of kinematics alone is zero
         self.control[loop_state.DRIVEN] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
-        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
+        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # largest number of attempts per call
         self.clock = np.zeros(loop_state.N_CLOCK)
-        self._set_clock(t0)
-        self.control_by(plan)
+        self._reset_clock(t0)
+        self.write_step_control(plan)
         self.substituted = False  # whether the substitute plan has replaced the first plan
-        self.near = singular_threshold(rtol)  # ratio of pivots below which rounding errors of velocities are estimated
+        self.near_threshold = singular_threshold(rtol)  # ratio of pivots near a singular position
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced), lambda: (may_be_short(system, force_traced), may_be_steep(system, force_traced))
@@ -111,12 +117,12 @@ class Run:
         self.may_be_steep = steep or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
-        self.mirrored = 0.0  # size of a step that ends as far beyond the position as its base is before it, s
-        self.looser = self.tolerances  # tolerances of steps across singular positions
-        self.lengths: list[float] = []  # sizes of steps that are still to be tried, s
-        self.longer: list[float] = []  # larger sizes to be tried if too few nodes of a step are beyond the position, s
-        self.crossed = 0.0  # size of the last attempted step across a singular position, s
-        self.pieces: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
+        self.mirrored_size = 0.0  # size of a step that ends as far beyond the position as its base is before it, s
+        self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
+        self.sizes_to_try: list[float] = []  # sizes of steps that are still to be tried, s
+        self.larger_sizes: list[float] = []  # larger sizes, s, for too few nodes beyond the position
+        self.crossing_size = 0.0  # size of the last attempted step across a singular position, s
+        self.piece_ends: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
         self.origins: list[Any] = []  # `Origin`s of polynomials across the position that are still to be tried
         self.t1 = np.inf  # end of the run, s
         self.starts_singular = False  # whether the start is a singular position from which the rank rises
@@ -128,12 +134,12 @@ class Run:
         self._compute_start()
         self.rank = len(self.work.rows_v)
         self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings about redundant rows, by these rows
-        self.redundant, self.rows_warning = self.redundant_rows()
+        self.redundant, self.rows_warning = self.find_redundant_rows()
         self.start_warning = self._start_warning()
 
     def copy(self) -> "Run":
         """Return a copy of this run, which must be at its start."""
-        new_run = self._copy()
+        new_run = self._copy_without_workspace()
         new_run.work = copy_of(self.work)
         return new_run
 
@@ -142,7 +148,7 @@ class Run:
 
         The run must not use the static form of linear algebra.
         """
-        new_run = self._copy()
+        new_run = self._copy_without_workspace()
         new_run.t0, new_run.compared_until = t0, [-np.inf]
         work = empty(self.work.sizes)
         prepare_workspace(work, self.system, self.kit.flags, new_run._pattern(q0), q0, self.rtol, self.reuse)
@@ -150,7 +156,7 @@ class Run:
         new_run.work = work
         if new_run.restart(t0, q0, v0) != indices.DONE:
             return None
-        new_run.redundant, new_run.rows_warning = new_run.redundant_rows()
+        new_run.redundant, new_run.rows_warning = new_run.find_redundant_rows()
         new_run.start_warning = new_run._start_warning()
         return new_run
 
@@ -159,7 +165,7 @@ class Run:
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
-        self._set_clock(t)
+        self._reset_clock(t)
         code: int = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         return code
 
@@ -168,14 +174,14 @@ class Run:
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
-        self._set_clock(t)
+        self._reset_clock(t)
         clock[self.a.H_LONG], clock[self.a.LARGEST_PIVOT] = length, self.work.notes[indices.PIVOT]
         self.start_warning = (
             "the run begins in a singular position, where the constraints lose rank: it follows the branch of the "
             "motion to which v0 belongs; multipliers are not determined there, and are NaN at the start"
         )
 
-    def _set_clock(self, t: float) -> None:
+    def _reset_clock(self, t: float) -> None:
         """Reset the array `clock` for a run that begins at t."""
         a, clock = self.a, self.clock
         clock[:] = 0.0
@@ -206,12 +212,12 @@ class Run:
             Plan, controls and kit for this call. None: those of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
-        tolerances = self.tolerances if plan is self.plan else self.looser
+        tolerances = self.tolerances if plan is self.plan else self.crossing_tolerances
         arrays = plan.options, plan.memory, tolerances, control, self.clock, self.state, self.new_state
         code: int = entry_point(self.kernels.advance)(kit, self.work, *arrays, outputs, *buffers, filled)
         return code
 
-    def _copy(self) -> "Run":
+    def _copy_without_workspace(self) -> "Run":
         new_run = object.__new__(Run)
         vars(new_run).update(
             vars(self),
@@ -224,18 +230,18 @@ class Run:
             crossings=[],
             jumps=[],
         )
-        new_run.looser = new_run.tolerances
-        if self.static is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # a run may change these flags
+        new_run.crossing_tolerances = new_run.tolerances
+        if self.static_form is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # its flags may change
             new_run.kit = kit_for_plan(self.system, self.kit.flags, new_run.plan)
             new_run.functions = new_run.kit.functions
         return new_run
 
     @property
-    def lands(self) -> bool:
+    def ends_at_outputs(self) -> bool:
         """Whether steps end at all output times."""
         return self.plan.lands or self.control[self.a.FIXED_STEP] > 0.0
 
-    def control_by(self, plan: Plan) -> None:
+    def write_step_control(self, plan: Plan) -> None:
         """Write the step-size control of a plan to the array `control`, and its first limit of steps to `clock`."""
         a, control = self.a, self.control
         control[: a.N_RULE] = plan.rule
@@ -250,9 +256,11 @@ class Run:
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Return a new workspace for the rank of C_q and the rank of all rows; None: full rank."""
         q0 = self.state[: self.system.n_q]
-        pattern = self._pattern(q0) if self.static is None else NO_PATTERN
+        pattern = self._pattern(q0) if self.static_form is None else NO_PATTERN
         ranks = rank, rank_v
-        work = workspace(self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static, self.matrices)
+        work = workspace(
+            self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static_form, self.matrices
+        )
         work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         return work
 
@@ -261,11 +269,11 @@ class Run:
         system, t0 = self.system, self.t0
         return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
-    def is_lost_without_dense(self, code: int) -> bool:
+    def may_succeed_in_other_form(self, code: int) -> bool:
         """Return whether steps failed in the static form of linear algebra, but may succeed in another form."""
         failure_codes = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
-            self.static is not None
+            self.static_form is not None
             and code in (self.a.STEP_TOO_SMALL, self.a.FIXED_STEP_FAILED, self.a.RANK_LOST)
             and int(self.clock[self.a.FAILURE_CODE]) in failure_codes
         )
@@ -279,18 +287,18 @@ class Run:
         old_work, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
         rank = len(old_work.rows_v)
         t, q = float(self.clock[self.a.T]), self.state[:n].copy()
-        static, self.static = self.static, None
-        if static is not None and static.newton is None and self.matrices > 0:
-            self.static = with_newton(self.system, t, q, static)
-        if self.static is not None and self.plan.first is not None:
-            self.plan = with_matrix_cost(self.plan, self.static.matrix_cost())
-        self.kit = kit_of(self.system, t, q, self.plan, self.static)
+        static, self.static_form = self.static_form, None
+        if static is not None and static.newton_program is None and self.matrices > 0:
+            self.static_form = with_newton(self.system, t, q, static)
+        if self.static_form is not None and self.plan.first is not None:
+            self.plan = with_matrix_cost(self.plan, self.static_form.matrix_cost())
+        self.kit = kit_of(self.system, t, q, self.plan, self.static_form)
         self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = old_work.counters
         notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.KINK_BEFORE, indices.KINK_AFTER]
         self.work.notes[notes] = old_work.notes[notes]
-        self.control[self.a.BRIDGE] = self.static is None
+        self.control[self.a.BRIDGE] = self.static_form is None
         clock, a = self.clock, self.a
         if clock[a.FAILURE_CODE] != indices.DONE:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
@@ -308,14 +316,14 @@ class Run:
         """Compute the accelerations at the start, if necessary with other ranks or another form of linear algebra."""
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
-        if self.static is not None and code == indices.RANK_DIFFERS:
+        if self.static_form is not None and code == indices.RANK_DIFFERS:
             rank = int(self.work.notes[indices.RANK])
             self.work = self._workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
-        if self.static is not None and code not in (indices.DONE, indices.NOT_FINITE):
+        if self.static_form is not None and code not in (indices.DONE, indices.NOT_FINITE):
             if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
                 self.system.derived["static form"] = None
-            self.static = None
+            self.static_form = None
             self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
             self.functions = self.kit.functions
             self.control[self.a.BRIDGE] = 1.0
@@ -349,7 +357,7 @@ class Run:
             f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {describe_not_finite(self)}"
         )
 
-    def redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
+    def find_redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
         """Return the indices of dependent rows of [C_q; A] at the start, and a warning; `rows`: [C_q; A] or None."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
@@ -374,7 +382,7 @@ class Run:
 
     def _start_warning(self) -> str:
         """Return the warning for a start at or near a singular position, else ""."""
-        if self.work.notes[indices.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
+        if self.work.notes[indices.PIVOT] > (PIVOT_FACTOR * WEAK_RATIO if self.static_form is None else SMALL_PIVOT):
             return ""
         atol, q = self.tolerances[indices.ATOL :], self.state[: self.system.n_q]
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
@@ -384,9 +392,9 @@ class Run:
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
-        if residual.max() <= CONTRADICTS:  # CONTRADICTS is the smallest tolerance of a row
+        if residual.max() <= CONTRADICTION:  # CONTRADICTION is the smallest tolerance of a row
             return np.zeros(0, dtype=np.int64)
-        return np.flatnonzero(residual > CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
+        return np.flatnonzero(residual > CONTRADICTION * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
     def _rows_at_start(self) -> Rows:
         """Return [C_q; A] at the start, dense or sparse."""
@@ -400,18 +408,18 @@ class Run:
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
         q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
-        if self.static is None or set(rows) & set(counted):
+        if self.static_form is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
         for row, factor in zip(rows, factors, strict=False):  # row = factor @ independent rows
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
         return equations_in_words(rows, counted, factors[:, counted], norms(all_rows))
 
-    def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
+    def set_step_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first step size and the limits of step sizes, s; `first_step` None: take an estimate."""
         self.max_step = max_step
         self.limit_steps()
-        proposed_size = self.first_step(self.t0, t1, self.state, max_step)
+        proposed_size = self.choose_first_step(self.t0, t1, self.state, max_step)
         first_size = min(first_step or proposed_size, t1 - self.t0)
         self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first_size, float(first_step is not None)
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
@@ -425,7 +433,7 @@ class Run:
         max_size = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), unseen
 
-    def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
+    def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
         """Return the first step size, s, from a state; if `longest` (max_step) > 0, also limit the later step sizes."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
         first: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
@@ -439,10 +447,10 @@ class Run:
 
     def passed_near_singular(self) -> bool:
         """Return whether a step ended so near a singular position that rounding may have changed its velocities."""
-        threshold = self.near if self.static is None else LEAST  # pivots of static factors vary, and checks take long
+        threshold = self.near_threshold if self.static_form is None else SMALL_PIVOT  # pivots of static factors vary
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 
-    def attempts(self) -> int:
+    def n_attempts(self) -> int:
         """Return the number of attempted steps so far."""
         c = self.work.counters
         return int(c[indices.N_ACCEPTED] + c[indices.N_REJECTED_ERROR] + c[indices.N_REJECTED_CONVERGENCE])

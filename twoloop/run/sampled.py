@@ -22,7 +22,7 @@ from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import MAX_REPETITIONS, closer_sampling, may_have_missed_changes, warn_of_missed_changes
+from twoloop.run.fallbacks import MAX_REPETITIONS, gap_for_repetition, may_have_missed_changes, warn_of_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
 from twoloop.run.record import MemoryStore, OutputRequest, Record, Status, statistics
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 MAX_STEPS = 1024  # largest number of attempted steps in one call of `advance`; more steps are left to IntegrationLoop
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # callbacks that may depend on parameters that change at samples
-CHANGED = "the parameters changed at samples"  # value of the field `changes` of the result
+CHANGED_PARAMETERS = "the parameters changed at samples"  # value of the field `changes` of the result
 
 
 class SampledState(NamedTuple):
@@ -65,7 +65,7 @@ class SampledRun:
     Parameters
     ----------
     system : ConstrainedSystem
-        A system that only this object uses: `set` changes its parameters.
+        A system that only this object uses: `set_parameters` changes its parameters.
     method : Method
     rtol, atol : float, ndarray (n_q,)
     max_step : float
@@ -102,7 +102,7 @@ class SampledRun:
         def check(traced: Traced) -> None:
             traced.refuse(system, t0, t0 + 1.0, q0, v0)
 
-        self._derived, _ = with_derived_callbacks(system, check)
+        self._derived_system, _ = with_derived_callbacks(system, check)
         self._plan = method.plan(system.n_q, rtol, float(atol.min()), False)
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
         self._tolerances = rtol, atol
@@ -111,7 +111,7 @@ class SampledRun:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
         self._force_parameters: set[int] = set()  # indices of parameters that were found to affect forces only
-        self._changed = self._failed = False
+        self._parameters_changed = self._step_failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = (
             np.empty(1),
@@ -119,20 +119,20 @@ class SampledRun:
             np.empty((MAX_STEPS, self.run.a.N_STEP_COLUMNS)),
         )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu, self._every = 0.0, np.inf  # CPU time, s; longest allowed time between evaluations, s
+        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time, s; longest allowed time between evaluations, s
         self._store_sample(t0)
 
     def _run_from(self, t: float, q: Array, v: Array) -> Run:
-        run = Run(self._derived, self._plan.fresh(), t, q, v, *self._tolerances, None)
+        run = Run(self._derived_system, self._plan.fresh(), t, q, v, *self._tolerances, None)
         allowed = self._tolerances[1] + self._tolerances[0] * np.abs(v).max()
-        if run.static is None and branch_at(self._derived, t, run.state, run.rank, allowed) is not None:
+        if run.static_form is None and branch_at(self._derived_system, t, run.state, run.rank, allowed) is not None:
             raise ValueError(
                 f"start of {self.system.name!r} must not be a singular position, as at t = {t:g}: the constraints "
-                f"have lost rank there ({dependent_rows(self._derived, t, q)}), but not beside it. Start a little "
-                "before that position, or beyond; run and solve_dae may start there"
+                f"have lost rank there ({dependent_rows(self._derived_system, t, q)}), but not beside it. Start a "
+                "little before that position, or beyond; run and solve_dae may start there"
             )
         run.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
-        run.set_sizes(None, self.max_step, t + 1.0)
+        run.set_step_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
 
@@ -141,7 +141,7 @@ class SampledRun:
         """Time of the last sample, s."""
         return self.times[-1]
 
-    def set(self, inputs: Any) -> None:
+    def set_parameters(self, inputs: Any) -> None:
         """Change parameters; `inputs`: a mapping from indices to numbers, or an array of all parameters."""
         if not self.p.size:
             raise ValueError(f"inputs are parameters, of which {self.system.name!r} has none: make it with parameters=")
@@ -154,7 +154,7 @@ class SampledRun:
                     )
                 number = value if type(value) is float and abs(value) < np.inf else check_finite("inputs", value)
                 if number != self.p[index]:
-                    self._write(index, number)
+                    self._write_parameter(index, number)
             return
         values = check_real("inputs", inputs)
         if values.shape != self.p.shape or not np.isfinite(values).all():
@@ -163,17 +163,17 @@ class SampledRun:
                 f"{shown(inputs)}"
             )
         for index in np.flatnonzero(values != self.p).tolist():
-            self._write(index, float(values[index]))
+            self._write_parameter(index, float(values[index]))
 
     def step(self, dt: float) -> SampledState:
         """Integrate for a time dt, s, from the last sample; store the final state as a new sample, and return it."""
-        if self._failed:
+        if self._step_failed:
             self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
-        self._failed = True  # until the end is reached, as a callback may raise
+        self._step_failed = True  # until the end is reached, as a callback may raise
         with signals_of(self.system):
             self._step_to(end)
-        self.cpu += time.process_time() - began
+        self.cpu_time += time.process_time() - began
         self._store_sample(end)
         return self.state
 
@@ -185,7 +185,7 @@ class SampledRun:
                 return
             if len(self.times) > 1:  # earlier samples, which are not repeated, may have missed a change
                 warn_of_missed_changes(self.run)
-            self._every = closer_sampling(self.run)
+            self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
         self._integrate_to(end)
         warn_of_missed_changes(self.run)
@@ -194,10 +194,10 @@ class SampledRun:
         """Integrate from the last sample to the time `end`, without repetitions."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
-        if self._changed or self.system.called_in_python:  # global variables of Python functions may change
+        if self._parameters_changed or self.system.called_in_python:  # global variables of Python functions may change
             self._restart(t)
-        run.first_step(self.t0, end, run.state, run.max_step)
-        run.control[a.APART] = min(self._every, run.control[a.APART])
+        run.choose_first_step(self.t0, end, run.state, run.max_step)
+        run.control[a.APART] = min(self._max_gap, run.control[a.APART])
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
         run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = MAX_STEPS, np.inf
         code = run.advance(self._outputs, self._buffers, self._filled)
@@ -218,7 +218,7 @@ class SampledRun:
         row.setflags(write=False)
         self.rows.append(row)
         self.times.append(t)
-        self._n_steps, self._failed = len(self.steps), False
+        self._n_steps, self._step_failed = len(self.steps), False
 
     def record(self) -> Record:
         """Return the record of the states at all samples so far."""
@@ -231,13 +231,13 @@ class SampledRun:
             h=steps[:, a.H],
             status=Status.REACHED_END,
             message=f"Stepped to t = {self.t:g} in {len(self.times) - 1} samples.",
-            stats=statistics(run.work.counters, self.cpu),
+            stats=statistics(run.work.counters, self.cpu_time),
             rank=run.rank,
             redundant=run.redundant.copy(),
             untested=steps[:, a.JACOBIANS] > 0.0,
             widest_gap=float(run.work.notes[indices.WIDEST_GAP]),
             system=self.system,
-            changes=CHANGED,
+            changes=CHANGED_PARAMETERS,
         )
 
     def _restart(self, t: float) -> None:
@@ -256,7 +256,7 @@ class SampledRun:
                 f"the accelerations of {self.system.name!r} cannot be found at t = {t:.10g} with the inputs given: the "
                 "forces are not finite, or the constraints have lost rank"
             )
-        self._changed = False
+        self._parameters_changed = False
 
     def _return_to_sample(self) -> None:
         """Replace the run, which failed or has to be repeated, by a new run from the state at the last sample."""
@@ -267,18 +267,18 @@ class SampledRun:
             raise RuntimeError(f"step goes on from the last sample, where it cannot begin: {error}") from None
         self.run.work.counters[:] = old_run.work.counters
         del self.steps[self._n_steps :]
-        self._changed = False
+        self._parameters_changed = False
 
     def _finish_by_loop(self, end: float) -> None:
         """Integrate to `end` by IntegrationLoop (after many steps, or at a jump); raise RuntimeError if that fails."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
         request = OutputRequest(np.array([end]), True, False, None, MemoryStore())
-        interrupts = Interrupts().listen()
+        interrupts = Interrupts().install_handlers()
         try:
-            record = IntegrationLoop(run, end, request, lambda t: None, None, interrupts).to_end(False)
+            record = IntegrationLoop(run, end, request, lambda t: None, None, interrupts).integrate_to_end(False)
         finally:
-            interrupts.leave()
+            interrupts.restore_handlers()
         run.control[run.a.STORE_ALL], run.work.notes[indices.KINK_AFTER] = 0.0, np.inf
         steps = np.zeros((len(record.h), run.a.N_STEP_COLUMNS))
         steps[:, run.a.H], steps[:, run.a.JACOBIANS] = record.h, record.untested
@@ -286,11 +286,11 @@ class SampledRun:
         if record.status != Status.REACHED_END:
             raise RuntimeError(f"step of {self.system.name!r}: {record.message}")
 
-    def _write(self, index: int, value: float) -> None:
+    def _write_parameter(self, index: int, value: float) -> None:
         if index not in self._force_parameters:
             self._check_enters_forces_only(index, value)
         self.p[index] = value
-        self._changed = True
+        self._parameters_changed = True
 
     def _check_enters_forces_only(self, index: int, value: float) -> None:
         """Raise ValueError if callbacks other than forces depend on a parameter: positions or momenta would jump."""

@@ -26,7 +26,7 @@ class SignalHandlers:
     Python calls a handler at its next instruction, which may be one of numba. In Python code called by machine code, an
     exception becomes a `SystemError`; during compilation, it breaks numba for the rest of the process. So the call of a
     handler is delayed if a signal arrives in a compiler. Elsewhere the handler is called at once. As its exception may
-    be mistaken for that of a callback, `check`, between chunks of steps, and `leave` raise the exception again.
+    be mistaken for that of a callback, `call_delayed` (between chunks of steps) and `restore` raise it again.
 
     Parameters
     ----------
@@ -35,51 +35,51 @@ class SignalHandlers:
     """
 
     def __init__(self, ctrl_c: bool = False) -> None:
-        self._before: dict[int, Any] = {}
-        self._waiting: list[tuple[int, FrameType | None]] = []
-        self._raised: BaseException | None = None
+        self._user_handlers: dict[int, Any] = {}
+        self._delayed_calls: list[tuple[int, FrameType | None]] = []
+        self._handler_error: BaseException | None = None
         for number in SIGNAL_NUMBERS:
             handler = _signal.getsignal(number)
             if callable(handler) and (ctrl_c or handler is not signal.default_int_handler):
                 if threading.current_thread() is not threading.main_thread():
                     break  # other threads get no signals
-                self._before[number] = handler
+                self._user_handlers[number] = handler
                 _signal.signal(number, self._receive)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        if within_a_compiler(frame):
-            self._waiting.append((number, frame))
+        if is_in_compiler(frame):
+            self._delayed_calls.append((number, frame))
         else:
-            self._call(number, frame)
+            self._call_handler(number, frame)
 
-    def _call(self, number: int, frame: FrameType | None) -> None:
+    def _call_handler(self, number: int, frame: FrameType | None) -> None:
         try:
-            self._before[number](number, frame)
+            self._user_handlers[number](number, frame)
         except BaseException as error:
-            self._raised = error
+            self._handler_error = error
             raise
 
-    def check(self) -> None:
+    def call_delayed(self) -> None:
         """Call the delayed handlers; raise the exception of a handler, if there was one."""
-        while self._waiting and self._raised is None:
-            self._call(*self._waiting.pop(0))
-        if self._raised is not None:  # not cleared, because the caller may catch a KeyboardInterrupt
-            raise self._raised from None
+        while self._delayed_calls and self._handler_error is None:
+            self._call_handler(*self._delayed_calls.pop(0))
+        if self._handler_error is not None:  # not cleared, because the caller may catch a KeyboardInterrupt
+            raise self._handler_error from None
 
-    def leave(self) -> None:
-        """Restore the user's handlers, except those that the user has changed since; call `check`. Call this once."""
-        for number, handler in self._before.items():
+    def restore(self) -> None:
+        """Restore the user's handlers, except those that the user has changed since; then call the delayed ones."""
+        for number, handler in self._user_handlers.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)
-        self.check()
+        self.call_delayed()
 
     def __enter__(self) -> "SignalHandlers":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if error is not None and error is self._raised:
-            self._raised = None  # it propagates already
-        self.leave()
+        if error is not None and error is self._handler_error:
+            self._handler_error = None  # it propagates already
+        self.restore()
 
 
 def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
@@ -87,7 +87,7 @@ def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
     return SignalHandlers(ctrl_c=True) if system.called_in_python else nullcontext()
 
 
-def within_a_users_function(frame: FrameType | None) -> bool:
+def is_in_user_function(frame: FrameType | None) -> bool:
     """Return whether a frame belongs to a call of a user's function by machine code or by the search for events."""
     while frame is not None:
         if frame.f_code in CALLERS_OF_USER_CODE:
@@ -96,7 +96,7 @@ def within_a_users_function(frame: FrameType | None) -> bool:
     return False
 
 
-def within_a_compiler(frame: FrameType | None) -> bool:
+def is_in_compiler(frame: FrameType | None) -> bool:
     """Return whether a frame belongs to a call of a compiler, and not to a user's function called by the compiler."""
     while frame is not None and frame.f_code not in CALLERS_OF_USER_CODE:
         if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
@@ -105,7 +105,7 @@ def within_a_compiler(frame: FrameType | None) -> bool:
     return False
 
 
-def interrupted(error: BaseException) -> bool:
+def is_keyboard_interrupt(error: BaseException) -> bool:
     """Return whether an error, such as a `SystemError` of machine code, is or was caused by a KeyboardInterrupt."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):

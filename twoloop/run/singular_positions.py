@@ -16,38 +16,39 @@ from twoloop.kernels.data.indices import REPORTED_ERROR
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
-Place = tuple[float, Array]  # time and state [q, v, ...]
+TimedState = tuple[float, Array]  # time and state [q, v, ...]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
-LOST = 1e-2  # ratio of the smallest to the largest singular value below which messages say that constraints lose rank
-SAMPLES = 33  # number of positions between two states at which the ratio of singular values is evaluated
-SHOWN = 3  # largest number of singular positions in a message
+LOST_RANK_RATIO = 1e-2  # ratio of singular values below which messages say that constraints lose rank
+N_POSITIONS = 33  # number of positions between two states at which the ratio of singular values is evaluated
+MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
-DIFFERENCE = 1e-6
+DISPLACEMENT = 1e-6
 MIN_ROW_NORM = 0.1  # lower bound of the norm by which a row is divided, over the norm expected from its derivative
-# velocities turned if they changed by more than TURNED times the change that accelerations explain, and by more than
-# APPARENT times the tolerances
-TURNED, APPARENT = 3.0, 10.0
+# velocities turned if they changed by more than TURN_RATIO times the change that accelerations explain, and by more
+# than MIN_TURN times the tolerances
+TURN_RATIO, MIN_TURN = 3.0, 10.0
 
 
-def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int) -> str:
+def describe_crossings(system: ConstrainedSystem, crossings: list[list[TimedState]], now: TimedState, rank: int) -> str:
     """Return sentences about the singular positions that steps crossed.
 
     `crossings`: for each position the states before and after it; the latter is missing if the run ended, at the state
     `now`, before the crossing was complete.
     """
-    ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:SHOWN]}
-    singular = {t: ratio for t, ratio in ratios.items() if ratio < LOST}
-    regular = {t: ratio for t, ratio in ratios.items() if ratio >= LOST}
+    ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:MAX_SHOWN]}
+    singular = {t: ratio for t, ratio in ratios.items() if ratio < LOST_RANK_RATIO}
+    regular = {t: ratio for t, ratio in ratios.items() if ratio >= LOST_RANK_RATIO}
     text = ""
     if singular:
         text += (
-            f" Near t = {_times(singular)} steps went across positions where the constraints lose rank, or nearly so "
-            f"({_measured(singular)}): beyond these, errors may exceed the tolerances."
+            f" Near t = {_format_times(singular)} steps went across positions where the constraints lose rank, or "
+            f"nearly so ({_describe_ratio(singular)}): beyond these, errors may exceed the tolerances."
         )
     if regular:
         text += (
-            f" Near t = {_times(regular)} steps by collocation took the place of shorter ones ({_measured(regular)})."
+            f" Near t = {_format_times(regular)} steps by collocation took the place of shorter ones "
+            f"({_describe_ratio(regular)})."
         )
     n_more = len(crossings) - len(ratios)
     return text + (f" There were {n_more} more such places." if n_more > 0 else "")
@@ -66,20 +67,20 @@ def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: in
 
 
 def _least_ratio(
-    system: ConstrainedSystem, before: Place, behind: Place, rank: int, ratio: Ratio = singular_ratio
+    system: ConstrainedSystem, before: TimedState, behind: TimedState, rank: int, ratio: Ratio = singular_ratio
 ) -> float:
-    """Return the smallest value of `ratio` at SAMPLES positions of a cubic interpolation between two states."""
+    """Return the smallest value of `ratio` at N_POSITIONS positions of a cubic interpolation between two states."""
     n, (t0, first), (t1, last) = system.n_q, before, behind
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
     from scipy.interpolate import CubicHermiteSpline  # imported here, as that takes 0.1 s and few runs need it
 
     path = CubicHermiteSpline([t0, t1], [first[:n], last[:n]], [first[n : 2 * n], last[n : 2 * n]])
-    return min(ratio(system, float(t), path(t), rank) for t in np.linspace(t0, t1, SAMPLES))
+    return min(ratio(system, float(t), path(t), rank) for t in np.linspace(t0, t1, N_POSITIONS))
 
 
 def describe_turn(
-    system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int, rtol: float, atol: Array
+    system: ConstrainedSystem, crossings: list[list[TimedState]], now: TimedState, rank: int, rtol: float, atol: Array
 ) -> str:
     """Describe where velocities changed by more than accelerations explain; return "" if there is no such place.
 
@@ -90,22 +91,22 @@ def describe_turn(
         size, speeds = (max(np.abs(first[part]).max(), np.abs(last[part]).max()) for part in (_q_slice(n), _v_slice(n)))
         change = np.abs(last[_v_slice(n)] - first[_v_slice(n)])
         least = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
-        if not (change > np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * least)).any():
+        if not (change > np.maximum(MIN_TURN * (atol + rtol * speeds), TURN_RATIO * (t1 - t0) * least)).any():
             continue
-        near = min(LOST, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST
+        near = min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST_RANK_RATIO
         # if no step led across, the run's own steps may have left the branch: evaluate the ratio at the last state only
         here, there = (t0, first), (t1, last)
-        ratio = _least_ratio(system, here if across else there, there, rank, ratio_in_any_units)
+        ratio = _least_ratio(system, here if across else there, there, rank, unit_free_ratio)
         if ratio >= near:
             continue
         explained = max(
             _known_acceleration(system, t, state[_q_slice(n)], state[_v_slice(n)], near) for t, state in (here, there)
         )
-        change[change <= np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * explained)] = 0.0
+        change[change <= np.maximum(MIN_TURN * (atol + rtol * speeds), TURN_RATIO * (t1 - t0) * explained)] = 0.0
         if change.any():
             return (
                 f"Not to be trusted beyond t = {t0:.10g}: near it the constraints lose rank "
-                f"({_measured({t0: ratio})}), and velocities changed there by up to {change.max():.1g} within "
+                f"({_describe_ratio({t0: ratio})}), and velocities changed there by up to {change.max():.1g} within "
                 f"{t1 - t0:.1g} s, more than forces and constraints explain: within the tolerances lies another "
                 "branch of the motion, onto which the steps may have come. Tighten rtol and atol, take another method, "
                 "or end t_span before."
@@ -120,12 +121,12 @@ def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
         return False
     change = largest(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
     least = np.minimum.reduce(largest(np.abs(rows[-2:, 2 * n : 3 * n]), axis=1))
-    return bool(change > TURNED * (times[-1] - times[-2]) * least)
+    return bool(change > TURN_RATIO * (times[-1] - times[-2]) * least)
 
 
-def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
+def _passages(crossings: list[list[TimedState]], now: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
     """Yield, for each crossed singular position, the states before and after, and whether crossing steps were taken."""
-    before: Place | None = None
+    before: TimedState | None = None
     for first, *behind in crossings:
         before = first if before is None else before
         if behind and behind[0][0] > first[0]:
@@ -145,10 +146,10 @@ def _v_slice(n: int) -> slice:
 
 def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
     """Return the largest acceleration, computed without the singular values of rows below `near` times the largest."""
-    mass, rows, norms, units = in_any_units(system, t, q)
+    mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     kept = values > near * values[0]
-    short = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / max(np.abs(v).max(), DIFFERENCE)
+    short = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / max(np.abs(v).max(), DISPLACEMENT)
     rates = [system.velocity_constraint(t + dt, q + dt * v, v) / norms for dt in (-short, short)]
     gamma = (left.T @ (rates[0] - rates[1]))[kept] / (2.0 * short * values[kept])
     equations = np.block([[mass, right[kept].T], [right[kept], np.zeros((int(kept.sum()),) * 2)]])
@@ -156,13 +157,13 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
     return float(np.abs(units * solution[: len(q)]).max())
 
 
-def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return `singular_ratio` of the rows as scaled by `in_any_units`, so that it does not depend on units."""
-    values = np.linalg.svd(in_any_units(system, t, q)[1], compute_uv=False)[:rank]
+def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
+    """Return `singular_ratio` of the rows as scaled by `scaled_to_unit_masses`, so that it does not depend on units."""
+    values = np.linalg.svd(scaled_to_unit_masses(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
-def in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
+def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
     """Return M and the rows, scaled to unit masses and unit norms, the divisors of rows, and the units of coordinates.
 
     The divisor of a row is its norm, or at least MIN_ROW_NORM times the norm expected from its derivative.
@@ -171,7 +172,7 @@ def in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, 
     inertia = np.abs(np.diagonal(mass))
     units = 1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max()))
     norms = np.linalg.norm(rows * units, axis=1)
-    displacement = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) * units / units.max() * signs(len(q))
+    displacement = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) * units / units.max() * signs(len(q))
     try:
         slopes = np.linalg.norm((system.rows(t, q + displacement) - system.rows(t, q - displacement)) * units, axis=1)
     except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
@@ -182,24 +183,26 @@ def in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, 
     return mass * units * units[:, None], rows * units / norms[:, None], norms, units
 
 
-def _times(ratios: dict[float, float]) -> str:
+def _format_times(ratios: dict[float, float]) -> str:
     return ", ".join(f"{t:.4g}" for t in ratios)
 
 
-def _measured(ratios: dict[float, float]) -> str:
+def _describe_ratio(ratios: dict[float, float]) -> str:
     least = min(ratios.values())
     return f"the smallest singular value of the constraint Jacobian comes down to {least:.1g} of the largest"
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-WEAK = 1e-2  # singular value, relative to the largest, up to which rounding errors along its vector are estimated
+WEAK_RATIO = 1e-2  # singular value, relative to the largest, up to which rounding errors along its vector are estimated
 # ratio of pivots below which rounding errors are always estimated; ratio of pivots over ratio of singular values
-LEAST, MARGIN = 1e-5, 30.0
+SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
     """Return the ratio of the smallest pivot to the largest below which rounding may change velocities beyond rtol."""
-    return min(WEAK, max(LEAST, MARGIN * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING))))))
+    return min(
+        WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
+    )
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
@@ -208,11 +211,11 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
     for u, value, direction in zip(left.T[:rank], values[:rank], right[:rank], strict=True):
-        if value > WEAK * values[0]:
+        if value > WEAK_RATIO * values[0]:
             continue
         if value == 0.0:
             return np.full(len(q), np.inf)
-        step = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / np.abs(direction).max()
+        step = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(direction).max()
         beside = [q + side * step * direction for side in (1.0, -1.0)]
         try:
             slope = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
@@ -230,10 +233,10 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
     """Return a warning for a start that the tolerances do not distinguish from a singular position, else ""."""
-    if rank == 0 or surely_above(WEAK, system.rows(t, q), rank):
+    if rank == 0 or surely_above(WEAK_RATIO, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)
-    if max(ratio, ratio_in_any_units(system, t, q, rank)) > WEAK:
+    if max(ratio, unit_free_ratio(system, t, q, rank)) > WEAK_RATIO:
         return ""
     allowed = atol + rtol * np.abs(q).max()
     if not (np.abs(_displacement_to_singular(system, t, q, rank)) <= allowed).all():
@@ -253,7 +256,7 @@ def _displacement_to_singular(system: ConstrainedSystem, t: float, q: Array, ran
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, held = left[:, rank - 1], right[rank - 1], right[: rank - 1]
-    step, gradient = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE), np.zeros(len(q))
+    step, gradient = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT), np.zeros(len(q))
     for j, displacement in enumerate(np.eye(len(q)) * step):
         try:
             gradient[j] = u @ (system.rows(t, q + displacement) - system.rows(t, q - displacement)) @ w / (2.0 * step)

@@ -17,19 +17,21 @@ from numpy.typing import NDArray
 from twoloop.checks.scales import signs
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.fallbacks import state_after_jump
-from twoloop.run.singular_positions import DIFFERENCE, in_any_units
+from twoloop.run.singular_positions import DISPLACEMENT, scaled_to_unit_masses
 
 Array = NDArray[np.float64]
 
-TURN = 3e-3  # relative change of the rows from one sample to the next, for derivatives along the motion
+CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows from one sample to the next, for derivatives along the motion
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0  # for f', f''
-NOTHING = 1e-8  # relative size up to which a derivative may be an error of the finite differences
-RISES = 1e-6  # relative derivative of the rows from which on the rank rises: well above 1e-8, the allowed error of v0
+MAX_DIFFERENCE_ERROR = 1e-8  # relative size up to which a derivative may be an error of the finite differences
+MIN_RANK_DERIVATIVE = 1e-6  # relative derivative of the rows from which on the rank rises; allowed errors of v0: 1e-8
 # factor by which derivatives of the rows must exceed the derivatives along velocities as small as the tolerances
-DETERMINED = 10.0
-BESIDE, LENGTH = 0.1, 0.6  # relative change of the rows up to the state beside the start, and in the first step to try
-HALVINGS, MOVED = 6, 0.2  # number of states beside the start to try; largest correction of one, over its displacement
-RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, relative to the right-hand side
+MIN_CERTAINTY = 10.0
+# relative change of the rows: up to the state beside the start; within the first step that is tried
+BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
+# number of states beside the start that are tried; largest correction of such a state, relative to its displacement
+N_BESIDE, MAX_CORRECTION = 6, 0.2
+MAX_RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, relative to the right-hand side
 
 
 class Branch(NamedTuple):
@@ -64,7 +66,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
     way = v if v.any() else a
     if not way.any():
         return None
-    mass, rows, lengths, units = in_any_units(system, t, q)
+    mass, rows, lengths, units = scaled_to_unit_masses(system, t, q)
     left, _, right = np.linalg.svd(rows)
     lost, free = left[:, rank:].T, right[rank:].T  # rows u^T with u^T C_q = 0; directions that C_q allows, as columns
 
@@ -76,24 +78,24 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
         samples = [system.velocity_constraint(t, q + s * v, v) for s in step * np.arange(-2.0, 3.0)]
         return WEIGHTS[order - 1] @ samples / (step**order * lengths)  # type: ignore[no-any-return]
 
-    size, step = float(np.linalg.norm(rows)), DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / np.abs(way).max()
+    size, step = float(np.linalg.norm(rows)), DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(way).max()
     speed = float(np.linalg.norm(derivative_of_rows(way, step))) / size  # relative change of the rows, 1/s
-    if not step * speed > NOTHING * DIFFERENCE:
+    if not step * speed > MAX_DIFFERENCE_ERROR * DISPLACEMENT:
         return None
-    step = TURN / speed
+    step = CHANGE_PER_SAMPLE / speed
     added = lost @ derivative_of_rows(way, step) / speed
     gained = np.linalg.svd(added @ free, compute_uv=False)  # derivatives of the singular values that are zero here
-    if gained.max() <= RISES * size:
+    if gained.max() <= MIN_RANK_DERIVATIVE * size:
         return None
     distance = step * float(np.abs(way).max())  # displacement for finite differences
     uncertain = np.linalg.norm(derivative_of_rows(allowed * signs(len(q)), distance / float(allowed.max())))
-    clear = gained > max(DETERMINED * float(uncertain) / speed, RISES * size)
-    if not v.any() or gained[~clear].max(initial=0.0) > RISES * size:
+    clear = gained > max(MIN_CERTAINTY * float(uncertain) / speed, MIN_RANK_DERIVATIVE * size)
+    if not v.any() or gained[~clear].max(initial=0.0) > MIN_RANK_DERIVATIVE * size:
         return False
     wanted = -np.append(derivative_of_constraints(1), lost @ derivative_of_constraints(2) / (3.0 * speed))
     equations, rank = np.vstack([rows, added]), rank + int(clear.sum())
-    a = np.asarray(np.linalg.lstsq(equations, wanted, rcond=NOTHING)[0])
-    if not np.abs(equations @ a - wanted).max() <= RESIDUAL * max(np.abs(wanted).max(), speed * speed * size):
+    a = np.asarray(np.linalg.lstsq(equations, wanted, rcond=MAX_DIFFERENCE_ERROR)[0])
+    if not np.abs(equations @ a - wanted).max() <= MAX_RESIDUAL * max(np.abs(wanted).max(), speed * speed * size):
         return False
     motions = np.linalg.svd(equations)[2][rank:].T
     a += motions @ np.linalg.solve(motions.T @ mass @ motions, motions.T @ (units * system.force(t, q, v) - mass @ a))
@@ -101,12 +103,12 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
     bend = 0.0  # relative acceleration of the rows, 1/s^2
     if a.any():
         bend = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / size
-    for change in BESIDE * 0.5 ** np.arange(HALVINGS):
+    for change in BESIDE_CHANGE * 0.5 ** np.arange(N_BESIDE):
         away = _duration(change, speed, bend)
         ahead = away * (v + 0.5 * away * a)
         beside = state_after_jump(system, t, q + ahead, v + away * a)
-        if beside is not None and np.abs(beside[: len(q)] - q - ahead).max() <= MOVED * np.abs(ahead).max():
-            return Branch(a, beside[: len(q)], beside[len(q) :], rank, _duration(LENGTH, speed, bend))
+        if beside is not None and np.abs(beside[: len(q)] - q - ahead).max() <= MAX_CORRECTION * np.abs(ahead).max():
+            return Branch(a, beside[: len(q)], beside[len(q) :], rank, _duration(STEP_CHANGE, speed, bend))
     return False
 
 

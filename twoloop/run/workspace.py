@@ -109,7 +109,7 @@ def _derivative_entries(
     return entries
 
 
-SINGULAR = 1e-10  # eigenvalue of a body's M, relative to the largest, up to which its eigenvector has no mass
+MASSLESS_RATIO = 1e-10  # eigenvalue of a body's M, relative to the largest, up to which its eigenvector has no mass
 # norm of a row's component along the massless directions of a body, relative to the row's norm, above which the row is
 # used to give one of these directions a mass
 MIN_FRACTION_ALONG = 1e-3
@@ -127,23 +127,25 @@ class StaticForm(NamedTuple):
     pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else (0, n_q)
     mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else (0, 0)
     newton_arguments: tuple[Any, ...]  # arguments of `newton_form` that follow t0 and q0
-    newton: NDArray[np.int32] | None = None  # program that factorizes Newton's matrix; None until a plan needs it
+    newton_program: NDArray[np.int32] | None = (
+        None  # program that factorizes Newton's matrix; None until a plan needs it
+    )
     n_groups: int = 0  # number of groups of columns of Newton's matrix, each computed from one difference of forces
 
     def matrix_cost(self) -> float:
         """Return the estimated cost of Newton's matrix and its factors, in evaluations of accelerations."""
-        assert self.newton is not None
-        return self.n_groups + float(self.newton[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
+        assert self.newton_program is not None
+        return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
-    def n_matrices(self, matrices: int) -> int:
+    def newton_matrices_size(self, matrices: int) -> int:
         """Return the number of floats in a plan's sparse Newton matrices; `matrices`: its number of dense matrices."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
-        if self.newton is None or matrices == 0:
+        if self.newton_program is None or matrices == 0:
             return 0
         n_values = self.static.n_mass_values, self.static.n_jacobian_values
-        return matrices_size(self.newton, *n_values, (matrices - SYSTEMS) // 2)
+        return matrices_size(self.newton_program, *n_values, (matrices - SYSTEMS) // 2)
 
 
 def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
@@ -164,7 +166,7 @@ def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticFor
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
     cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
-    return None if cached is None else form._replace(newton=cached[0], n_groups=cached[1])
+    return None if cached is None else form._replace(newton_program=cached[0], n_groups=cached[1])
 
 
 def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
@@ -174,12 +176,12 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
         jacobian = system.entries["jacobian"]
     else:
         pattern = pattern_of(system, t0, q0)
-        jacobian = _entries_of(pattern)
+        jacobian = _nonzero_entries(pattern)
     if "mass" in system.entries:
         mass = system.entries["mass"]
     else:
         entries = _mass_pattern(system, t0, q0)
-        mass, dense_mass = _entries_of(entries), not system.constant_mass
+        mass, dense_mass = _nonzero_entries(entries), not system.constant_mass
         mass_pattern = entries if dense_mass else mass_pattern
     if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
         return None
@@ -252,7 +254,7 @@ def _massless_directions(block: Array) -> Array:
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)
-    return np.asarray(directions.T[values <= SINGULAR * values[-1]])
+    return np.asarray(directions.T[values <= MASSLESS_RATIO * values[-1]])
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
@@ -265,7 +267,7 @@ def _dense_cost(n_q: int, n_c: int) -> float:
     return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
 
 
-def _entries_of(pattern: Array) -> Entries:
+def _nonzero_entries(pattern: Array) -> Entries:
     rows, columns = np.nonzero(pattern)
     return rows.astype(np.int64), columns.astype(np.int64)
 
@@ -317,11 +319,11 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
     flags = system.functions.flags.copy()
     flags[FORM] = STATIC
     functions = system.functions._replace(flags=flags, static_program=form.program)
-    if form.newton is not None:
-        functions = functions._replace(newton_program=form.newton)
+    if form.newton_program is not None:
+        functions = functions._replace(newton_program=form.newton_program)
     if plan is None:
         return Kit(functions, sparse_inner_loop)
-    return Kit(functions, sparse_inner_loop, *_steps_of(plan), sparse_inner_loop)
+    return Kit(functions, sparse_inner_loop, *_steps_of_plan(plan), sparse_inner_loop)
 
 
 def _flags_for_start(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
@@ -377,14 +379,14 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     flags = flags.copy()
     flags[STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
-    kit = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *numbers)
+    kit = Kit(functions, plan.inner or inner_loop, *_steps_of_plan(plan), inner_loop, plan.own, *numbers)
     if len(kits) == MAX_KITS:
         del kits[next(iter(kits))]
     kits[key] = kit, system.functions
     return _with_own_flags(kit) if run_changes_flags else kit
 
 
-def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
+def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
     """Return a plan's step, and the first and second step of its pair of methods; the second is loaded when needed."""
     return loaded(plan.step), loaded(plan.first), step_if_loaded(plan.second)
 
@@ -421,7 +423,7 @@ def workspace(
     full_ranks = min(n_c, n_q), min(n_c + n_a, n_q)
     rank, rank_v = (rank if rank is not None else highest for rank, highest in zip(ranks, full_ranks, strict=True))
     sizes = n_q, n_c, n_a, rank, rank_v, bool(uses_null_space and n_q > rank_v), bool(augmented), n_nodes
-    n_floats = matrices * n_q**2 if static is None else static.n_matrices(matrices)
+    n_floats = matrices * n_q**2 if static is None else static.newton_matrices_size(matrices)
     work = empty((*sizes, None if static is None else static.static, n_floats))
     return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, static)
 
