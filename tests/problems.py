@@ -13,7 +13,7 @@ from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.kernels.compile.caches import compile_cached, compiled_when_called
 from twoloop.kernels.compile.linking import KernelCompiler
-from twoloop.kernels.data.common import OPTIONS, stamp
+from twoloop.kernels.data.common import OPTIONS, source_digest
 from twoloop.kernels.data.indices import FORCE_BY_Q_GIVEN
 from twoloop.mechanisms import Problem, four_bar
 
@@ -129,7 +129,7 @@ def called(helper, *arguments):
 
 def kept(signature):
     """Compile a function that calls helpers of an evaluation, and keep it until a file changes that these need."""
-    watched = (stamp("evaluation.calls"), "")
+    watched = (source_digest("evaluation.calls"), "")
     return lambda function: compile_cached(function, signature, watched, pipeline_class=KernelCompiler, **OPTIONS)
 
 

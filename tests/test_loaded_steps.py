@@ -25,8 +25,8 @@ for kind in {kinds}:
 print(*[name for name in ("newton_step", "diagonal_step") if f"twoloop.kernels.steps.{{name}}" in sys.modules])
 """
 BEFORE = """
-from twoloop.kernels.steps.stages import LazyStep, loaded
-loaded(LazyStep("steps.diagonal_step", "DIAGONAL")), loaded(LazyStep("steps.newton_step", "NEWTON"))
+from twoloop.kernels.steps.stages import LazyStep, load_step
+load_step(LazyStep("steps.diagonal_step", "DIAGONAL")), load_step(LazyStep("steps.newton_step", "NEWTON"))
 """
 KINDS = ("ends", "t_eval", "dense", "Integrator")
 

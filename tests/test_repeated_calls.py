@@ -18,7 +18,7 @@ from tests.problems import assert_same, pendulum, quick, some_of
 from twoloop import ConstrainedSystem, ConstraintWarning, Integrator, callback, mechanisms, solve_dae
 from twoloop.checks.consistency import StartEvaluation, check_start
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
-from twoloop.kernels.layout import _free
+from twoloop.kernels.layout import _unused_workspaces
 from twoloop.methods.tableaux import gauss, radau_iia
 from twoloop.run import cached
 
@@ -76,7 +76,7 @@ def test_a_repeated_call_equals_a_new_one_to_the_bit(name, method, options, take
         ends = [np.array([float(s.t), float(s.t) + span])[list(at)] for s in states]
         return [runs(problem, [s], span, method=method, t_eval=t)[0] for s, t in zip(states, ends, strict=True)]
 
-    for work in chain.from_iterable(_free.values()):
+    for work in chain.from_iterable(_unused_workspaces.values()):
         work.notes.base[:], work.counters.base[:] = np.nan, 10**6  # whatever a run has left
     by_arrays = all_runs(problem)
     assert all(taken[-6:-1])

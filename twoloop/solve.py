@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import check_span, check_times, check_vector, is_vector
 from twoloop.checks.consistency import ConstraintWarning
-from twoloop.kernels.layout import give_back
+from twoloop.kernels.layout import keep_unused_workspace
 from twoloop.methods.plan import Method
 from twoloop.methods.presets import Compiled
 from twoloop.problem.events import check_events
@@ -237,7 +237,7 @@ def solve_dae(
                 record = IntegrationLoop(run, t1, wanted, report, limit, interrupts, last).integrate_to_end(
                     check_derivatives
                 )
-            give_back(run.work)
+            keep_unused_workspace(run.work)
             if last or record.status < 0 or not may_have_missed_changes(run):
                 break
             every, spent, run = gap_for_repetition(run), spent + record.stats.cpu_time, None

@@ -44,8 +44,8 @@ def test_systems_are_solved_with_rows_exchanged_as_each_lane_needs(imaginary):
     room[matrix : matrix + 2 * N * N] = np.concatenate([A.real, A.imag], axis=1).reshape(LANES, -1).T
     room[pivots + N :] = np.concatenate([right.real, right.imag], axis=1).T
     flat, apart = room.ravel(), N * N * (parts - 1)
-    called(layout.factor_lanes, flat, matrix, pivots, N, apart)
-    called(layout.solve_lanes, flat, matrix, pivots, N, apart, pivots + N)
+    called(layout.factor_matrices, flat, matrix, pivots, N, apart)
+    called(layout.solve_systems, flat, matrix, pivots, N, apart, pivots + N)
     found = room[pivots + N :].reshape(2, N, LANES)[:parts]
     assert np.abs(found - x[:parts].transpose(0, 2, 1)).max() < 1e-4 and (room[FINE] == 1.0).all()
     assert np.delete(np.abs(found - x[:parts].transpose(0, 2, 1)), 2, axis=2).max() < 1e-11
@@ -56,7 +56,7 @@ def test_a_singular_matrix_is_noted_in_its_lane_alone():
     room[FINE] = 1.0
     room[N_FIELDS : N_FIELDS + N * N] = np.eye(N).reshape(-1, 1)
     room[N_FIELDS + 6, 3] = 0.0
-    called(layout.factor_lanes, room.ravel(), N_FIELDS, N_FIELDS + N * N, N, 0)
+    called(layout.factor_matrices, room.ravel(), N_FIELDS, N_FIELDS + N * N, N, 0)
     assert np.flatnonzero(room[FINE] != 1.0).tolist() == [3]
 
 

@@ -146,8 +146,8 @@ class _LaneProjection:
         settings = np.array([n, n_rows, 0, 0, code.n_numbers, n_redundant], dtype=np.int64)
         control = np.concatenate([[starts.t0], np.zeros(layout.ATOL - 1 + n), code.numbers.values])
         places = (
-            layout.places(n, n_rows, code.n_numbers)[-1]
-            + kernels.places_of_starts(n, n_rows, len(code.pattern) - n_rows - 1, n_redundant)[-1]
+            layout.array_offsets(n, n_rows, code.n_numbers)[-1]
+            + kernels.offsets_in_memory(n, n_rows, len(code.pattern) - n_rows - 1, n_redundant)[-1]
         )
 
         def block(rows: slice) -> None:

@@ -339,7 +339,7 @@ class LaneRuns:
         starts, code, method = self.starts, self.own.code, self.method
         n, n_rows = code.n, code.n_rows
         numbers = self.own.numbers(starts.parameters[which])
-        begin = layout.places(n, n_rows, code.n_numbers)[-1]
+        begin = layout.array_offsets(n, n_rows, code.n_numbers)[-1]
         room = aligned(begin + method.memory(code), layout.LANES)
         kit = layout.LaneKit(self.own.functions, method.step())
         redundant = bool(code.equations.redundant_rows.conditions)

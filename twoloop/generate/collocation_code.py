@@ -185,8 +185,8 @@ class CollocationCode:
         self.iterated = self._iterated()
         self.others = [i for i in range(self.n) if i not in self.iterated]
         self.has_reduced = len(self.equations.accelerations) > 1
-        self.a, self.q, self.v, self.polynomials, self.spectra, self.ends, self.end_a, self.lam, self.size = at.places(
-            self.n, len(self.iterated), self.n_rows
+        self.a, self.q, self.v, self.polynomials, self.spectra, self.ends, self.end_a, self.lam, self.size = (
+            at.array_offsets(self.n, len(self.iterated), self.n_rows)
         )
 
         if self.parts is None:
@@ -398,7 +398,7 @@ class CollocationCode:
         max_sweeps = builder.select(has_estimate, one.add(target, number(EXTRA_SWEEPS)), number(MAX_SWEEPS_OF_FIXED))
         kappa, noise = (
             builder.select(has_estimate, number(usual), number(fixed))
-            for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (at.NOISE, NOISE_OF_FIXED))
+            for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (at.MAX_ROUNDING, NOISE_OF_FIXED))
         )
         noise = one.multiply(noise, one.multiply(one.load(work, at.SIZE), stricter))
         may_guess = builder.compare("fcmp ogt", one.load(work, at.MAY_GUESS), llvm_code.ZERO)
@@ -532,7 +532,7 @@ class CollocationCode:
             weight = emit.splat(one.load(work, at.WEIGHTS + i))
             worst = emit.larger(emit.multiply(emit.function("fabs", difference), weight), worst)
             largest = emit.larger(emit.multiply(emit.function("fabs", value), weight), largest)
-        beyond_noise = emit.fused(emit.constant(-at.NOISE), largest, worst)
+        beyond_noise = emit.fused(emit.constant(-at.MAX_ROUNDING), largest, worst)
         scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED_DEFECT)))
         defect = one.larger(emit.largest_lane(scaled), llvm_code.ZERO)
         two = LaneEmitter(builder, 2)

@@ -276,7 +276,7 @@ class LaneSteps:
 
     def places(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> Places:
         """Return the pointers to the arrays in `work`; store the pointers to coefficients in `emit`."""
-        *fixed, series = lanes.places(self.n, self.n_rows, self.n_numbers)
+        *fixed, series = lanes.array_offsets(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
         emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
         series_memory = emit.pointer(work, series)
@@ -799,4 +799,4 @@ def _stamp() -> str:
     from twoloop.kernels.data import common
 
     kernels = ("lanes.control", "control.step_size")
-    return digest_of("".join(map(common.stamp, kernels)), __file__, *WRITERS)
+    return digest_of("".join(map(common.source_digest, kernels)), __file__, *WRITERS)

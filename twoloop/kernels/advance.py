@@ -74,7 +74,7 @@ from twoloop.kernels.linalg.dense import copy
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
 # number of accepted steps from which on a short next step ends the trial of a method: the first step size is a guess
-FIRST_JUDGED = 2
+FIRST_JUDGED_STEP = 2
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -381,7 +381,10 @@ def advance(
             return at.ALL_OUTPUT_DONE
         if fixed_size and not at_output:
             record_pivot_at_output(f, w, clock, state)
-        if FIRST_JUDGED <= w.counters[N_ACCEPTED] <= control[at.TRIAL_STEPS] and clock[at.H_NEXT] <= tolerances[GAP]:
+        if (
+            FIRST_JUDGED_STEP <= w.counters[N_ACCEPTED] <= control[at.TRIAL_STEPS]
+            and clock[at.H_NEXT] <= tolerances[GAP]
+        ):
             clock[at.H_FAILED] = clock[at.H_NEXT]
             return at.SWITCH_METHOD
         if crosses_jump:

@@ -35,7 +35,7 @@ from twoloop.kernels.data.common import (
 from twoloop.kernels.data.indices import FORM, GAP, LONGEST_UNSEEN, LOOK, N_ACCEPTED, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
 
-ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate: smaller corrections are left out
+ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate; a smaller correction is omitted
 
 
 @merged
@@ -69,14 +69,14 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
-FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step
+FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 SHORTEST_STEP = 1e-16  # step size, relative to the first step size, at which a run fails
 GAP_TO_LOOK = 10  # ratio of tolerances[GAP] to tolerances[LOOK] if forces may change suddenly with position or velocity
 
 
 @exact
-def _first_step(state, n, t, span, smallest):
+def _first_step_size(state, n, t, span, smallest):
     """Return the first step size (s), FIRST_STEP times the time in which coordinates change by max(max|q|, `smallest`).
 
     The result is at most FIRST_STEP times the duration `span` (s) of the run, and at least MIN_FIRST_STEP spacings of
@@ -98,7 +98,7 @@ def _first_step(state, n, t, span, smallest):
 
 
 @exact
-def _limit_steps(control, tolerances, span, longest, within):
+def _set_step_limits(control, tolerances, span, longest, within):
     """Store GAP and LOOK in `tolerances`, and MAX_STEP, APART and SPACING in `control`.
 
     These limit the time between two evaluations of the equations to LONGEST_UNSEEN times the run's duration `span`. If
@@ -113,15 +113,15 @@ def _limit_steps(control, tolerances, span, longest, within):
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
 def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longest, within):
-    """Return the first step size (s), see _first_step; if `longest` > 0, also store the limits of `_limit_steps`."""
+    """Return the first step size (s), see _first_step_size; if `longest` > 0, also call `_set_step_limits`."""
     if longest > 0.0:
-        _limit_steps(control, tolerances, t1 - t, longest, within)
-    return _first_step(state, n, t, t1 - t, smallest)
+        _set_step_limits(control, tolerances, t1 - t, longest, within)
+    return _first_step_size(state, n, t, t1 - t, smallest)
 
 
 @merged
 def _is_within_bounds(t, rows, bounds):
-    """Return whether t[k] and the first entries of rows[k] are between bounds[0] and bounds[1] for all k."""
+    """Return whether [t[k], rows[k]], cut to the length of bounds[0], is between bounds[0] and bounds[1] for all k."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -144,9 +144,9 @@ def split_steps(steps, counts, h, changes, used_newton):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-# codes that `start_and_advance` returns instead of a number of steps. REFUSED: the choices of the previous run do not
-# suit this start. IN_DOUBT: the start may violate the constraints and needs a closer check. UNUSUAL: Python must read
-# the report, and may have to continue the run
+# codes that `start_and_advance` returns instead of a number of steps. REFUSED: rows or coordinates chosen in the
+# previous run do not suit this start. IN_DOUBT: the start may violate the constraints and needs a closer check.
+# UNUSUAL: Python must read the report, and may have to continue the run
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
 # arrays for runs that are repeated from different starts: to check a start, to choose rows, and to run. Among them are
@@ -179,9 +179,10 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 # nonzero wherever `kinds` is not 0. RANK, WEAK: thresholds for `choose`. SCALE: factor s in M + s G^T G. CONTRADICTS:
 # relative tolerance of redundant rows. MASS_FLAG: flag of M (DEFINITE, INDEFINITE or 0). LEAST_PIVOT: smallest pivot of
 # an accepted start. EQUATION_FORM: value of FORM. FIRST: first step size that the user has chosen, s; 0: none. LEAST:
-# argument `smallest` of _first_step. LONGEST, EVALUATES_WITHIN: arguments of _limit_steps. NEAR: pivot below which
-# Python checks the run. MAX_CHANGE_RATIO: ratio of the change of velocities in the last step to that by accelerations
-# above which velocities have jumped. MIN_SAMPLES: least time between two sudden changes, in spacings of samples
+# argument `smallest` of _first_step_size. LONGEST, EVALUATES_WITHIN: arguments of _set_step_limits. NEAR: pivot below
+# which Python checks the run. MAX_CHANGE_RATIO: velocities have jumped if their change in the last step, relative to
+# the change that accelerations explain, is larger. MIN_SAMPLES: least time between two sudden changes, in spacings of
+# samples
 ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
 EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
 # indices in `expected`, the choices for which code was generated (empty without generated code). PLACE: result of
@@ -215,7 +216,7 @@ def _has_same_choices(b):
 
 
 @merged
-def _copy(source, target):
+def _copy_vector(source, target):
     for k in range(target.size):
         target[k] = source[k]
 
@@ -244,7 +245,7 @@ def _evaluate_start(checked_kit, b, t, q, v, sizes, shifts):
 
 @merged
 def _has_all_entries(b):
-    """Return whether b.rows is nonzero exactly where b.kinds is: then it need not be evaluated at other positions."""
+    """Return whether b.rows is nonzero exactly where b.kinds is, so that one position shows all nonzero entries."""
     n, is_same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         is_same = is_same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
@@ -253,10 +254,10 @@ def _has_all_entries(b):
 
 @merged
 def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
-    """Prepare a run from t to t1 with the choices of the previous run; return 0, REFUSED or IN_DOUBT.
+    """Prepare a run from t to t1, with rows and coordinates chosen as before; return 0, REFUSED or IN_DOUBT.
 
-    `checked_kit` contains the callbacks that the check of the start calls; `is_consistent`: (q, v) is known to satisfy
-    the constraints.
+    `checked_kit` contains the callbacks that the check of the start calls. If `is_consistent`, an earlier check has
+    shown that (q, v) satisfies the constraints.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -271,12 +272,12 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
         return IN_DOUBT
     if b.expected.size > 0 and not _has_same_choices(b):
         return REFUSED
-    _copy(b.start_numbers, b.numbers)
+    _copy_vector(b.start_numbers, b.numbers)
     for j in range(b.state.size):
         b.state[j] = q[j] if j < n else v[j - n] if j < 2 * n else 0.0
     b.clock[at.T] = b.clock[at.T_START] = t
     prepare_work(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
-    _copy(b.lapack, w.lapack[: b.lapack.size])
+    _copy_vector(b.lapack, w.lapack[: b.lapack.size])
     w.notes[indices.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
     if b.start(f, w, t, b.state) != indices.DONE or not _has_consistent_rows(w, b, n):
         return REFUSED
@@ -285,29 +286,31 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
     w.notes[indices.KINK_AFTER] = t1
     if b.control[at.FIXED_STEP] == 0.0:
         span, first, within = t1 - t, b.constants[FIRST], b.constants[EVALUATES_WITHIN] > 0.0
-        _limit_steps(b.control, b.tolerances, span, b.constants[LONGEST], within)
-        b.clock[at.H_NEXT] = min(first if first > 0.0 else _first_step(b.state, n, t, span, b.constants[LEAST]), span)
+        _set_step_limits(b.control, b.tolerances, span, b.constants[LONGEST], within)
+        b.clock[at.H_NEXT] = min(
+            first if first > 0.0 else _first_step_size(b.state, n, t, span, b.constants[LEAST]), span
+        )
         b.control[at.SHORTEST] = SHORTEST_STEP * b.clock[at.H_NEXT]
-    _copy(w.rows_v, b.start_rows)
+    _copy_vector(w.rows_v, b.start_rows)
     return 0
 
 
 @merged
 def _save_start(b):
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
-    _copy(b.numbers, b.saved[:i])
-    _copy(b.lasting, b.saved[i:j])
-    _copy(b.state, b.saved[j:])
-    _copy(b.lasting_integers, b.saved_integers)
+    _copy_vector(b.numbers, b.saved[:i])
+    _copy_vector(b.lasting, b.saved[i:j])
+    _copy_vector(b.state, b.saved[j:])
+    _copy_vector(b.lasting_integers, b.saved_integers)
 
 
 @merged
 def _restore_start(b):
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
-    _copy(b.saved[:i], b.numbers)
-    _copy(b.saved[i:j], b.lasting)
-    _copy(b.saved[j:], b.state)
-    _copy(b.saved_integers, b.lasting_integers)
+    _copy_vector(b.saved[:i], b.numbers)
+    _copy_vector(b.saved[i:j], b.lasting)
+    _copy_vector(b.saved[j:], b.state)
+    _copy_vector(b.saved_integers, b.lasting_integers)
 
 
 # indices in `last_start`. N_EQUAL: number of successive runs from this start, at most 2. START: index of [t, t1, q, v]
@@ -339,7 +342,7 @@ N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
 
 @merged
 def _has_velocity_jump(b, k, n):
-    """Return whether velocities jump from state k - 1 to state k, see MAX_CHANGE_RATIO; n: number of coordinates."""
+    """Return whether a velocity jumps between states k - 1 and k, see MAX_CHANGE_RATIO; n: number of coordinates."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
         change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
@@ -349,7 +352,7 @@ def _has_velocity_jump(b, k, n):
 
 @merged
 def _write_report(w, b, region, n_rows, n_steps, code, is_new):
-    """Store the report, times and steps of a run in b.report; return n_steps, or UNUSUAL if Python must read them.
+    """Store the report, times and steps of a run in b.report; return n_steps, or UNUSUAL if Python must read b.report.
 
     The run has n_rows states after the first, and n_steps steps; `region` contains the bounds for IN_CHECKED_REGION.
     """
@@ -366,9 +369,9 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     report[DEFECT], report[LONGEST_GAP] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
     for k in range(N_COUNTERS):
         report[N_REPORT + k] = w.counters[k]
-    _copy(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
+    _copy_vector(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
     for k in range(n_steps):
-        _copy(b.steps[k], report[N_HEAD + 1 + n_rows + k * width : N_HEAD + 1 + n_rows + (k + 1) * width])
+        _copy_vector(b.steps[k], report[N_HEAD + 1 + n_rows + k * width : N_HEAD + 1 + n_rows + (k + 1) * width])
     is_usual = code == at.ALL_OUTPUT_DONE and nothing_to_check and is_inside and n_rows == n_steps
     b.filled[0], b.filled[1] = n_rows, n_steps
     return n_steps if is_usual else UNUSUAL
@@ -381,7 +384,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consi
     If a start is repeated bit for bit, the second run still checks the start, and saves the data of the started run.
     From the third run on, these data are restored without a check. Arguments: see _start_run and _write_report.
     """
-    f.flags[FORM] = int(b.constants[EQUATION_FORM])  # the run before may have changed the form
+    f.flags[FORM] = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
     is_repeated, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
     if is_repeated and n_equal == IS_SAVED:
         _restore_start(b)
@@ -398,7 +401,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consi
     for k in range(b.memory_places.size):
         b.memory[b.memory_places[k]] = b.start_memory[k]
     b.end[0], b.t[0] = t1, t
-    _copy(b.state, b.states[0])
+    _copy_vector(b.state, b.states[0])
     arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
     code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
     return _write_report(w, b, region, b.filled[0], b.filled[1], code, not is_repeated)

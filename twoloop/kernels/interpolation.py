@@ -1,7 +1,7 @@
 """Interpolate states within steps by polynomials through neighbouring states, and project the results.
 
 Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. For methods that take long
-steps, `fill` first computes states within each interval, through which one polynomial passes.
+steps, `fill_intervals` first computes states within each interval, through which one polynomial passes.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ TABLE = types.int64[:, ::1]
 CHECKED_AT = (0.3, 0.7)  # times at which polynomials are checked, as fractions of an interval
 N_CHECKED = len(CHECKED_AT)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
-MAX_GAP_RATIO = 8.0  # largest ratio of the longest to the shortest of neighbouring steps that count as equally long
+MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
 # rounding error of q over the duration of the interval, in tolerances of v, above which v gets a polynomial of its own
 MAX_VELOCITY_ROUNDING = 10.0
 # pivot within an interval, relative to the larger one of the pivots at its ends, below which the position is singular
@@ -41,8 +41,13 @@ RESIDUAL, WEAK_PIVOT = 10.0, 0.05
 
 @merged
 def _node_range(low, high, i, last):
-    """Return the first and last state of the polynomial for an interval from state i: centred, in `low` to `high`."""
-    if last > i + 1:  # `fill` has computed interior states of the interval: the polynomial interpolates no others
+    """Return the indices of the first and last state that the polynomial interpolates in an interval from i to `last`.
+
+    The states are centred at the interval, and between `low` and `high`.
+    """
+    if (
+        last > i + 1
+    ):  # `fill_intervals` has computed interior states of the interval: the polynomial interpolates no others
         return i, last
     n_states = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - n_states // 2, high + 1 - n_states))
@@ -199,7 +204,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _max_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest of scale_q |q - q_other| and scale_v |v - v_other| in units of the tolerances at state i."""
+    """Return the largest entry of scale_q |q - q_other| and scale_v |v - v_other|, in tolerances at state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -230,7 +235,7 @@ def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
 
 @merged
 def _has_similar_gaps(t, lo, hi):
-    """Return whether the steps between t[lo] and t[hi] are about equally long, see MAX_GAP_RATIO."""
+    """Return whether the steps from t[lo] to t[hi] differ in size by at most the factor MAX_GAP_RATIO."""
     shortest, longest = np.inf, 0.0
     for r in range(lo, hi):
         shortest, longest = min(shortest, t[r + 1] - t[r]), max(longest, t[r + 1] - t[r])
@@ -302,7 +307,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
 
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
-def complete(f, w, times, states, out):
+def fill_accelerations(f, w, times, states, out):
     """Store [a, lam] at consistent states [q, v] in the rows of `out` (NaN: failure); return the number of failures."""
     n = w.Q.size
     code = SINGULAR
@@ -329,7 +334,9 @@ def complete(f, w, times, states, out):
 
 
 @kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
-def fill(f, w, options, memory, initial_memory, tolerances, state, new_state, t, states, intervals, out_t, out):
+def fill_intervals(
+    f, w, options, memory, initial_memory, tolerances, state, new_state, t, states, intervals, out_t, out
+):
     """Store states within intervals, computed by equal steps of the method; return the number of failed intervals.
 
     `intervals` are the indices of the intervals. For each interval, `out_t` (times) and `out` (states) get equally many

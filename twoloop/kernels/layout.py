@@ -14,8 +14,8 @@ from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-# MOST_FREE: largest number of unused workspaces that are kept for later runs; LARGEST_FREE: most floats in one of them
-MOST_FREE, LARGEST_FREE = 32, 100_000
+# MAX_UNUSED: largest number of unused workspaces kept for later runs; MAX_UNUSED_SIZE: largest number of floats in each
+MAX_UNUSED, MAX_UNUSED_SIZE = 32, 100_000
 WORD, LINE = 8, 8  # WORD: bytes in a number; LINE: numbers in a cache line, at the start of which each array begins
 
 
@@ -55,37 +55,37 @@ class Layout(NamedTuple):
     of_integers: NDArray[np.int64]
 
 
-def empty(sizes: Sizes) -> Work:
-    """Return a workspace of `sizes` in its initial state: an unused one, reset, or else a newly allocated one."""
-    unused = _take_unused(sizes)
-    return _allocate(sizes) if unused is None else cleared(unused)
+def empty_workspace(sizes: Sizes) -> Work:
+    """Return a workspace of `sizes` in its initial state: an unused workspace, or if there is none, a new one."""
+    unused = _take_unused_workspace(sizes)
+    return _allocate_workspace(sizes) if unused is None else reset_workspace(unused)
 
 
-def copy_of(work: Work) -> Work:
-    """Return a workspace with a copy of the data of `work` that are kept from one step to the next."""
+def copy_workspace(work: Work) -> Work:
+    """Return a workspace with copies of the arrays of `work` that keep data from one step to the next."""
     sizes = work.sizes
-    duplicate = _take_unused(sizes) or _allocate(sizes)
-    for target, source in zip(lasting(duplicate), lasting(work), strict=True):
+    duplicate = _take_unused_workspace(sizes) or _allocate_workspace(sizes)
+    for target, source in zip(lasting_arrays(duplicate), lasting_arrays(work), strict=True):
         target[:] = source
     duplicate.changes[:] = 0.0
     return duplicate
 
 
-def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def lasting_arrays(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return views of the floats and of the integers of a workspace that keep data from one step to the next."""
     layout = _layout(*work.sizes)
     return work.notes.base[: layout.n_lasting], work.counters.base[: layout.n_lasting_integers]
 
 
-def _take_unused(sizes: Sizes) -> Work | None:
-    unused = _free.get(sizes)
+def _take_unused_workspace(sizes: Sizes) -> Work | None:
+    unused = _unused_workspaces.get(sizes)
     try:
         return unused.pop() if unused else None
-    except IndexError:  # another thread has taken the last one
+    except IndexError:  # another thread has taken the last workspace of these sizes
         return None
 
 
-def _allocate(sizes: Sizes) -> Work:
+def _allocate_workspace(sizes: Sizes) -> Work:
     layout = _layout(*sizes)
     numbers, integers = np.zeros(layout.n_numbers), np.zeros(layout.n_integers, dtype=np.int64)
     arrays: dict[str, Any] = {name: numbers[a:b].reshape(shape) for name, a, b, shape in layout.numbers}
@@ -95,24 +95,26 @@ def _allocate(sizes: Sizes) -> Work:
     return Work(**arrays, sizes=sizes, table=table, address=table.ctypes.data)
 
 
-def give_back(work: Work) -> None:
-    """Keep an unused workspace for later runs of the same sizes, unless it is large; drop old ones beyond MOST_FREE."""
-    unused = _free.pop(work.sizes, [])
-    if work.notes.base.size <= LARGEST_FREE and len(unused) < MOST_FREE:
+def keep_unused_workspace(work: Work) -> None:
+    """Keep an unused workspace for later runs of equal sizes, unless it is large; drop the oldest beyond MAX_UNUSED."""
+    unused = _unused_workspaces.pop(work.sizes, [])
+    if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
-    _free[work.sizes] = unused  # insert at the end, so that the dictionary begins with the sizes used longest ago
-    for oldest in list(_free)[:-1]:
-        if sum(map(len, list(_free.values()))) <= MOST_FREE:
+    _unused_workspaces[work.sizes] = (
+        unused  # insert at the end, so that the dictionary begins with the sizes used longest ago
+    )
+    for oldest in list(_unused_workspaces)[:-1]:
+        if sum(map(len, list(_unused_workspaces.values()))) <= MAX_UNUSED:
             break
-        _free.pop(oldest, None)
+        _unused_workspaces.pop(oldest, None)
 
 
-_free: dict[Sizes, list[Work]] = {}  # unused workspaces, in a list for each combination of sizes
+_unused_workspaces: dict[Sizes, list[Work]] = {}  # unused workspaces, in a list for each combination of sizes
 
 
-def cleared(work: Work) -> Work:
+def reset_workspace(work: Work) -> Work:
     """Reset a workspace in place to its state after allocation, and return it."""
-    for view in lasting(work):
+    for view in lasting_arrays(work):
         view[:] = 0
     work.G_of_S[:] = np.nan
     return work

@@ -29,7 +29,7 @@ from twoloop.kernels.control.loop_state import N_STEP_COLUMNS
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import BANDWIDTH, FORM
-from twoloop.kernels.layout import cached_run, lasting
+from twoloop.kernels.layout import cached_run, lasting_arrays
 from twoloop.kernels.linalg.band import lapack_addresses
 from twoloop.methods.presets import code_for, identity, may_have_code, plans_for
 from twoloop.problem.system import ConstrainedSystem
@@ -402,7 +402,7 @@ def arrays_of(
     numbers, n_rows = np.concatenate([run.clock, run.control, run.tolerances]), system.n_c + system.n_a
     i, j = run.clock.size, run.clock.size + run.control.size
     run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
-    memory, (lasting_floats, integers) = run.plan.memory, lasting(run.work)
+    memory, (lasting_floats, integers) = run.plan.memory, lasting_arrays(run.work)
     choice, none = None if code is None else code.shared.equations.choice, np.zeros(0, dtype=np.int64)
     expected, scale = _choice_as_array(choice)
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]

@@ -17,7 +17,7 @@ from twoloop.checks.structure import pattern_of
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.indices import ATOL, RTOL
-from twoloop.kernels.steps.stages import loaded
+from twoloop.kernels.steps.stages import load_step
 from twoloop.methods.plan import INNER_TOL, Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.signals import signals_of
@@ -114,7 +114,7 @@ class Interpolator:
         system, t0, row = self.arguments[:3]
         q0, static = row[: system.n_q], self.static_form
         for plan in self.plans.values():
-            loaded(plan.second)  # load the step now: `result.sol` may need it at any time
+            load_step(plan.second)  # load the step now: `result.sol` may need it at any time
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
@@ -352,7 +352,9 @@ class Interpolator:
                 break
             n_states = parts + 1
             out_t, out = np.empty(n_states * len(intervals)), np.empty((n_states * len(intervals), 3 * n))
-            entry_point(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
+            entry_point(self.kernels.fill_intervals)(
+                kit, self.work, *vectors, table.t, table.states, intervals, out_t, out
+            )
             times, states = out_t.reshape(-1, n_states), out.reshape(-1, n_states, 3 * n)
             succeeded = np.isfinite(times[:, 0])
             begins = times[:, 0].tolist()
@@ -387,7 +389,10 @@ class Interpolator:
 
     def fill_accelerations(self, times: Array, states: Array, out: Array) -> None:
         """Store [a, lam] in `out` for states on the constraints, given `times` and rows [q, v]; NaN on failure."""
-        complete, times, states = entry_point(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
+        complete, times, states = (
+            entry_point(self.kernels.fill_accelerations),
+            *map(np.ascontiguousarray, (times, states)),
+        )
         failures = complete(self.kit, self.work, times, states, out)
         if failures > 0 and self.static_form is not None:
             self._switch_to_dense_form()

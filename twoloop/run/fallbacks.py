@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
-from twoloop.kernels.steps.stages import loaded
+from twoloop.kernels.steps.stages import load_step
 from twoloop.methods.plan import Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import warn_user
@@ -150,7 +150,7 @@ def switch_method(run: Run) -> None:
 
 def load_next_step(run: Run) -> None:
     """Compile, or load from disk, the second step of a pair of methods, and renew the run's kit."""
-    loaded(run.plan.second)
+    load_step(run.plan.second)
     _renew_kit(run)
 
 
@@ -169,7 +169,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     See kernels/steps/crossing_step.py. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock
-    from twoloop.kernels.steps.crossing_step import BACK, NODE_GAP
+    from twoloop.kernels.steps.crossing_step import BACKWARD_FRACTION, NODE_GAP
 
     plan = crossing_plan(run.system.n_q)
     earliest, fixed = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
@@ -193,7 +193,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
     run.piece_ends = []  # an earlier run of a cached integrator may have ended within a polynomial
     if control[a.FIXED_STEP] == 0.0:
-        control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else NODE_GAP / (1.0 - BACK)
+        control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0
     _prepare_next_origin(run, plan, control)
     return plan, control
@@ -201,11 +201,11 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     """Remove the first of `run.origins`, store it in the plan's memory, and set the step sizes and limits to try."""
-    from twoloop.kernels.steps.crossing_step import begin
+    from twoloop.kernels.steps.crossing_step import begin_polynomial
 
     a, clock = run.a, run.clock
     earliest, base, limits, beyond = run.origins.pop(0)
-    begin(plan.memory, clock[a.LARGEST_PIVOT], earliest, base)
+    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], earliest, base)
     run.crossing_tolerances = run.tolerances
     if limits != STRICT:
         run.crossing_tolerances = run.tolerances.copy()

@@ -23,7 +23,7 @@ from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.evaluation.tasks import SOLVE
-from twoloop.kernels.layout import cached_run, copy_of, empty
+from twoloop.kernels.layout import cached_run, copy_workspace, empty_workspace
 from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
@@ -140,7 +140,7 @@ class Run:
     def copy(self) -> "Run":
         """Return a copy of this run, which must be at its start."""
         new_run = self._copy_without_workspace()
-        new_run.work = copy_of(self.work)
+        new_run.work = copy_workspace(self.work)
         return new_run
 
     def from_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
@@ -150,7 +150,7 @@ class Run:
         """
         new_run = self._copy_without_workspace()
         new_run.t0, new_run.compared_until = t0, [-np.inf]
-        work = empty(self.work.sizes)
+        work = empty_workspace(self.work.sizes)
         prepare_workspace(work, self.system, self.kit.flags, new_run._pattern(q0), q0, self.rtol, self.reuse)
         work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         new_run.work = work

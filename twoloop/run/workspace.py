@@ -21,7 +21,7 @@ from twoloop.kernels.data.indices import (
     STRAIGHT,
 )
 from twoloop.kernels.evaluation.operations import N_NODES
-from twoloop.kernels.layout import Static, cached_run, empty, lasting
+from twoloop.kernels.layout import Static, cached_run, empty_workspace, lasting_arrays
 from twoloop.kernels.linalg.band import banded_pays, lapack_addresses
 from twoloop.kernels.linalg.saddle_point import sparse_pays
 from twoloop.kernels.linalg.sparse_lu import column_groups, grouped_entries, newton_program
@@ -33,7 +33,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     bodies_of,
     factorization_program,
 )
-from twoloop.kernels.steps.stages import LOADED_STEPS, loaded, step_if_loaded
+from twoloop.kernels.steps.stages import LOADED_STEPS, load_step, step_if_loaded
 from twoloop.methods.plan import Plan
 from twoloop.problem.callbacks import LARGE
 from twoloop.problem.system import ConstrainedSystem
@@ -388,7 +388,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
     """Return a plan's step, and the first and second step of its pair of methods; the second is loaded when needed."""
-    return loaded(plan.step), loaded(plan.first), step_if_loaded(plan.second)
+    return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:
@@ -424,7 +424,7 @@ def workspace(
     rank, rank_v = (rank if rank is not None else highest for rank, highest in zip(ranks, full_ranks, strict=True))
     sizes = n_q, n_c, n_a, rank, rank_v, bool(uses_null_space and n_q > rank_v), bool(augmented), n_nodes
     n_floats = matrices * n_q**2 if static is None else static.newton_matrices_size(matrices)
-    work = empty((*sizes, None if static is None else static.static, n_floats))
+    work = empty_workspace((*sizes, None if static is None else static.static, n_floats))
     return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, static)
 
 
@@ -440,7 +440,7 @@ def prepare_workspace(
 ) -> common.Work:
     """Reset a workspace, which another run may have used, for a run from q0; return the workspace."""
     arrays = map(np.ascontiguousarray, (pattern, q0))
-    entry_point(cached_run().prepare_workspace)(work, *lasting(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
+    entry_point(cached_run().prepare_workspace)(work, *lasting_arrays(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
         _set_constants(work, system, static, q0)
         return work

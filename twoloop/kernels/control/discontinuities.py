@@ -25,7 +25,7 @@ import numpy as np
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.control.step_size import project_and_evaluate
-from twoloop.kernels.data.common import allowed, compiled, finite_vector
+from twoloop.kernels.data.common import allowed_error, compiled, finite_vector
 from twoloop.kernels.data.indices import ATOL, DONE, FORM, GAP, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_of
@@ -96,7 +96,7 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
-        scale = allowed(tolerances, m, v, v1)
+        scale = allowed_error(tolerances, m, v, v1)
         largest = max(largest, abs(v1 - v - 0.5 * h * (a + a1)) / scale)
     return largest
 
@@ -118,11 +118,11 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
         if difference == 0.0:  # the row does not depend on time
             continue
         slope, size = _slope_and_size(w, i, h)
-        allowed_error = max(
+        error_limit = max(
             _allowed_error(f, w, tolerances, v, i), RATE_ROUNDING * size, TIME_ROUNDING * slope * np.spacing(abs(end))
         )
-        if difference > largest * allowed_error:
-            row, limit, mean, largest = i, allowed_error, slope, difference / allowed_error
+        if difference > largest * error_limit:
+            row, limit, mean, largest = i, error_limit, slope, difference / error_limit
     if row < 0:
         return SMOOTH, t, end
     steepest, low, high = 0.0, begin, end
@@ -377,7 +377,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
     for m in range(n):
         largest = max(largest, abs(a[m]))
         if a[m] != 0.0:
-            time = min(time, allowed(tolerances, m, v[m], v[m]) / abs(a[m]))
+            time = min(time, allowed_error(tolerances, m, v[m], v[m]) / abs(a[m]))
     if largest == 0.0:
         return True
     for m in range(n):

@@ -37,15 +37,19 @@ CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partitio
 # the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
 # freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
-N_CHECKED = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
-CHECKED_BELOW = 0.5  # pivot at an end of a step, relative to its largest value so far, below which the step is checked
+N_CHECKED_PARTS = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
+MAX_UNCHECKED_PIVOT = (
+    0.5  # pivot at an end of a step, relative to its largest value so far, below which the step is checked
+)
 # the smallest pivot counts as zero within a step if its smallest sample is below this fraction of its largest change
 # between two samples
 PASSED_PIVOT_RATIO = 0.6
-# NEAR_LEAST, NEAR_MOST: smallest and largest result of near_share; SHARE_OF_NOISE: allowed rounding error, in
-# tolerances; EPS: unit roundoff
-NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
-END_SHARE = 0.25  # static form: pivot at a step's end, relative to that at its start, below which the step is halved
+# MIN_NEAR_RATIO, MAX_NEAR_RATIO: smallest and largest result of near_pivot_ratio; MAX_ROUNDING_ERROR: allowed rounding
+# error, in tolerances; EPS: unit roundoff
+MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
+MIN_END_RATIO = (
+    0.25  # static form: pivot at a step's end, relative to that at its start, below which the step is halved
+)
 
 
 @merged
@@ -71,7 +75,7 @@ def ends_at_singular(f, w, control, clock):
     """
     if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0:
         return False
-    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[at.LARGEST_PIVOT], END_SHARE * clock[at.PIVOT_HERE])
+    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[at.LARGEST_PIVOT], MIN_END_RATIO * clock[at.PIVOT_HERE])
 
 
 @merged
@@ -100,9 +104,9 @@ def retry_projected(f, w, control, clock, size):
 
 
 @merged
-def near_share(tolerances):
-    """Return the ratio of a pivot to the largest one below which rounding errors exceed SHARE_OF_NOISE tolerances."""
-    return min(max(NEAR_LEAST, (EPS / (SHARE_OF_NOISE * tolerances[LEAST])) ** (1.0 / 3.0)), NEAR_MOST)
+def near_pivot_ratio(tolerances):
+    """Return the pivot, relative to the largest, below which rounding errors exceed MAX_ROUNDING_ERROR tolerances."""
+    return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 
 @compiled
@@ -112,8 +116,8 @@ def _least_pivot_within(f, w, t, size, before, end, state, new_state):
     The samples are on the cubic through the states at the ends of the step, whose pivots are `before` and `end`.
     """
     n, least, change = w.Q.size, min(before, end), 0.0
-    for k in range(1, N_CHECKED):
-        s = k / N_CHECKED
+    for k in range(1, N_CHECKED_PARTS):
+        s = k / N_CHECKED_PARTS
         rest = 1.0 - s
         for m in range(n):
             q0, v0, q1, v1 = state[m], size * state[n + m], new_state[m], size * new_state[n + m]
@@ -139,7 +143,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
     before = smallest_pivot(f, w, t, state[:n])
     end = smallest_pivot(f, w, t + size, new_state[:n])
     w.notes[PIVOT] = end
-    if min(before, end) > CHECKED_BELOW * largest:
+    if min(before, end) > MAX_UNCHECKED_PIVOT * largest:
         control[at.BRIDGE] = 1.0
         return False
     least, change = _least_pivot_within(f, w, t, size, before, end, state, new_state)
@@ -147,7 +151,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
         min_ratio = max(least / largest, EPS)
         clock[at.PIVOT_PASSED] = min_ratio if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], min_ratio)
         return False
-    if least < max(near_share(tolerances) * largest, min(PASSED_PIVOT_RATIO * change, SINGULAR_PIVOT * largest)):
+    if least < max(near_pivot_ratio(tolerances) * largest, min(PASSED_PIVOT_RATIO * change, SINGULAR_PIVOT * largest)):
         w.notes[PIVOT] = before
         return True
     return False

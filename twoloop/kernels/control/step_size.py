@@ -30,7 +30,7 @@ from twoloop.kernels.control.loop_state import (
     LEAST_ERROR,
     SAFETY,
 )
-from twoloop.kernels.data.common import SETTLE, allowed, compiled, is_beyond_gap, kernel, merged
+from twoloop.kernels.data.common import SETTLE, allowed_error, compiled, is_beyond_gap, kernel, merged
 from twoloop.kernels.data.indices import (
     ATOL,
     DEFECT,
@@ -194,7 +194,7 @@ def departure(w, tolerances, h, q, v, q1):
     largest = 0.0
     for k in range(w.dependent.size):
         m = w.dependent[k]
-        scale = allowed(tolerances, m, q[m], q1[m])
+        scale = allowed_error(tolerances, m, q[m], q1[m])
         largest = max(largest, abs(w.predicted[k] - q1[m]) / max(min(scale, fraction * motion + floor * scale), LEAST))
     return largest
 

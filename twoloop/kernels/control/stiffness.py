@@ -40,7 +40,7 @@ from twoloop.kernels.data.common import (
     SETTLE,
     Attempt,
     Step,
-    allowed,
+    allowed_error,
     compiled,
     gap_ratio,
     inlined,
@@ -255,7 +255,7 @@ def _has_small_vibrations(w, tolerances, state, rate):
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
-        if abs(state[2 * n + i]) > QUIET_FACTOR * rate * allowed(tolerances, i, v, v):
+        if abs(state[2 * n + i]) > QUIET_FACTOR * rate * allowed_error(tolerances, i, v, v):
             return False
     return True
 

@@ -6,7 +6,7 @@ numbers: one number for each unknown node, or one for each of eight steps that a
 
 LANES = 8  # number of lanes: numbers in a group that is computed at once
 ORDER = 12.0  # the error estimate is proportional to this power of the step size
-NOISE = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
+MAX_ROUNDING = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
 # codes: how the iteration of the stages ended. REFUSED: the step is rejected. GUESSED: the step size was a guess, and
 # must be replaced by another one. NOT_COMPUTED: accelerations at the nodes could not be computed
 CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
@@ -50,7 +50,7 @@ DEFECTS = 64  # offset of eight numbers: defects of successive steps
 WEIGHTS = 72  # offset of n_q numbers: reciprocals of the allowed errors of velocities
 
 
-def places(n, n_iterated, n_rows):
+def array_offsets(n, n_iterated, n_rows):
     """Return the offsets of the arrays whose sizes depend on the mechanism, and the length of the memory.
 
     Arrays of the stages: accelerations (n lanes), positions, velocities and two polynomials (n_iterated lanes each),

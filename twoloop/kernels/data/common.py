@@ -26,7 +26,9 @@ from twoloop.kernels.data.indices import ATOL, ESTIMATE, FAULT_KIND, FAULT_TIME,
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
-PLACES = types.int32[::1]  # type of long programs: 32-bit integers, so that a program fits in the processor's cache
+INTEGERS_32 = types.int32[
+    ::1
+]  # type of long programs: 32-bit integers, so that a program fits in the processor's cache
 
 # names of the programs in `Functions`: programs that replace missing callbacks (evaluation/operations.py), and programs
 # for sparse factors of large systems (linalg/symbolic_factorization.py, sparse_lu.py). A missing program has size 0
@@ -162,7 +164,7 @@ KIT = Reference(
     "Kit",
     {
         **{"p": VECTOR, "flags": INTEGERS, "numbers": VECTOR, "own_numbers": VECTOR},
-        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, PLACES, PLACES), strict=True)),
+        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, INTEGERS_32, INTEGERS_32), strict=True)),
     },
 )
 for _name, _kind in KINDS.items():
@@ -211,23 +213,23 @@ KIT.add_llvm_functions(OWN_FUNCTIONS)
 _FOLDER = Path(__file__).parents[1]  # folder of the kernels
 
 
-def _path(module: str) -> Path:
+def _source_path(module: str) -> Path:
     return _FOLDER / f"{module.replace('.', '/')}.py"
 
 
 @cache
-def _text(module: str) -> str:
-    path = _path(module)
+def _source_text(module: str) -> str:
+    path = _source_path(module)
     return path.read_text() if path.exists() else ""
 
 
-def _imports(text: str) -> set[str]:
+def _imported_modules(text: str) -> set[str]:
     """Return the names of those modules of the kernels that a source text imports, such as "steps.stages"."""
     names = set()
     for folder, several, single in re.findall(
         r"^from twoloop\.kernels([\w.]*) import (?:\(([^)]*)\)|(.+))$", text, re.MULTILINE
     ):
-        if _path(folder[1:]).exists():
+        if _source_path(folder[1:]).exists():
             names.add(folder[1:])
         else:
             modules = (name.split(" as ")[0].strip() for name in (several or single).split(","))
@@ -236,7 +238,7 @@ def _imports(text: str) -> set[str]:
 
 
 @cache
-def stamp(module: str) -> str:
+def source_digest(module: str) -> str:
     """Return a digest of the callback signatures, and of the sources of a module and of all modules that it imports.
 
     `module`: name below twoloop.kernels, such as "steps.stages".
@@ -245,10 +247,10 @@ def stamp(module: str) -> str:
     pending = {module}
     while pending:
         modules |= pending
-        pending = {name for each in pending for name in _imports(_text(each)) if name not in modules}
+        pending = {name for each in pending for name in _imported_modules(_source_text(each)) if name not in modules}
     digest = hashlib.sha256(repr((KIT.functions, GIVEN)).encode())
     for each in sorted(modules):
-        digest.update(_text(each).encode())
+        digest.update(_source_text(each).encode())
     return digest.hexdigest()
 
 
@@ -268,7 +270,7 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
         return compile_cached(
             function,
             signature,
-            (stamp(_module_name(function)), ""),
+            (source_digest(_module_name(function)), ""),
             announcement=_ANNOUNCEMENT,
             pipeline_class=VectorizingCompiler if vectorized else KernelCompiler,
             **OPTIONS,
@@ -288,7 +290,7 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
+def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     """Return a decorator that compiles a function which only kernels call, not Python."""
     wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
@@ -296,11 +298,13 @@ def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
 
 # forceinline is always set explicitly, because a callee inherits the flags of its caller: otherwise, all helpers that a
 # merged helper calls would be merged, too
-exact = _helper(fastmath=False, forceinline=False)  # keeps the order of floating-point operations as in the source
-compiled = _helper(forceinline=False)  # compiled as one function, which LLVM inlines only if it is short
-inlined = _helper(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
+exact = _helper_decorator(
+    fastmath=False, forceinline=False
+)  # keeps the order of floating-point operations as in the source
+compiled = _helper_decorator(forceinline=False)  # compiled as one function, which LLVM inlines only if it is short
+inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
 # inlined by LLVM, so that each call becomes a copy of the code: for short helpers, and for those of every evaluation
-merged = _helper(forceinline=True)
+merged = _helper_decorator(forceinline=True)
 
 
 NO_NUMBERS = np.zeros(0)  # data of generated functions that read none
@@ -406,7 +410,7 @@ SLACK = 1e-9  # excess of a step size over GAP, relative to GAP, that counts as 
 
 
 @merged
-def allowed(tolerances, m, x, x1):
+def allowed_error(tolerances, m, x, x1):
     """Return the allowed error of coordinate m, or of its velocity, in a step in which its value goes from x to x1."""
     return tolerances[ATOL + m] + tolerances[RTOL] * max(abs(x), abs(x1))
 

@@ -38,18 +38,18 @@ from twoloop.kernels.lanes.layout import (
     T,
     X,
     fill_field,
-    leave_run,
-    places_of,
+    offsets_in_work,
     project_lanes,
+    remove_run,
 )
 
 TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 
 @compiled
-def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status):
+def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status):
     """Start new runs in idle lanes; return the index of the next new run, and the number of lanes with a run."""
-    state, new, _, _, _, _, own, _ = places_of(n, n_rows, numbers.shape[1])
+    state, new, _, _, _, _, own, _ = offsets_in_work(n, n_rows, numbers.shape[1])
     n_fresh, n_running = 0, 0
     for k in range(LANES):
         previous_run = int(work[RUN * LANES + k])
@@ -78,13 +78,13 @@ def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, st
                 for j in range(2 * n):
                     work[(state + j) * LANES + k] = work[(new + j) * LANES + k]
                 if work[FINE * LANES + k] == 0.0:
-                    leave_run(work, status, k, NO_START)
+                    remove_run(work, status, k, NO_START)
                     n_running -= 1
     return next_run, n_running
 
 
 @compiled
-def _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
+def _write_states_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
     """Store the states at the output times within accepted steps in out_q and out_v; NaN where a projection fails."""
     while True:
         n_requested = 0
@@ -113,7 +113,7 @@ def _write_within_steps(code, settings, control, options, work, n, new, times, o
 
 
 @compiled
-def _write_ends(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
+def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
     """End the runs whose accepted step ends at t1, and copy their final states to out_q, out_v and out_a.
 
     `last` is the index of t1 among the output times.
@@ -166,7 +166,7 @@ def advance_lanes(
     (n_runs,); n_evaluations : (n_runs,) increased by the number of evaluations.
     """
     n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
-    _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])
+    _, new, _, _, a, _, _, _ = offsets_in_work(n, n_rows, numbers.shape[1])
     next_run, has_new_runs = 0, False
     for field in (T, AHEAD, H, X, RUNNING, ACCEPTED):
         fill_field(work, field, 0.0)
@@ -178,7 +178,9 @@ def advance_lanes(
             n_running += work[RUNNING * LANES + k]
         if n_running < LANES or has_new_runs:
             first_new_run = next_run
-            next_run, n_occupied = _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status)
+            next_run, n_occupied = _refill_lanes(
+                code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status
+            )
             has_new_runs = next_run > first_new_run
             if n_occupied == 0:
                 if next_run == numbers.shape[0]:
@@ -188,7 +190,9 @@ def advance_lanes(
         code.step(code, settings, control, options, work, status, n_steps, False)
         _count_evaluations(settings, work, n_evaluations)
         code.commit(order, control, work)
-        _write_ends(work, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
+        _write_final_states(work, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
         if times.size > 1:
-            _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps)
+            _write_states_within_steps(
+                code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps
+            )
         _advance_time(work, control, n_steps)

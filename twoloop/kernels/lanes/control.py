@@ -51,10 +51,10 @@ from twoloop.kernels.lanes.layout import (
     T,
     X,
     copy_vectors,
-    enlarge,
-    leave_run,
-    places_of,
+    offsets_in_work,
     project_lanes,
+    raise_to_ratio,
+    remove_run,
 )
 
 # indices in `options`; its first N_RULE entries are the step-size rule. ROUGH: factor by which errors may exceed their
@@ -129,12 +129,12 @@ def choose_steps(work, control, status, n_steps):
             elif h > 0.5 * time_left:
                 h = 0.5 * time_left  # two equal steps rather than a long and a tiny one
             if n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
-                leave_run(work, status, k, MANY_STEPS)
+                remove_run(work, status, k, MANY_STEPS)
             elif h > SHORTEST * max(abs(t), abs(t1)):
                 work[H * LANES + k], work[H_FREE * LANES + k] = h, h_wanted
             else:
                 last_step_failed = work[H_LIMIT * LANES + k] < np.inf and work[LIMIT_AGE * LANES + k] == 0.0
-                leave_run(work, status, k, NO_VALUES if last_step_failed else OFTEN_REFUSED)
+                remove_run(work, status, k, NO_VALUES if last_step_failed else OFTEN_REFUSED)
         work[X * LANES + k] = work[H * LANES + k]
         work[FINE * LANES + k] = work[RUNNING * LANES + k]
 
@@ -155,7 +155,7 @@ def end_steps(code, settings, control, work, predicted_v):
     between the stages. `predicted_v` (n) is scratch.
     """
     n, order = settings[N], settings[ORDER]
-    state, new, predicted, _, _, _, _, _ = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     for i in range(n * LANES):
         work[predicted * LANES + i] = work[new * LANES + i]
         work[predicted_v * LANES + i] = work[(new + n) * LANES + i]
@@ -167,7 +167,7 @@ def end_steps(code, settings, control, work, predicted_v):
         work[predicted_v * LANES + i] -= work[(new + n) * LANES + i]
     for j in range(n):
         atol = control[ATOL + j]
-        enlarge(work, ERROR, predicted_v + j, RUNNING, state + n + j, new + n + j, atol, control[RTOL])
+        raise_to_ratio(work, ERROR, predicted_v + j, RUNNING, state + n + j, new + n + j, atol, control[RTOL])
     for k in range(LANES):
         work[ERROR * LANES + k] = max(work[ERROR * LANES + k], work[OFF * LANES + k])
 
@@ -213,7 +213,7 @@ def judge_steps(options, work, n, a, start, status):
         else:
             work[REFUSED * LANES + k] += 1.0
             if work[REFUSED * LANES + k] > MAX_REJECTED:
-                leave_run(work, status, k, OFTEN_REFUSED if work[FINE * LANES + k] == 1.0 else NO_VALUES)
+                remove_run(work, status, k, OFTEN_REFUSED if work[FINE * LANES + k] == 1.0 else NO_VALUES)
 
 
 def memory_size(s: int, n: int) -> int:
@@ -228,7 +228,7 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
     With `within`, compute instead the states at the time X after the beginning of the last accepted step.
     """
     n = settings[N]
-    state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     start = memory + START * n
     if not within:
         begin_control(options, control, work, n, state, a, start)
@@ -256,7 +256,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
         return
     for k in range(LANES):  # end runs with too many steps: in stiff motion, any tolerance may need many
         if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
-            leave_run(work, status, k, MANY_STEPS)
+            remove_run(work, status, k, MANY_STEPS)
     code.series(order, control, work)
     code.lengths(order, control, work)
     for k in range(LANES):  # count the evaluations of the defect within the step

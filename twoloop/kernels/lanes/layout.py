@@ -23,19 +23,19 @@ NO_START, NO_STATE, NO_VALUES, OFTEN_REFUSED, MANY_STEPS, UNLIKE = range(-6, 0)
 
 LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of doubles in a SIMD register
 
-# offsets in `work` of the fields, each a vector; the fields are followed by STATE, NEW, PREDICTED, ..., see `places`
+# offsets in `work` of the fields, each a vector; after the fields, `work` contains the arrays of `array_offsets`
 (
     T,  # time of STATE, s
     AHEAD,  # time of NEW, s
     UNIT,  # unit of time of a series, s
     H,  # size of the step, s
     X,  # time from the beginning of the step to the state to be computed, s
-    FINE,  # 1 in lanes in which a task has to run; it remains 1 if the task succeeds
+    FINE,  # on entry to a task 1 in lanes in which it has to run; on return 1 in those in which it has succeeded
     DEFECT,  # defect at the end of the step, relative to the allowed defect
     OFF,  # departure: difference of predicted and projected positions, relative to its limit, see control/step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
     LONGEST,  # largest allowed step size, s
-    REQUESTED,  # 1 in lanes that begin a run, or for which a state within a step is requested
+    REQUESTED,  # 1 in lanes that begin a run, or in which a state within the step is to be computed
     WORST,  # largest defect within the step, relative to the allowed defect
     REFUSED,  # number of successive rejected steps
     RUNNING,  # 1 in lanes with a run
@@ -48,16 +48,16 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     ERROR,  # error estimate of the step, in units of the tolerances
     H_FREE,  # size of the step before it was shortened to reach the end of the run, s
     H_NEXT,  # size of the next step, s
-    H_LIMIT,  # upper limit of the step size after a step that failed, s; infinite if there is no limit
+    H_LIMIT,  # upper limit of step sizes after a failed step, s; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
-    ROUGH_TO,  # time at the end of the last step that was rejected because of a suddenly large error, s
+    ROUGH_TO,  # time at which the last step rejected with an error above SUDDEN_ERROR would have ended, s
     SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
     EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
     PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# names of tasks: functions (order, control, work) generated for a mechanism, which change `work`
+# tasks are functions (order, control, work) that are generated for a mechanism and change `work`; these are their names
 TASKS = (
     "approach",  # move the positions of NEW, at the time AHEAD, towards the constraints, in lanes with FINE = 1
     "refine",  # correct NEW once in lanes with LEFT_TO_MOVE = 1; compute A and LAM; FINE is 1 if NEW has converged
@@ -78,7 +78,7 @@ TASKS_OF_SERIES = (
     "defect",  # compute DEFECT at NEW, the end of a step H: the difference of A and SERIES_A, relative to its limit
     "judge",  # set ACCEPTED, and choose the size of the next step
 )
-CODE = Reference("LaneKit", {})  # numba's type of a LaneKit
+CODE = Reference("LaneKit", {})  # numba's type for objects of the class LaneKit
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # signature of a method's step, (code, settings, control, options, work, status, n_steps, within): in each lane with a
@@ -105,8 +105,8 @@ class LaneKit:
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
         self.__dict__.update(own.addresses)
         self.own, self.step = own, step
-        self.table = CODE.table(self)
-        self.address = self.table.ctypes.data
+        self.matrix_view = CODE.matrix_view(self)
+        self.address = self.matrix_view.ctypes.data
 
 
 @typeof_impl.register(LaneKit)
@@ -114,7 +114,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return CODE
 
 
-def places(n, n_rows, n_numbers):
+def array_offsets(n, n_rows, n_numbers):
     """Return the offsets in `work`, in vectors, of the arrays that follow its fields.
 
     These are STATE and NEW (q, v), PREDICTED (q), SERIES_A (accelerations by a series), A, LAM, the data of the
@@ -130,7 +130,7 @@ def places(n, n_rows, n_numbers):
     return state, new, predicted, series_a, a, lam, numbers, numbers + n_numbers
 
 
-places_of = merged(places)
+offsets_in_work = merged(array_offsets)
 
 
 @merged
@@ -141,20 +141,20 @@ def fill_field(work, field, value):
 
 
 @merged
-def leave_run(work, status, k, reason):
-    """Remove the run of lane k; store in `status` the reason, such as NO_VALUES, why it has to be repeated alone."""
+def remove_run(work, status, k, reason):
+    """Remove the run from lane k; store in `status` the `reason`, such as NO_VALUES, why it is repeated alone."""
     work[RUNNING * LANES + k] = 0.0
     status[int(work[RUN * LANES + k])] = reason
 
 
 @inlined
-def vectors(work, begin, count):
+def vector_range(work, begin, count):
     """Return a flat view of `count` adjacent vectors of `work`, which begin at offset `begin`."""
     return work[begin * LANES : (begin + count) * LANES]
 
 
 @inlined
-def table(work, begin, rows, count):
+def matrix_view(work, begin, rows, count):
     """Return a view (rows, count * LANES) of adjacent vectors of `work`, which begin at offset `begin`."""
     return work[begin * LANES : (begin + rows * count) * LANES].reshape((rows, count * LANES))
 
@@ -184,7 +184,7 @@ def sum_rows(weights, rows, total):
 
 @merged
 def _add_four(work, t, p, q, sign):
-    """Add sign x y to a vector in four adjacent lanes; t, p and q are indices in `work` of the vector, x and y."""
+    """Add sign * x * y to a vector in four adjacent lanes; t, p and q are indices in `work` of the vector, x and y."""
     t0, t1 = work[t] + sign * work[p] * work[q], work[t + 1] + sign * work[p + 1] * work[q + 1]
     t2, t3 = work[t + 2] + sign * work[p + 2] * work[q + 2], work[t + 3] + sign * work[p + 3] * work[q + 3]
     work[t], work[t + 1], work[t + 2], work[t + 3] = t0, t1, t2, t3
@@ -192,32 +192,32 @@ def _add_four(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign x y to the vector `target`, reading four lanes before writing any: LLVM assumes that vectors overlap."""
+    """Add sign * x * y to the vector `target`; read four lanes before writing any, as LLVM assumes overlapping vectors."""
     for k in range(0, LANES, 4):
         _add_four(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
 
 @merged
-def _enlarged(work, target, error, factor, before, after, atol, rtol):
-    """Return the value that `enlarge` stores in one lane; arguments `target` to `after` are indices in `work`."""
+def _raised_value(work, target, error, factor, before, after, atol, rtol):
+    """Return the value that `raise_to_ratio` stores in one lane; `target` to `after` are indices in `work`."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
 
 @compiled
-def enlarge(work, target, error, factor, before, after, atol, rtol):
-    """Increase `target` to |error| factor / (atol + rtol max(|before|, |after|)) in lanes in which this is larger."""
+def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
+    """Raise `target` to the ratio |error| factor / (atol + rtol max(|before|, |after|)) in lanes in which it is smaller."""
     for k in range(0, LANES, 4):
         m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k
-        m0 = _enlarged(work, m, e, f, x, y, atol, rtol)
-        m1 = _enlarged(work, m + 1, e + 1, f + 1, x + 1, y + 1, atol, rtol)
-        m2 = _enlarged(work, m + 2, e + 2, f + 2, x + 2, y + 2, atol, rtol)
-        m3 = _enlarged(work, m + 3, e + 3, f + 3, x + 3, y + 3, atol, rtol)
+        m0 = _raised_value(work, m, e, f, x, y, atol, rtol)
+        m1 = _raised_value(work, m + 1, e + 1, f + 1, x + 1, y + 1, atol, rtol)
+        m2 = _raised_value(work, m + 2, e + 2, f + 2, x + 2, y + 2, atol, rtol)
+        m3 = _raised_value(work, m + 3, e + 3, f + 3, x + 3, y + 3, atol, rtol)
         work[m], work[m + 1], work[m + 2], work[m + 3] = m0, m1, m2, m3
 
 
 @merged
-def _scale(work, target, apart, x, imaginary):
+def _multiply_number(work, target, apart, x, imaginary):
     """Multiply the number `target` by x in each lane; if `imaginary` > 0, both numbers are complex.
 
     Their imaginary parts are `apart` vectors after the real part of `target`, and `imaginary` vectors after that of x.
@@ -234,7 +234,7 @@ def _scale(work, target, apart, x, imaginary):
 
 @merged
 def _subtract_product(work, target, x, y, imaginary, imaginary_y):
-    """Subtract x y from the number `target` in each lane; if `imaginary` > 0, all three numbers are complex.
+    """Subtract the product x * y from the number `target` in each lane; if `imaginary` > 0, all three are complex.
 
     Their imaginary parts are `imaginary` vectors after the real part of x, and `imaginary_y` vectors after the real
     parts of y and `target`.
@@ -247,15 +247,15 @@ def _subtract_product(work, target, x, y, imaginary, imaginary_y):
 
 
 @merged
-def _exchange(work, first, second, k):
-    """Exchange the numbers of two vectors in lane k."""
+def _exchange_entries(work, first, second, k):
+    """Exchange the entries of the vectors `first` and `second` in lane k."""
     i, j = first * LANES + k, second * LANES + k
     work[i], work[j] = work[j], work[i]
 
 
 @merged
-def _absolute_value(work, entry, imaginary, k):
-    """Return |x| of a real number x in lane k, or |re x| + |im x| of a complex one; `entry` is the offset of x."""
+def _pivot_magnitude(work, entry, imaginary, k):
+    """Return |x| of a real matrix entry x in lane k, or |re x| + |im x| of a complex one; `entry`: offset of x."""
     magnitude = abs(work[entry * LANES + k])
     return magnitude if imaginary == 0 else magnitude + abs(work[(entry + imaginary) * LANES + k])
 
@@ -267,17 +267,17 @@ def _choose_pivot(work, matrix, pivots, n, imaginary, c):
     Clear FINE in lanes in which the pivot is zero.
     """
     for k in range(LANES):
-        best, largest = c, _absolute_value(work, matrix + c * n + c, imaginary, k)
+        best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)
         for i in range(c + 1, n):
-            magnitude = _absolute_value(work, matrix + i * n + c, imaginary, k)
+            magnitude = _pivot_magnitude(work, matrix + i * n + c, imaginary, k)
             if magnitude > largest:
                 best, largest = i, magnitude
         work[(pivots + c) * LANES + k] = best
         if best != c:
             for j in range(n):
-                _exchange(work, matrix + c * n + j, matrix + best * n + j, k)
+                _exchange_entries(work, matrix + c * n + j, matrix + best * n + j, k)
                 if imaginary > 0:
-                    _exchange(work, matrix + c * n + j + imaginary, matrix + best * n + j + imaginary, k)
+                    _exchange_entries(work, matrix + c * n + j + imaginary, matrix + best * n + j + imaginary, k)
         if not largest > 0.0:
             work[FINE * LANES + k] = 0.0
         re = (matrix + c * n + c) * LANES + k
@@ -290,20 +290,20 @@ def _choose_pivot(work, matrix, pivots, n, imaginary, c):
 
 
 @compiled
-def factor_lanes(work, matrix, pivots, n, imaginary):
+def factor_matrices(work, matrix, pivots, n, imaginary):
     """Replace a matrix (n, n) in each lane by its LU factors, with inverted pivots; store row exchanges in `pivots`."""
     for c in range(n):
         _choose_pivot(work, matrix, pivots, n, imaginary, c)
         for i in range(c + 1, n):
-            _scale(work, matrix + i * n + c, imaginary, matrix + c * n + c, imaginary)
+            _multiply_number(work, matrix + i * n + c, imaginary, matrix + c * n + c, imaginary)
             for j in range(c + 1, n):
                 row, column = matrix + i * n + c, matrix + c * n + j
                 _subtract_product(work, matrix + i * n + j, row, column, imaginary, imaginary)
 
 
 @compiled
-def solve_lanes(work, matrix, pivots, n, imaginary, x):
-    """Replace a right-hand side x (n) in each lane by the solution, with the factors of `factor_lanes`.
+def solve_systems(work, matrix, pivots, n, imaginary, x):
+    """Replace a right-hand side x (n) in each lane by the solution, with the factors of `factor_matrices`.
 
     If `imaginary` > 0, the system is complex, and n imaginary parts follow the real parts of x.
     """
@@ -312,16 +312,16 @@ def solve_lanes(work, matrix, pivots, n, imaginary, x):
         for k in range(LANES):
             pivot_row = int(work[(pivots + c) * LANES + k])
             if pivot_row != c:
-                _exchange(work, x + c, x + pivot_row, k)
+                _exchange_entries(work, x + c, x + pivot_row, k)
                 if imaginary > 0:
-                    _exchange(work, x + n + c, x + n + pivot_row, k)
+                    _exchange_entries(work, x + n + c, x + n + pivot_row, k)
     for i in range(n):
         for j in range(i):
             _subtract_product(work, x + i, matrix + i * n + j, x + j, imaginary, imaginary_x)
     for i in range(n - 1, -1, -1):
         for j in range(i + 1, n):
             _subtract_product(work, x + i, matrix + i * n + j, x + j, imaginary, imaginary_x)
-        _scale(work, x + i, imaginary_x, matrix + i * n + i, imaginary)
+        _multiply_number(work, x + i, imaginary_x, matrix + i * n + i, imaginary)
 
 
 MAX_PASSES = 10  # largest number of passes of a projection, each with the task "refine"

@@ -35,14 +35,14 @@ from twoloop.kernels.lanes.layout import (
     X,
     add_product,
     copy_vectors,
-    enlarge,
-    factor_lanes,
+    factor_matrices,
     fill_field,
-    places_of,
-    solve_lanes,
+    matrix_view,
+    offsets_in_work,
+    raise_to_ratio,
+    solve_systems,
     sum_rows,
-    table,
-    vectors,
+    vector_range,
 )
 from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import (
@@ -63,7 +63,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 (
     ITERATING,  # 1 in lanes whose iteration has not ended
     DONE,  # 1 in lanes whose iteration has converged
-    CHANGE_BEFORE,  # correction by the previous iteration, relative to SCALE_Q and SCALE_V, see _end_iteration
+    CHANGE_BEFORE,  # correction by the previous iteration, relative to SCALE_Q and SCALE_V, see _has_iteration_ended
     SCALE_Q,  # largest absolute position at the stages, at least 1
     SCALE_V,  # largest absolute velocity at the stages, at least 1
     LARGEST_Q,  # largest correction of positions, divided by the square of the step size
@@ -105,43 +105,43 @@ def memory_size(s: int, n: int) -> int:
 
 
 @merged
-def vector_at(memory, n, block):
+def vector_offset(memory, n, block):
     """Return the offset of a block of n vectors, such as START; `memory`: offset of the method's memory."""
     return memory + N_OF_LANES + block * n
 
 
 @merged
-def block_at(memory, n, s, block):
+def block_offset(memory, n, s, block):
     """Return the offset of a block of (s, n) vectors, such as STAGES; `memory`: offset of the method's memory."""
     return memory + N_OF_LANES + (N_VECTORS + block * s) * n
 
 
 @merged
-def _weights_at(memory, n, s):
+def _weights_offset(memory, n, s):
     """Return the offset of the weights (s, s) with which `predict_stages` multiplies PREVIOUS."""
     return memory + N_OF_LANES + (N_VECTORS + N_BLOCKS * s) * n
 
 
 @merged
-def matrix_at(memory, n, s, index):
+def matrix_offset(memory, n, s, index):
     """Return the offset of matrix (n, n) number `index`: DERIVATIVE_Q, DERIVATIVE_V, or SYSTEMS + 2 k for system k."""
-    return _weights_at(memory, n, s) + s * s + index * n * n
+    return _weights_offset(memory, n, s) + s * s + index * n * n
 
 
 @merged
-def pivots_at(memory, n, s, n_systems, k):
+def pivots_offset(memory, n, s, n_systems, k):
     """Return the offset of the pivots (n) of system k."""
-    return matrix_at(memory, n, s, SYSTEMS + 2 * n_systems) + k * n
+    return matrix_offset(memory, n, s, SYSTEMS + 2 * n_systems) + k * n
 
 
 @compiled
-def _evaluate_middle(code, settings, control, c, work, new, a, memory):
+def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
     """Store a state in the middle of the step, and its accelerations, in MIDDLE_Q, MIDDLE_V and MIDDLE_A.
 
     The state is extrapolated from the beginning of the step, and its positions are moved towards the constraints.
     """
     n, order = settings[N], settings[ORDER]
-    node, begin = middle_node(c), vector_at(memory, n, BEGIN_Q)
+    node, begin = middle_node(c), vector_offset(memory, n, BEGIN_Q)
     for k in range(LANES):
         x = node * work[X * LANES + k]
         work[AHEAD * LANES + k] = work[T * LANES + k] + x
@@ -152,28 +152,28 @@ def _evaluate_middle(code, settings, control, c, work, new, a, memory):
             work[(new + n + j) * LANES + k] = v + x * a0
     code.approach(order, control, work)
     code.accelerate(order, control, work)
-    copy_vectors(work, new, vector_at(memory, n, MIDDLE_Q), 2 * n)
-    copy_vectors(work, a, vector_at(memory, n, MIDDLE_A), n)
+    copy_vectors(work, new, vector_offset(memory, n, MIDDLE_Q), 2 * n)
+    copy_vectors(work, a, vector_offset(memory, n, MIDDLE_A), n)
 
 
 @compiled
-def find_derivatives(code, settings, control, c, work):
+def compute_derivatives(code, settings, control, c, work):
     """Store the derivatives of the accelerations in the middle of the step by q and v, in lanes with FINE = 1.
 
     The middle is the time of a stage, because a force that acts only between two stages has no effect on the step.
     """
     n, order = settings[N], settings[ORDER]
-    _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
-    _evaluate_middle(code, settings, control, c, work, new, a, memory)
-    middle, middle_a = vector_at(memory, n, MIDDLE_Q), vector_at(memory, n, MIDDLE_A)
+    _evaluate_middle_state(code, settings, control, c, work, new, a, memory)
+    middle, middle_a = vector_offset(memory, n, MIDDLE_Q), vector_offset(memory, n, MIDDLE_A)
     for column in range(2 * n):
         copy_vectors(work, middle, new, 2 * n)
         for k in range(LANES):
             index = (new + column) * LANES + k
             work[index] += RELATIVE_DISPLACEMENT * max(1.0, abs(work[index]))
         code.accelerate(order, control, work)
-        matrix = matrix_at(memory, n, s, DERIVATIVE_Q if column < n else DERIVATIVE_V) + column % n
+        matrix = matrix_offset(memory, n, s, DERIVATIVE_Q if column < n else DERIVATIVE_V) + column % n
         for k in range(LANES):
             per_displacement = 1.0 / (work[(new + column) * LANES + k] - work[(middle + column) * LANES + k])
             for i in range(n):
@@ -185,15 +185,15 @@ def find_derivatives(code, settings, control, c, work):
 def factor_systems_of_lanes(settings, method_options, s, work):
     """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one l of each complex pair."""
     n = settings[N]
-    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_index(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
-    by_q, by_v = matrix_at(memory, n, s, DERIVATIVE_Q), matrix_at(memory, n, s, DERIVATIVE_V)
+    by_q, by_v = matrix_offset(memory, n, s, DERIVATIVE_Q), matrix_offset(memory, n, s, DERIVATIVE_V)
     for system in range(n_systems):
         re, im = method_options[offset], method_options[offset + 1]
         offset += 2 + 4 * s
-        matrix, apart = matrix_at(memory, n, s, SYSTEMS + 2 * system), n * n * LANES
+        matrix, apart = matrix_offset(memory, n, s, SYSTEMS + 2 * system), n * n * LANES
         for i in range(n * n):
             diagonal = 1.0 if i % (n + 1) == 0 else 0.0
             for k in range(LANES):
@@ -201,8 +201,8 @@ def factor_systems_of_lanes(settings, method_options, s, work):
                 q, v = x * x * work[(by_q + i) * LANES + k], x * work[(by_v + i) * LANES + k]
                 work[(matrix + i) * LANES + k] = diagonal - (re * re - im * im) * q - re * v
                 work[(matrix + i) * LANES + k + apart] = -2.0 * re * im * q - im * v
-        pivots = pivots_at(memory, n, s, n_systems, system)
-        factor_lanes(work, matrix, pivots, n, 0 if system < n_real else n * n)
+        pivots = pivots_offset(memory, n, s, n_systems, system)
+        factor_matrices(work, matrix, pivots, n, 0 if system < n_real else n * n)
 
 
 @compiled
@@ -213,10 +213,10 @@ def predict_stages(settings, c, work, begins):
     step in units of the step of PREVIOUS: 1 if PREVIOUS belongs to the last step, 0 if it belongs to this step.
     """
     n = settings[N]
-    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = c.size
-    weights, stages = _weights_at(memory, n, s), block_at(memory, n, s, STAGES)
-    previous, a = block_at(memory, n, s, PREVIOUS), vector_at(memory, n, BEGIN_A)
+    weights, stages = _weights_offset(memory, n, s), block_offset(memory, n, s, STAGES)
+    previous, a = block_offset(memory, n, s, PREVIOUS), vector_offset(memory, n, BEGIN_A)
     for k in range(LANES):
         h_previous = work[(memory + H_PREVIOUS) * LANES + k]
         ratio = work[X * LANES + k] / h_previous if h_previous > 0.0 else np.inf
@@ -244,11 +244,11 @@ def predict_stages(settings, c, work, begins):
 def _compute_residuals(code, settings, control, A, A2, c, work):
     """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations STAGES; clear FINE in lanes with invalid values."""
     n, order = settings[N], settings[ORDER]
-    _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
-    stages, sums = block_at(memory, n, s, STAGES), vector_at(memory, n, SUMS)
-    begin, residual = vector_at(memory, n, BEGIN_Q), block_at(memory, n, s, RESIDUAL)
-    stage_rows, total = table(work, stages, s, n), vectors(work, sums, n)
+    stages, sums = block_offset(memory, n, s, STAGES), vector_offset(memory, n, SUMS)
+    begin, residual = vector_offset(memory, n, BEGIN_Q), block_offset(memory, n, s, RESIDUAL)
+    stage_rows, total = matrix_view(work, stages, s, n), vector_range(work, sums, n)
     fill_field(work, memory + SCALE_Q, 1.0)
     fill_field(work, memory + SCALE_V, 1.0)
     for j in range(s):
@@ -277,23 +277,26 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
 def _correct_stages(settings, method_options, s, work):
     """Store the corrections of the stage accelerations in CHANGES; add them to STAGES in lanes with ITERATING = 1."""
     n = settings[N]
-    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_index(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
-    scratch, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
-    residual, stages = block_at(memory, n, s, RESIDUAL), block_at(memory, n, s, STAGES)
-    residual_rows, width = table(work, residual, s, n), n * LANES
+    scratch, changes = vector_offset(memory, n, COMPLEX), block_offset(memory, n, s, CHANGES)
+    residual, stages = block_offset(memory, n, s, RESIDUAL), block_offset(memory, n, s, STAGES)
+    residual_rows, width = matrix_view(work, residual, s, n), n * LANES
     for i in range(s * width):
         work[changes * LANES + i] = 0.0
     for system in range(n_systems):
         row, column = offset + 2, offset + 2 + 2 * s
         offset += 2 + 4 * s
-        sum_rows(method_options[row : row + s], residual_rows, vectors(work, scratch, n))
-        sum_rows(method_options[row + s : row + 2 * s], residual_rows, vectors(work, scratch + n, n))
-        matrix, pivots = matrix_at(memory, n, s, SYSTEMS + 2 * system), pivots_at(memory, n, s, n_systems, system)
+        sum_rows(method_options[row : row + s], residual_rows, vector_range(work, scratch, n))
+        sum_rows(method_options[row + s : row + 2 * s], residual_rows, vector_range(work, scratch + n, n))
+        matrix, pivots = (
+            matrix_offset(memory, n, s, SYSTEMS + 2 * system),
+            pivots_offset(memory, n, s, n_systems, system),
+        )
         imaginary = 0 if system < n_real else n * n
-        solve_lanes(work, matrix, pivots, n, imaginary, scratch)
+        solve_systems(work, matrix, pivots, n, imaginary, scratch)
         multiplicity = 1.0 if system < n_real else 2.0
         for j in range(s):
             re, im = multiplicity * method_options[column + j], multiplicity * method_options[column + s + j]
@@ -306,7 +309,7 @@ def _correct_stages(settings, method_options, s, work):
 
 
 @merged
-def _store_largest(work, target, begin, n):
+def _raise_to_largest_value(work, target, begin, n):
     """Increase the vector `target` to the largest |value| of the n vectors from `begin` on, or to NaN if one is NaN."""
     for i in range(n * LANES):
         magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
@@ -318,20 +321,20 @@ def _store_largest(work, target, begin, n):
 def _store_largest_corrections(settings, A, A2, work):
     """Store LARGEST_Q and LARGEST_V, the largest changes of q and v that CHANGES causes at the stages if X is 1."""
     n = settings[N]
-    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = A.shape[0]
-    sums, stage_rows = vector_at(memory, n, SUMS), table(work, block_at(memory, n, s, CHANGES), s, n)
+    sums, stage_rows = vector_offset(memory, n, SUMS), matrix_view(work, block_offset(memory, n, s, CHANGES), s, n)
     fill_field(work, memory + LARGEST_Q, 0.0)
     fill_field(work, memory + LARGEST_V, 0.0)
     for j in range(s):
-        sum_rows(A2[j], stage_rows, vectors(work, sums, n))
-        _store_largest(work, memory + LARGEST_Q, sums, n)
-        sum_rows(A[j], stage_rows, vectors(work, sums, n))
-        _store_largest(work, memory + LARGEST_V, sums, n)
+        sum_rows(A2[j], stage_rows, vector_range(work, sums, n))
+        _raise_to_largest_value(work, memory + LARGEST_Q, sums, n)
+        sum_rows(A[j], stage_rows, vector_range(work, sums, n))
+        _raise_to_largest_value(work, memory + LARGEST_V, sums, n)
 
 
 @merged
-def _end_iteration(options, work, memory, iteration, k):
+def _has_iteration_ended(options, work, memory, iteration, k):
     """Set DONE to 1 if the iteration of lane k has converged, otherwise to 0; return whether the iteration ends."""
     x, tolerance = work[X * LANES + k], options[N_HEAD + OUTER_TOL]
     rounding_limit = MAX_ROUNDING_CORRECTION * options[LEAST]
@@ -361,7 +364,7 @@ def _end_iteration(options, work, memory, iteration, k):
 def solve_stages(code, settings, control, options, method_options, A, A2, c, work):
     """Solve for STAGES of a step X from their predictions in lanes with FINE = 1; clear FINE on divergence."""
     n = settings[N]
-    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     iterating, done = memory + ITERATING, memory + DONE
     for k in range(LANES):
         work[iterating * LANES + k] = work[FINE * LANES + k]
@@ -378,20 +381,20 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
         _correct_stages(settings, method_options, c.size, work)
         _store_largest_corrections(settings, A, A2, work)
         for k in range(LANES):
-            if work[iterating * LANES + k] == 1.0 and _end_iteration(options, work, memory, iteration, k):
+            if work[iterating * LANES + k] == 1.0 and _has_iteration_ended(options, work, memory, iteration, k):
                 work[iterating * LANES + k] = 0.0
     for k in range(LANES):
         work[FINE * LANES + k] = work[done * LANES + k]
 
 
 @compiled
-def state_from_stages(settings, b, bA, work):
+def store_state_from_stages(settings, b, bA, work):
     """Store the state at the time X after the beginning of the step in NEW, computed from STAGES."""
     n = settings[N]
-    _, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     s = b.size
-    begin, sums = vector_at(memory, n, BEGIN_Q), vector_at(memory, n, SUMS)
-    stage_rows, total = table(work, block_at(memory, n, s, STAGES), s, n), vectors(work, sums, n)
+    begin, sums = vector_offset(memory, n, BEGIN_Q), vector_offset(memory, n, SUMS)
+    stage_rows, total = matrix_view(work, block_offset(memory, n, s, STAGES), s, n), vector_range(work, sums, n)
     sum_rows(bA, stage_rows, total)
     for i in range(n * LANES):
         x, index = work[X * LANES + i % LANES], begin * LANES + i
@@ -410,23 +413,23 @@ def _allowed_error(control, work, state, new, j, entry, k):
 
 
 @compiled
-def _embedded_estimate(settings, method_options, A, work, memory):
+def _store_embedded_estimate(settings, method_options, A, work, memory):
     """Store the unfiltered error estimate of the embedded formula in E_Q and E_V."""
     n, s = settings[N], A.shape[0]
     offset = newton_options_index(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
-    stage_rows, begin = table(work, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
-    e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
+    stage_rows, begin = matrix_view(work, block_offset(memory, n, s, STAGES), s, n), vector_offset(memory, n, BEGIN_V)
+    e_q, e_v, sums = vector_offset(memory, n, E_Q), vector_offset(memory, n, E_V), vector_offset(memory, n, SUMS)
     total = 0.0
     for i in range(s):
         total += e[i]
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
     for j in range(s):  # the velocity at stage j changes by H sum_k A_jk a_k from the beginning of the step
-        sum_rows(A[j], stage_rows, vectors(work, sums, n))
+        sum_rows(A[j], stage_rows, vector_range(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[H * LANES + i % LANES] * work[sums * LANES + i]
-    sum_rows(e, stage_rows, vectors(work, sums, n))
+    sum_rows(e, stage_rows, vector_range(work, sums, n))
     for i in range(n * LANES):
         h = work[H * LANES + i % LANES]
         work[e_q * LANES + i] *= h
@@ -438,16 +441,16 @@ def _filter_errors(settings, method_options, s, work, memory):
     """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), z = gamma0 H, where J is the Jacobian of (v, F)."""
     n = settings[N]
     gamma0 = method_options[newton_options_index(s) + GAMMA0]
-    e_q, e_v, scratch = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
-    by_q = matrix_at(memory, n, s, DERIVATIVE_Q)
+    e_q, e_v, scratch = vector_offset(memory, n, E_Q), vector_offset(memory, n, E_V), vector_offset(memory, n, COMPLEX)
+    by_q = matrix_offset(memory, n, s, DERIVATIVE_Q)
     for i in range(n):
         for k in range(LANES):
             total = 0.0
             for j in range(n):
                 total += work[(by_q + i * n + j) * LANES + k] * work[(e_q + j) * LANES + k]
             work[(scratch + i) * LANES + k] = work[(e_v + i) * LANES + k] + gamma0 * work[H * LANES + k] * total
-    pivots = pivots_at(memory, n, s, count_systems(method_options, s), 0)
-    solve_lanes(work, matrix_at(memory, n, s, SYSTEMS), pivots, n, 0, scratch)
+    pivots = pivots_offset(memory, n, s, count_systems(method_options, s), 0)
+    solve_systems(work, matrix_offset(memory, n, s, SYSTEMS), pivots, n, 0, scratch)
     copy_vectors(work, scratch, e_v, n)
     for i in range(n * LANES):
         work[e_q * LANES + i] += gamma0 * work[H * LANES + i % LANES] * work[e_v * LANES + i]
@@ -456,8 +459,12 @@ def _filter_errors(settings, method_options, s, work, memory):
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
     """Return the error, in units of the tolerances, that a velocity error causes in lane k, see velocity_errors.py."""
-    raw, once, twice = vector_at(memory, n, UNFILTERED), vector_at(memory, n, FILTERED_ONCE), vector_at(memory, n, E_V)
-    begin = vector_at(memory, n, BEGIN_V)
+    raw, once, twice = (
+        vector_offset(memory, n, UNFILTERED),
+        vector_offset(memory, n, FILTERED_ONCE),
+        vector_offset(memory, n, E_V),
+    )
+    begin = vector_offset(memory, n, BEGIN_V)
     largest_error = largest_difference = largest_v = largest_a = 0.0
     for j in range(n):
         largest_v = max(largest_v, abs(work[(begin + j) * LANES + k]))
@@ -489,7 +496,7 @@ def _velocity_error(control, work, n, error_v, duration, state, new, k):
 @merged
 def _motion_time(control, work, n, memory, k):
     """Return the ratio (s) of the largest velocity to the largest acceleration in lane k, at most LONGEST_GAPS GAP."""
-    begin = vector_at(memory, n, BEGIN_V)
+    begin = vector_offset(memory, n, BEGIN_V)
     largest_v = largest_a = 0.0
     for j in range(n):
         largest_v = max(largest_v, abs(work[(begin + j) * LANES + k]))
@@ -502,8 +509,8 @@ def _motion_time(control, work, n, memory, k):
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
     """Increase ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
     n = settings[N]
-    state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    e_v, error_field, fine_copy = vector_at(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
+    state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
+    e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
     has_large_error = False
     for k in range(LANES):
         error = 0.0
@@ -514,16 +521,16 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
         has_large_error = has_large_error or error > 1.0
     if not has_large_error:
         return
-    by_q, by_v = matrix_at(memory, n, s, DERIVATIVE_Q), matrix_at(memory, n, s, DERIVATIVE_V)
-    matrix = matrix_at(memory, n, s, SYSTEMS)
+    by_q, by_v = matrix_offset(memory, n, s, DERIVATIVE_Q), matrix_offset(memory, n, s, DERIVATIVE_V)
+    matrix = matrix_offset(memory, n, s, SYSTEMS)
     for i in range(n * n):
         for k in range(LANES):
             z = STEPS_TO_DECAY * work[H * LANES + k]
             entry = -z * z * work[(by_q + i) * LANES + k] - z * work[(by_v + i) * LANES + k]
             work[(matrix + i) * LANES + k] = entry + (1.0 if i % (n + 1) == 0 else 0.0)
-    pivots = pivots_at(memory, n, s, count_systems(method_options, s), 0)
-    factor_lanes(work, matrix, pivots, n, 0)
-    solve_lanes(work, matrix, pivots, n, 0, e_v)
+    pivots = pivots_offset(memory, n, s, count_systems(method_options, s), 0)
+    factor_matrices(work, matrix, pivots, n, 0)
+    solve_systems(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[error_field * LANES + k]
         if work[FINE * LANES + k] == 1.0:  # in unstable motion, the filter may enlarge the error: use the smaller error
@@ -538,22 +545,22 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
 def _estimate_error(settings, control, method_options, A, work):
     """Store in ERROR the error estimate, in units of the tolerances, with stiff components suppressed by filters."""
     n, s = settings[N], A.shape[0]
-    state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     offset = newton_options_index(s)
-    e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
-    _embedded_estimate(settings, method_options, A, work, memory)
-    copy_vectors(work, e_v, vector_at(memory, n, UNFILTERED), n)
+    e_q, e_v = vector_offset(memory, n, E_Q), vector_offset(memory, n, E_V)
+    _store_embedded_estimate(settings, method_options, A, work, memory)
+    copy_vectors(work, e_v, vector_offset(memory, n, UNFILTERED), n)
     _filter_errors(settings, method_options, s, work, memory)
     tests_velocities = method_options[offset + TESTS_VELOCITIES] == 1.0
     fill_field(work, ERROR, 0.0)
     for j in range(n):
         atol, rtol = control[ATOL + j], control[RTOL]
-        enlarge(work, ERROR, e_q + j, RUNNING, state + j, new + j, atol, rtol)
+        raise_to_ratio(work, ERROR, e_q + j, RUNNING, state + j, new + j, atol, rtol)
         if tests_velocities:
-            enlarge(work, ERROR, e_v + j, RUNNING, state + n + j, new + n + j, atol, rtol)
+            raise_to_ratio(work, ERROR, e_v + j, RUNNING, state + n + j, new + n + j, atol, rtol)
     if tests_velocities:
         return
-    copy_vectors(work, e_v, vector_at(memory, n, FILTERED_ONCE), n)
+    copy_vectors(work, e_v, vector_offset(memory, n, FILTERED_ONCE), n)
     _filter_errors(settings, method_options, s, work, memory)
     for k in range(LANES):
         z = method_options[offset + GAMMA0] * work[H * LANES + k]
@@ -565,7 +572,7 @@ def _estimate_error(settings, control, method_options, A, work):
 @compiled
 def _store_stages(work, memory, n, s):
     """Copy STAGES of accepted steps to PREVIOUS, the basis of predictions for the next step and within this step."""
-    stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
+    stages, previous = block_offset(memory, n, s, STAGES), block_offset(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
             work[(memory + H_PREVIOUS) * LANES + k] = work[H * LANES + k]
@@ -580,10 +587,10 @@ def step_by_newton(code, settings, control, options, work, status, n_steps, with
     With `within`, compute instead the states at the time X after the beginning of the last accepted step.
     """
     n = settings[N]
-    state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     method_options = options[N_HEAD:]
     s, A, A2, b, bA, c = tableau_of(method_options)
-    start, begin = vector_at(memory, n, START), vector_at(memory, n, BEGIN_Q)
+    start, begin = vector_offset(memory, n, START), vector_offset(memory, n, BEGIN_Q)
     if not within:
         begin_control(options, control, work, n, state, a, start)
         for k in range(LANES):
@@ -592,14 +599,14 @@ def step_by_newton(code, settings, control, options, work, status, n_steps, with
         choose_steps(work, control, status, n_steps)
         copy_vectors(work, state, begin, 2 * n)
         copy_vectors(work, start, begin + 2 * n, n)
-        find_derivatives(code, settings, control, c, work)
+        compute_derivatives(code, settings, control, c, work)
     factor_systems_of_lanes(settings, method_options, s, work)
     predict_stages(settings, c, work, 0.0 if within else 1.0)
     solve_stages(code, settings, control, options, method_options, A, A2, c, work)
-    state_from_stages(settings, b, bA, work)
+    store_state_from_stages(settings, b, bA, work)
     set_end(work, control)
     if not within:
         _estimate_error(settings, control, method_options, A, work)
-        end_steps(code, settings, control, work, vector_at(memory, n, SUMS))
+        end_steps(code, settings, control, work, vector_offset(memory, n, SUMS))
         judge_steps(options, work, n, a, start, status)
         _store_stages(work, memory, n, s)

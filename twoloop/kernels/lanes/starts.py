@@ -30,15 +30,15 @@ from twoloop.kernels.lanes.layout import (
     N,
     copy_vectors,
     fill_field,
-    places_of,
+    offsets_in_work,
 )
 
-LEAST = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
-ITERATION_SHIFT = 1e-8  # replaces LEAST in inverse iterations, for which some eigenvalues of G G^T are zero
+DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
+ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
 MAX_REDUNDANT = 1e-4  # eigenvalue of G G^T below which a combination of rows counts as redundant
 # number of inverse iterations for each row of Z; few are enough, because the eigenvalues of redundant combinations of
 # rows are much smaller than the others
-REDUNDANT_ITERATIONS = 5
+N_REDUNDANT_ITERATIONS = 5
 GOLDEN = 0.6180339887498949  # fractional parts of its multiples are irregular start values of inverse iterations
 
 
@@ -71,7 +71,7 @@ def subtract_row(work, target, entries, pattern, i, y):
 
 
 @compiled
-def _scale(work, target, factor):
+def _multiply_vector(work, target, factor):
     """Multiply the vector `target` by the vector `factor` in each lane."""
     for k in range(LANES):
         work[target * LANES + k] *= work[factor * LANES + k]
@@ -98,7 +98,7 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
                 work[entry * LANES + k] *= -1.0
             subtract_products(work, entry, gram + i * n_rows, 1, gram + j * n_rows, 1, j)
             if i > j:
-                _scale(work, entry, gram + j * n_rows + j)
+                _multiply_vector(work, entry, gram + j * n_rows + j)
         for k in range(LANES):
             pivot = work[(gram + i * n_rows + i) * LANES + k]
             work[(gram + i * n_rows + i) * LANES + k] = 1.0 / np.sqrt(pivot) if pivot > 0.0 else np.nan
@@ -127,10 +127,10 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
             squared_norm = -work[reciprocal_norm * LANES + k]
             work[reciprocal_norm * LANES + k] = 1.0 / np.sqrt(squared_norm) if squared_norm != 0.0 else 1.0
         for e in range(pattern[i], pattern[i + 1]):
-            _scale(work, factors + e - pattern[0], reciprocal_norm)
+            _multiply_vector(work, factors + e - pattern[0], reciprocal_norm)
     if n_redundant > 0:
         _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors)
-    _cholesky(work, pattern, n_rows, n_redundant, row, factors, LEAST)
+    _cholesky(work, pattern, n_rows, n_redundant, row, factors, DIAGONAL_SHIFT)
 
 
 @compiled
@@ -144,29 +144,29 @@ def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factor
         z = Z + w * n_rows
         for i in range(n_rows):
             fill_field(work, z + i, 0.5 + (GOLDEN * (i + 1) * (w + 1)) % 1.0)
-        for _ in range(REDUNDANT_ITERATIONS):
-            normalise(work, z, n_rows, scratch)
-            _solve(work, n_rows, gram, z)
-            _remove_redundant(work, n_rows, w, Z, z, scratch)
-        normalise(work, z, n_rows, scratch)
+        for _ in range(N_REDUNDANT_ITERATIONS):
+            normalise_vector(work, z, n_rows, scratch)
+            _solve_with_gram(work, n_rows, gram, z)
+            _remove_redundant_components(work, n_rows, w, Z, z, scratch)
+        normalise_vector(work, z, n_rows, scratch)
         for k in range(LANES):
             if not work[scratch * LANES + k] < MAX_REDUNDANT:  # `scratch` is now the eigenvalue plus ITERATION_SHIFT
                 work[z * LANES + k] = np.nan
 
 
 @compiled
-def normalise(work, x, n_rows, scratch):
+def normalise_vector(work, x, n_rows, scratch):
     """Scale x (n_rows) to norm 1; store the reciprocal of the norm of x on entry in the vector `scratch`."""
     fill_field(work, scratch, 0.0)
     subtract_products(work, scratch, x, 1, x, 1, n_rows)
     for k in range(LANES):
         work[scratch * LANES + k] = 1.0 / np.sqrt(abs(work[scratch * LANES + k]))
     for i in range(n_rows):
-        _scale(work, x + i, scratch)
+        _multiply_vector(work, x + i, scratch)
 
 
 @compiled
-def _remove_redundant(work, n_rows, n_redundant, Z, x, scratch):
+def _remove_redundant_components(work, n_rows, n_redundant, Z, x, scratch):
     """Subtract from x (n_rows) its components along the rows of Z; overwrite the vector `scratch`."""
     for w in range(n_redundant):
         z = Z + w * n_rows
@@ -179,26 +179,26 @@ def _remove_redundant(work, n_rows, n_redundant, Z, x, scratch):
 
 
 @compiled
-def _solve(work, n_rows, factor, x):
+def _solve_with_gram(work, n_rows, factor, x):
     """Replace x (n_rows) by the solution y of G G^T y = x; `factor`: offset of the Cholesky factor of G G^T."""
     for i in range(n_rows):
         subtract_products(work, x + i, factor + i * n_rows, 1, x, 1, i)
-        _scale(work, x + i, factor + i * n_rows + i)
+        _multiply_vector(work, x + i, factor + i * n_rows + i)
     for i in range(n_rows - 1, -1, -1):
         subtract_products(work, x + i, factor + (i + 1) * n_rows + i, n_rows, x + i + 1, 1, n_rows - 1 - i)
-        _scale(work, x + i, factor + i * n_rows + i)
+        _multiply_vector(work, x + i, factor + i * n_rows + i)
 
 
 @compiled
-def along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
+def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
     """Replace x (n_rows) by the solution y of G G^T y = x, and store -G^T y in `out` (n).
 
     The rows of G are scaled to norm 1. First, the components of x along the rows of Z are removed.
     """
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
-    _remove_redundant(work, n_rows, n_redundant, Z, x, Z + n_redundant * n_rows)
-    _solve(work, n_rows, gram, x)
+    _remove_redundant_components(work, n_rows, n_redundant, Z, x, Z + n_redundant * n_rows)
+    _solve_with_gram(work, n_rows, gram, x)
     for j in range(n):
         fill_field(work, out + j, 0.0)
     for i in range(n_rows):
@@ -207,27 +207,27 @@ def along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
 
 
 @compiled
-def least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
+def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
     """Store the smallest d with G d = -x in `change` (n), not finite in lanes with dependent rows; overwrite x."""
     for i in range(n_rows):
-        _scale(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
-    along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
+        _multiply_vector(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
+    solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
 
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
-ROUNDING_FACTOR = 64.0  # largest residual of a constraint that holds, in rounding errors of its terms
-# difference between the projection of displaced positions and its prediction by C_q, relative to the displacement,
-# above which another assembly may be as near
+ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
+# another assembly may be as near as the projection if displaced positions are projected to positions that differ from
+# the prediction by C_q by more than this, relative to the displacement
 MAX_CURVATURE = 0.25
-SINGULAR = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
-WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `places_of_starts`
+MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
+N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
 # displacements of other guesses from the projected positions: factors of `correction`, the change from the first guess
 # to the projected positions, and of the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
-def places_of_starts(n, n_rows, n_entries, n_redundant):
+def offsets_in_memory(n, n_rows, n_entries, n_redundant):
     """Return the offsets, in vectors, of the parts of the method's memory, and its length.
 
     The memory begins with C and C_t (n_rows each), and the entries of G; the generated code writes these parts. The
@@ -244,13 +244,25 @@ def places_of_starts(n, n_rows, n_entries, n_redundant):
     weakest = correction + n
     displacement = weakest + n
     row = displacement + n
-    at_nearest = row + n
+    factors_at_nearest = row + n
     n_factors = n_entries + n_rows * (1 + n_rows + n_redundant) + 1
-    at_new = at_nearest + n_factors
-    return G, x, change, nearest, correction, weakest, displacement, row, at_nearest, at_new, at_new + n_factors
+    factors_at_new = factors_at_nearest + n_factors
+    return (
+        G,
+        x,
+        change,
+        nearest,
+        correction,
+        weakest,
+        displacement,
+        row,
+        factors_at_nearest,
+        factors_at_new,
+        factors_at_new + n_factors,
+    )
 
 
-_offsets = merged(places_of_starts)
+_memory_offsets = merged(offsets_in_memory)
 
 
 @merged
@@ -278,11 +290,13 @@ def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
 
 @compiled
 def _gauss_newton(code, settings, control, pattern, moves, work):
-    """Project the positions of NEW onto the constraints by steps of least change; clear RUNNING in lanes that fail."""
+    """Project the positions of NEW onto the constraints by Gauss-Newton steps; clear RUNNING where this fails."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
-    _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, row, _, at_new, _ = _offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + at_new
+    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
+    G, x, change, _, _, _, _, row, _, factors_at_new, _ = _memory_offsets(
+        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
+    )
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors_at_new
     for k in range(LANES):
         work[LEFT_TO_MOVE * LANES + k] = work[RUNNING * LANES + k]
     for _ in range(MAX_ITERATIONS):
@@ -290,7 +304,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
         code.rows(0, control, work)
         factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
         copy_vectors(work, memory, x, n_rows)
-        least_change(work, pattern, n, n_rows, n_redundant, factors, x, change)
+        solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change)
         n_left = 0.0
         for k in range(LANES):
             if work[LEFT_TO_MOVE * LANES + k] == 0.0:
@@ -314,11 +328,13 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _project_velocities(code, settings, control, pattern, moves, work):
-    """Project the velocities of NEW so that C_q v + C_t = 0; store results of `factor_gram` at offset `at_nearest`."""
+    """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at its positions."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
-    _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, row, at_nearest, _, _ = _offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + at_nearest
+    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
+    G, x, change, _, _, _, _, row, factors_at_nearest, _, _ = _memory_offsets(
+        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
+    )
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors_at_nearest
     fill_field(work, FINE, 1.0)
     code.rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
@@ -328,7 +344,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
             subtract_row(work, x + i, G, pattern, i, new + n)
             for k in range(LANES):
                 work[(x + i) * LANES + k] = work[(memory + n_rows + i) * LANES + k] - work[(x + i) * LANES + k]
-        least_change(work, pattern, n, n_rows, n_redundant, factors, x, change)
+        solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for j in range(n * LANES):
             work[(new + n) * LANES + j] += work[change * LANES + j]
     for k in range(LANES):
@@ -345,15 +361,15 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
     scratch = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
-    for _ in range(WEAKEST_ITERATIONS):
-        normalise(work, x, n_rows, scratch)
-        along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest)
-    normalise(work, x, n_rows, scratch)
-    min_eigenvalue = SINGULAR if n_redundant == 0 else MAX_REDUNDANT * n_rows
+    for _ in range(N_WEAKEST_ITERATIONS):
+        normalise_vector(work, x, n_rows, scratch)
+        solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest)
+    normalise_vector(work, x, n_rows, scratch)
+    min_eigenvalue = MIN_EIGENVALUE if n_redundant == 0 else MAX_REDUNDANT * n_rows
     for k in range(LANES):
         if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` is now the smallest eigenvalue
             work[RUNNING * LANES + k] = 0.0
-        factor = _largest_value(work, correction, n, k) / max(_largest_value(work, weakest, n, k), LEAST)
+        factor = _largest_value(work, correction, n, k) / max(_largest_value(work, weakest, n, k), DIAGONAL_SHIFT)
         for j in range(n):
             work[(weakest + j) * LANES + k] *= factor
 
@@ -362,12 +378,12 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
 def _check_other_guesses(code, settings, control, pattern, moves, work):
     """Clear RUNNING in lanes in which the projection of one of OTHER_GUESSES is far from its prediction by C_q."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
-    _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    _, x, change, nearest, correction, weakest, displacement, _, at_nearest, _, _ = _offsets(
+    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
+    _, x, change, nearest, correction, weakest, displacement, _, factors_at_nearest, _, _ = _memory_offsets(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
     x, change, nearest, correction = memory + x, memory + change, memory + nearest, memory + correction
-    weakest, displacement, factors = memory + weakest, memory + displacement, memory + at_nearest
+    weakest, displacement, factors = memory + weakest, memory + displacement, memory + factors_at_nearest
     _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest)
     for by_correction, by_weakest in OTHER_GUESSES:
         for j in range(n * LANES):
@@ -378,7 +394,7 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
             fill_field(work, x + i, 0.0)
             subtract_row(work, x + i, factors, pattern, i, displacement)
         # `change` becomes the component of the displacement that is normal to the constraints
-        along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
+        solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
             distance, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, nearest, n, k)
             for j in range(n):
@@ -400,8 +416,10 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
     module docstring; moves : (n,) 1 for coordinates that may change; numbers : (n_runs, n_numbers) data of the code.
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
-    _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])
-    _, _, _, nearest, correction, _, _, row, _, _, _ = _offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    _, new, _, _, _, _, own, memory = offsets_in_work(n, n_rows, numbers.shape[1])
+    _, _, _, nearest, correction, _, _, row, _, _, _ = _memory_offsets(
+        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
+    )
     fill_field(work, AHEAD, control[T0])
     for j in range(n):
         fill_field(work, memory + row + j, 0.0)

@@ -18,9 +18,9 @@ motion, and the fixed-point iteration converges as it does elsewhere.
 
 import numpy as np
 
-from twoloop.kernels.control.singular_positions import NEAR_LEAST, NEAR_MOST, near_share
+from twoloop.kernels.control.singular_positions import MAX_NEAR_RATIO, MIN_NEAR_RATIO, near_pivot_ratio
 from twoloop.kernels.control.step_size import commit_nothing, store_prediction
-from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compiled, kernel, merged
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, kernel, merged
 from twoloop.kernels.data.indices import (
     ATOL,
     BY_GENERAL,
@@ -48,16 +48,16 @@ CONVERGED_CHANGE = 0.01
 # STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
 MAX_SWEEPS, FEW_SWEEPS = 40, 12  # largest number of sweeps, and number of sweeps after which more nodes are left out
-DISTANCE_FACTOR = 2.0  # factor on the pivot below which nodes are left out, if FEW_SWEEPS sweeps do not converge
+DISTANCE_FACTOR = 2.0  # increase of the pivot below which nodes are left out, if FEW_SWEEPS sweeps do not converge
 MAX_LEFT_OUT = 9  # number of left-out nodes above which the step fails
-# indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of `begin`. BEGIN,
-# DURATION, END: times (s) of the polynomial of the last converged attempt (END = -inf: no polynomial)
+# indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of
+# `begin_polynomial`. BEGIN, DURATION, END (s): those of the polynomial of the last converged attempt; END = -inf: none
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
 # duration of the shortest and longest part of the polynomial that is taken as one step, relative to the polynomial
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 # longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
 NODE_GAP = 0.0767
-BACK = 0.4  # duration of the polynomial before the beginning of the step, relative to its whole duration
+BACKWARD_FRACTION = 0.4  # duration of the polynomial before the beginning of the step, relative to its whole duration
 ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error in the step size, and factor on the error estimate
 MOVED_WEIGHT = 0.5  # factor on the largest change of a stage by its projection, which counts as an error of the step
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
@@ -65,7 +65,9 @@ MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a ste
 # smallest allowed ratio of the pivot at the end of a step to the pivot below which nodes are left out; the pivot may be
 # smaller if it is not smaller than at the beginning
 END_MARGIN = 4.0
-REPEAT = 2.0  # error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
+REPEAT_FACTOR = (
+    2.0  # error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
+)
 TINY = 1e-300  # lower bound of divisors that may be zero
 
 
@@ -77,11 +79,11 @@ def options_array(A, b, c, inner_tol, theta):
 
 
 def memory_size(n):
-    """Return the length of `memory` for n coordinates."""
+    """Return the length of the array `memory` for n coordinates."""
     return (S + 7) * n + 3 * S + N_STORED
 
 
-def begin(memory, largest_pivot, earliest, base=None):
+def begin_polynomial(memory, largest_pivot, earliest, base=None):
     """Store the conditions for the next polynomial in `memory`, and discard the stored polynomial.
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). The
@@ -123,7 +125,7 @@ def _weighted_sum(weights, a, total):
 
 
 @compiled
-def _weight(tolerances, m, n, h, state):
+def _velocity_weight(tolerances, m, n, h, state):
     """Return the reciprocal of the allowed error of velocity number m in a step of size h from `state`."""
     q, v = abs(state[m]), abs(state[n + m])
     if tolerances[ESTIMATE] == 0.0:
@@ -134,7 +136,7 @@ def _weight(tolerances, m, n, h, state):
 
 
 @compiled
-def _error(tolerances, h, state, legendre, a, n_kept):
+def _estimate_error(tolerances, h, state, legendre, a, n_kept):
     """Return the error of a step, in units of the tolerances, estimated from the last Legendre coefficients.
 
     The coefficients are those of the accelerations a (S, n). The estimate is that of collocation_code.py. `n_kept`:
@@ -157,7 +159,7 @@ def _error(tolerances, h, state, legendre, a, n_kept):
         decay, far = late_max / middle_max, late_max / max(early_max, middle_max)
         if n_kept == S:
             decay *= np.sqrt(decay)
-        largest = max(largest, late_max * max(decay, far) * h * _weight(tolerances, m, n, h, state))
+        largest = max(largest, late_max * max(decay, far) * h * _velocity_weight(tolerances, m, n, h, state))
     return ERROR_FACTOR * largest
 
 
@@ -176,7 +178,7 @@ def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
 
 
 @compiled
-def _interpolate(j, c, left_out, a):
+def _interpolate_node(j, c, left_out, a):
     """Set a[j] to the value at node c[j] of the polynomial through the accelerations a at nodes with left_out = 0."""
     a[j, :] = 0.0
     for k in range(S):
@@ -213,7 +215,7 @@ def _choose_partition_at_end(f, w, t, q, pivot, near):
 
 
 @compiled
-def _weights_to_start(b, c, c0, weights_v, weights_q):
+def _fill_integral_weights(b, c, c0, weights_v, weights_q):
     """Store the weights (S) of accelerations in their integral (weights_v) and double integral (weights_q) to c0."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
@@ -228,8 +230,8 @@ def _weights_to_start(b, c, c0, weights_v, weights_q):
 
 
 @merged
-def _set_base(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
-    """Set q_0 and v_0 to the state at the beginning of the polynomial whose state at its fraction c0 is (q, v)."""
+def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
+    """Set (q_0, v_0) to the state at the beginning of the polynomial; (q, v) is its state at the time c0 h later."""
     _weighted_sum(weights_v, a, v_0)
     _weighted_sum(weights_q, a, q_0)
     for m in range(q.size):
@@ -238,7 +240,7 @@ def _set_base(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 
 @compiled
-def _extrapolate(j, c, last, a):
+def _extrapolate_node(j, c, last, a):
     """Set a[j] to the value at node c[j] of the polynomial through the accelerations at nodes `last` (-1: no node)."""
     a[j, :] = 0.0
     for k in last:
@@ -252,10 +254,10 @@ def _extrapolate(j, c, last, a):
 
 
 @compiled
-def _evaluate(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acceleration):
+def _evaluate_polynomial(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acceleration):
     """Set q, v and `acceleration` (n each) to the values of the polynomial `time` seconds after its beginning."""
     fraction = time / duration
-    _weights_to_start(b, c, fraction, weights_v, weights_q)
+    _fill_integral_weights(b, c, fraction, weights_v, weights_q)
     _weighted_sum(weights_v, a, v)
     _weighted_sum(weights_q, a, q)
     for m in range(q.size):
@@ -272,8 +274,8 @@ def _evaluate(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acc
 
 
 @merged
-def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
-    """Store the state [q, v, a] of `stage`, projected onto the constraints, in `new_state`; return the attempt.
+def _finish_piece(f, w, t, near, options, tolerances, stage, state, new_state):
+    """Store `stage`, a state [q, v, a], projected onto the constraints, in `new_state`; return an Attempt.
 
     The state is not projected if its smallest pivot is below `near`, or if its projection fails and `near` is positive.
     """
@@ -298,7 +300,7 @@ def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
     error = 0.0
     for k in range(w.dependent.size):
         m = w.dependent[k]
-        scale = allowed(tolerances, m, q[m], q1[m])
+        scale = allowed_error(tolerances, m, q[m], q1[m])
         error = max(error, abs(w.predicted[k] - q1[m]) / scale * tolerances[ESTIMATE])
     return Attempt(code, error, 0.0)
 
@@ -338,14 +340,16 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
     estimated, generated = tolerances[ESTIMATE] == 1.0, f.flags[STRAIGHT] == 1
-    near, duration = NEAR_LEAST, h
+    near, duration = MIN_NEAR_RATIO, h
     q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
     if estimated:
-        near = near_share(tolerances)
+        near = near_pivot_ratio(tolerances)
     if t + h <= stored[END] + ROUNDING * stored[DURATION] + 4.0 * np.spacing(abs(t)):
         begin, duration = stored[BEGIN], stored[DURATION]
-        _evaluate(t + h - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage)
-        return _end_of_piece(f, w, t + h, near * largest_pivot, options, tolerances, stage, state, new_state)
+        _evaluate_polynomial(
+            t + h - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage
+        )
+        return _finish_piece(f, w, t + h, near * largest_pivot, options, tolerances, stage, state, new_state)
     stored[END] = -np.inf
     if time_of_base <= t:
         duration = t + h - time_of_base
@@ -353,10 +357,10 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(q, q_base)
         copy(v, v_base)
         if estimated:
-            duration = h + max(0.0, min(h * BACK / (1.0 - BACK), t - earliest))
+            duration = h + max(0.0, min(h * BACKWARD_FRACTION / (1.0 - BACKWARD_FRACTION), t - earliest))
     begin, c0 = t + h - duration, (duration - h) / duration
     c_base = 0.0 if time_of_base <= t else c0  # time of the state `base`, as a fraction of the polynomial
-    _weights_to_start(b, c, c_base, weights_v, weights_q)
+    _fill_integral_weights(b, c, c_base, weights_v, weights_q)
     n_back = 0  # number of nodes before the state `base`
     while n_back < S and c[n_back] < c_base:
         n_back += 1
@@ -372,7 +376,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         change, moved = 0.0, 0.0
         chooses_nodes = sweep in (0, 2, FEW_SWEEPS)  # whether this sweep decides anew which nodes are left out
         if estimated and chooses_nodes and sweep == FEW_SWEEPS:
-            near = min(DISTANCE_FACTOR * near, NEAR_MOST)
+            near = min(DISTANCE_FACTOR * near, MAX_NEAR_RATIO)
         for i in range(S):
             # nodes in both directions from the state `base`, first backwards in time
             j = n_back - 1 - i if i < n_back else i
@@ -385,9 +389,9 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 if last_0 >= 0:
                     for k in range(S):
                         if k >= j if i >= n_back else k <= j or k >= n_back:
-                            _extrapolate(k, c, (last_0, last_1, last_2), a)
+                            _extrapolate_node(k, c, (last_0, last_1, last_2), a)
             time = begin + c[j] * duration
-            _set_base(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
+            _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
             _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
             code = DONE
             renews_partition = not generated or chooses_nodes
@@ -402,7 +406,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 code = renew_partition(f, w, time, q_stage)
             if left_out[j] == 1.0:
                 if not chooses_nodes:
-                    _interpolate(j, c, left_out, a)
+                    _interpolate_node(j, c, left_out, a)
                 continue
             while True:
                 if code == DONE:
@@ -418,7 +422,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 return Attempt(code, np.inf, 0.0)
             _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q1, v1)
             for m in range(n):
-                weight = _weight(tolerances, m, n, h, state)
+                weight = _velocity_weight(tolerances, m, n, h, state)
                 change = max(change, h * abs(a_stage[m] - a[j, m]) * weight)
                 moved = max(moved, abs(v1[m] - v_stage[m]) * weight, abs(q1[m] - q_stage[m]) / h * weight)
             copy(a_stage, a[j])
@@ -433,11 +437,11 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 return Attempt(OUTER_DIVERGED, np.inf, 0.0)
             for j in range(S):
                 if left_out[j] == 1.0:
-                    _interpolate(j, c, left_out, a)
+                    _interpolate_node(j, c, left_out, a)
         elif change <= CONVERGED_CHANGE or (sweep > 3 and STALL_RATIO * change_before <= change <= STALL_CHANGE):
             converged = True
             break
-        _set_base(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
+        _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
         # test the end of the step early: it is accurate enough after two sweeps, and most failing steps fail here
         if sweep == 1 and estimated:
             _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
@@ -449,20 +453,20 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(OUTER_DIVERGED, np.inf, 0.0)
     error = 0.0
     if estimated:
-        error = max(_error(tolerances, h, state, legendre, a, n_kept), MOVED_WEIGHT * moved)
+        error = max(_estimate_error(tolerances, h, state, legendre, a, n_kept), MOVED_WEIGHT * moved)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
-    _set_base(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
+    _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
     _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
     code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     if estimated:  # the next steps are pieces of this polynomial
         stored[BEGIN], stored[DURATION], stored[END] = begin, duration, t + h
-        return Attempt(DONE, REPEAT, REPEAT)
+        return Attempt(DONE, REPEAT_FACTOR, REPEAT_FACTOR)
     copy(q1, q_stage)
     copy(v1, v_stage)
-    return _end_of_piece(f, w, t + h, 0.0, options, tolerances, stage, state, new_state)
+    return _finish_piece(f, w, t + h, 0.0, options, tolerances, stage, state, new_state)
 
 
 CROSSING = Step(crossing_step, commit_nothing)

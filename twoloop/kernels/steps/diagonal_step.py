@@ -23,7 +23,7 @@ to the tolerance times the number of steps.
 import numpy as np
 
 from twoloop.kernels.control.step_size import departure, store_prediction
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed, compiled, inlined, kernel, merged
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import (
     BANDWIDTH,
     DONE,
@@ -433,10 +433,10 @@ def _estimate_error(f, w, options, memory, t, h, tolerances, state, new_state, V
     error = 0.0
     for i in range(n_dof):
         j = w.independent[i]
-        scale = allowed(tolerances, j, q[j], q1[j])
+        scale = allowed_error(tolerances, j, q[j], q1[j])
         error = max(error, abs(e_q[i]) / scale)
         if options[NEWTON_OFFSET + at.TESTS_VELOCITIES] == 1.0:
-            scale = allowed(tolerances, j, v[j], v1[j])
+            scale = allowed_error(tolerances, j, v[j], v1[j])
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, filtered_once)
     _filter_errors(f, w, options, memory, h, e_q, e_v)
@@ -503,7 +503,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
         for k in range(jump_weights.size):
             low, high = min(low, A_stage[k, j]), max(high, A_stage[k, j])
             total += jump_weights[k] * A_stage[k, j]
-        scale = allowed(tolerances, j, state[n + j], new_state[n + j])
+        scale = allowed_error(tolerances, j, state[n + j], new_state[n + j])
         deviation, widest = max(deviation, abs(total) / scale), max(widest, (high - low) / scale)
     if deviation == 0.0:
         return 0.0

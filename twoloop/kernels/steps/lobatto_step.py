@@ -20,7 +20,7 @@ from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.control.singular_positions import COLLAPSED, SHORT_STEP, SINGULAR_PIVOT
 from twoloop.kernels.control.step_size import count_step, departure, size_off_grid, store_prediction
 from twoloop.kernels.data import collocation as field
-from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REFUSED, places
+from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REFUSED, array_offsets
 from twoloop.kernels.data.common import (
     ATTEMPT,
     MANY,
@@ -28,7 +28,7 @@ from twoloop.kernels.data.common import (
     SLACK,
     Attempt,
     Step,
-    allowed,
+    allowed_error,
     compiled,
     inlined,
     kernel,
@@ -85,12 +85,12 @@ N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
 LEAST_TREND = 0.4  # lower bound of the trend: the ratio of successive values of the step size that the error allows
 MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
-_offsets = merged(places)
+_array_offsets = merged(array_offsets)
 
 
 def memory_size(n, n_iterated, n_rows):
     """Return the length of `memory` for n coordinates, with LANES more numbers for the alignment by `_aligned_view`."""
-    return places(n, n_iterated, n_rows)[-1] + LANES
+    return array_offsets(n, n_iterated, n_rows)[-1] + LANES
 
 
 @inlined
@@ -252,7 +252,7 @@ def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
     The lanes get the projected states, their accelerations and multipliers, and 1 in the field FINE if the projection
     converges, otherwise 0.
     """
-    begin_ends = _offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
+    begin_ends = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
         row = min(k, n_ends - 1)
         data[begin_ends + k] = out_t[row]
@@ -283,15 +283,15 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
     if it violates redundant rows. If constraints depend on time (`driven`), the change of velocities is checked, too:
     a large one may be due to a discontinuity of the drive between the nodes, see discontinuities.py.
     """
-    _, _, _, _, _, ends, end_a, lam, _ = _offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))
+    _, _, _, _, _, ends, end_a, lam, _ = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if data[field.FINE + k] == 0.0:
         return False
     for i in range(n):
         q = data[ends + LANES * (1 + i) + k]
-        if not abs(q - row[i]) <= allowed(tolerances, i, q, q):
+        if not abs(q - row[i]) <= allowed_error(tolerances, i, q, q):
             return False
         v = data[ends + LANES * (1 + n + i) + k]
-        if driven and not abs(v - row[n + i]) <= allowed(tolerances, i, v, v):
+        if driven and not abs(v - row[n + i]) <= allowed_error(tolerances, i, v, v):
             return False
     for i in range(n):
         row[i], row[n + i] = data[ends + LANES * (1 + i) + k], data[ends + LANES * (1 + n + i) + k]

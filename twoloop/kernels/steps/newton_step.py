@@ -14,7 +14,7 @@ Solving ODEs II, IV.8, for Radau IIA). In stiff problems, a fixed-point iteratio
 import numpy as np
 
 from twoloop.kernels.control.step_size import project_prediction
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed, compiled, kernel
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed_error, compiled, kernel
 from twoloop.kernels.data.indices import DONE, ESTIMATE, FORM, GENERATION, LEAST, N_OUTER, OUTER_DIVERGED, STATIC
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
@@ -165,9 +165,9 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
     error = 0.0
     for i in range(w.independent.size):
         j = w.independent[i]
-        error = max(error, abs(e_q[i]) / allowed(tolerances, j, q[j], q1[j]))
+        error = max(error, abs(e_q[i]) / allowed_error(tolerances, j, q[j], q1[j]))
         if options[offset + at.TESTS_VELOCITIES] == 1.0:
-            error = max(error, abs(e_v[i]) / allowed(tolerances, j, v[j], v1[j]))
+            error = max(error, abs(e_v[i]) / allowed_error(tolerances, j, v[j], v1[j]))
     if options[offset + at.TESTS_VELOCITIES] == 1.0:
         return error
     copy(e_v, filtered_once)

@@ -560,7 +560,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, G, K and D (one view each), a copy of w.counts, stiffness of rows (n_c)."""
+    """Return views of w.matrices: entries of M, of G, of K and of D, a copy of w.counts, stiffness (n_c) of rows."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_of(f.newton_program)[0].size - n_mass
@@ -578,7 +578,10 @@ def _sparse_derivative_views(f, w):
 
 @inlined
 def _sparse_scratch(f, w):
-    """Return scratch views of w.matrices: three vectors (n_q), pivot sizes (N), two complex vectors (N); N = n_q + n_c."""
+    """Return scratch views of w.matrices, with N = n_q + n_c.
+
+    The views are three vectors (n_q), pivot sizes (N), and two complex vectors (N).
+    """
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
     begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.control.step_size import commit_nothing
-from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compiled, inlined, kernel, merged
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
 # largest ratio of a step size to the previous one at which the previous step's polynomial predicts the stages
@@ -118,9 +118,9 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
         error = h * max(width, mismatch)
         if mismatch < width:
             error *= (mismatch / width) ** (options[POWER] / (s - 1.0))
-        scale = allowed(tolerances, m, v[m], v1[m])
+        scale = allowed_error(tolerances, m, v[m], v1[m])
         largest = max(largest, error / scale)
-        scale = allowed(tolerances, m, q[m], q1[m])
+        scale = allowed_error(tolerances, m, q[m], q1[m])
         largest = max(largest, h * error / scale)
     return largest
 
@@ -298,7 +298,7 @@ def _storage_after_vectors(memory, s, n, k):
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view (n) of `memory`: pivot indices of the filter matrix (k = 0), or for the eigenvalue k - 1 (k > 0)."""
+    """Return a view (n) of `memory`: pivot indices of the filter matrix (k = 0), or for eigenvalue k - 1 (k > 0)."""
     return _storage_after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 
@@ -327,7 +327,7 @@ class LazyStep(NamedTuple):
 LOADED_STEPS: dict[LazyStep, Step] = {}  # steps whose modules have been imported so far
 
 
-def loaded(step: Any) -> Any:
+def load_step(step: Any) -> Any:
     """Return `step`; for a LazyStep, return the Step in its module, which is imported if necessary."""
     if isinstance(step, LazyStep) and step not in LOADED_STEPS:
         LOADED_STEPS[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)

@@ -12,7 +12,7 @@ fast vibrations hardly counts. There are two exceptions:
 
 import numpy as np
 
-from twoloop.kernels.data.common import allowed, compiled
+from twoloop.kernels.data.common import allowed_error, compiled
 from twoloop.kernels.data.indices import DONE, GAP
 from twoloop.kernels.evaluation.inner_loop import evaluate
 from twoloop.kernels.linalg.dense import copy
@@ -67,8 +67,8 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
     error = 0.0
     for i in range(w.independent.size):
         j = w.independent[i]
-        scale_q = allowed(tolerances, j, state[j], new_state[j])
-        scale_v = allowed(tolerances, j, state[n + j], new_state[n + j])
+        scale_q = allowed_error(tolerances, j, state[j], new_state[j])
+        scale_v = allowed_error(tolerances, j, state[n + j], new_state[n + j])
         error = max(error, abs(e_v[i]) * min(duration / scale_q, 1.0 / scale_v))
     return error
 
@@ -138,7 +138,7 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_
     largest_difference, largest_product, largest_v = 0.0, 0.0, 0.0
     for i in range(w.independent.size):
         j = w.independent[i]
-        scale = allowed(tolerances, j, state[n + j], new_state[n + j])
+        scale = allowed_error(tolerances, j, state[n + j], new_state[n + j])
         product, difference = (e_v[i] - unfiltered[i]) / z, (a_moved[j] - a_base[j]) / factor
         largest_difference = max(largest_difference, abs(product - difference) / scale)
         largest_product = max(largest_product, abs(product) / scale, abs(difference) / scale)
