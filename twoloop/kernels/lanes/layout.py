@@ -192,7 +192,7 @@ def _add_four(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign * x * y to the vector `target`; read four lanes before writing any, as LLVM assumes overlapping vectors."""
+    """Add sign * x * y to the vector `target`, reading four lanes before writing any, because vectors might overlap."""
     for k in range(0, LANES, 4):
         _add_four(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
@@ -206,7 +206,7 @@ def _raised_value(work, target, error, factor, before, after, atol, rtol):
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """Raise `target` to the ratio |error| factor / (atol + rtol max(|before|, |after|)) in lanes in which it is smaller."""
+    """Raise `target` to |error| * factor / (atol + rtol * max(|before|, |after|)) in lanes in which it is smaller."""
     for k in range(0, LANES, 4):
         m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k
         m0 = _raised_value(work, m, e, f, x, y, atol, rtol)
