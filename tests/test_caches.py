@@ -17,7 +17,7 @@ from tests.processes import ROOT, run_python
 from twoloop.kernels.compile import caches as ownership
 from twoloop.kernels.compile import callbacks
 from twoloop.kernels.compile.caches import (
-    UNWRITABLE,
+    UNWRITABLE_CACHE_WARNING,
     CodeFiles,
     cache_folder,
     digests_of,
@@ -237,7 +237,10 @@ def test_without_a_writable_folder_callbacks_and_kernels_run_and_say_so_once(fol
     blocked = block_caches(folder)
     folder.write("kernels", KERNELS)
     values = folder.run(f"from kernels import *; print(twice(1.0), thrice(1.0))\n{RUN}", **blocked)
-    assert values.split() == ["2.0", "3.0", "one", "1.0", "0", "two", "1.0", "0"] and folder.said.count(UNWRITABLE) == 1
+    assert (
+        values.split() == ["2.0", "3.0", "one", "1.0", "0", "two", "1.0", "0"]
+        and folder.said.count(UNWRITABLE_CACHE_WARNING) == 1
+    )
 
 
 NAMED = {"values": 1.0}

@@ -13,7 +13,7 @@ import pytest
 from tests.compiled import HEAVY_PENDULUM, centripetal, circle, heavy, radius, unit_mass, weight
 from tests.problems import pendulum, quick
 from twoloop import ConstrainedSystem, Status, callback, solve_dae
-from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
+from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL_KINDS
 from twoloop.kernels.data.common import KIT, Functions
 from twoloop.kernels.data.indices import GIVEN
 from twoloop.mechanisms import four_bar
@@ -49,11 +49,13 @@ MAKERS = {"the class": ConstrainedSystem, "from_python": ConstrainedSystem.from_
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_kind_is_known_everywhere(kind):
     entry = KINDS[kind]
-    assert f'"{kind}" ({", ".join(entry.arguments)})' in callback.__doc__ and (kind in GIVEN) == (kind in OPTIONAL)
+    assert f'"{kind}" ({", ".join(entry.arguments)})' in callback.__doc__ and (kind in GIVEN) == (
+        kind in OPTIONAL_KINDS
+    )
     assert kind in Functions._fields and KIT.functions[kind] == entry.signature
     for name, maker in MAKERS.items():
         assert f"{kind} : " in maker.__doc__, name
-        assert (inspect.signature(maker).parameters[kind].default is None) == (kind in OPTIONAL)
+        assert (inspect.signature(maker).parameters[kind].default is None) == (kind in OPTIONAL_KINDS)
     assert tuple(inspect.signature(getattr(pendulum(), kind)).parameters) == ("t", *entry.state)
 
 

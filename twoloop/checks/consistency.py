@@ -356,7 +356,7 @@ def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) 
         return False
     evaluation = StartEvaluation(system)
     bits = evaluation.evaluate(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
-    if not bits & evaluation.flags.IN_ORDER:
+    if not bits & evaluation.flags.WELL_FORMED:
         return False
     place = (t, q.tobytes())
     system.remember_at("pattern", place, evaluation.pattern)

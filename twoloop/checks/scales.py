@@ -66,12 +66,12 @@ class Scales:
         same entries, and need not compute these scales again; elsewhere the mechanism may be much smaller. The latest
         MOST_PLACES positions are stored.
         """
-        from twoloop.kernels.evaluation.checks import NEAR_SHARE, NO_ENTRY
+        from twoloop.kernels.evaluation.checks import MAX_RELATIVE_DISTANCE, NO_ENTRY
 
         n, size = len(q), np.abs(jacobian)
         entries = (size > NO_ENTRY * size.max(axis=1, initial=0.0)[:, None]).ravel()
         known = system.derived.get("sizes", NONE).reshape(-1, 2 * n + entries.size)
-        away = (np.abs(known[:, n : 2 * n] - q) > NEAR_SHARE * known[:, :n]).any(axis=1)
+        away = (np.abs(known[:, n : 2 * n] - q) > MAX_RELATIVE_DISTANCE * known[:, :n]).any(axis=1)
         others = known[away | (known[:, 2 * n :] != entries).any(axis=1)][: MOST_PLACES - 1]
         system.derived["sizes"] = np.concatenate([self.by_coordinate(self.reach, jacobian), q, entries, others.ravel()])
 
@@ -191,7 +191,7 @@ def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, 
     check_callback(system, "jacobian", t, [places[0]])
     n, kit, defined = len(places), system.kit, np.ones(len(places), dtype=bool)
     rows = np.zeros((n, system.n_c + system.n_a, system.n_q))
-    evaluate = entry_point(start_checks.rows_at)
+    evaluate = entry_point(start_checks.rows_at_positions)
     try:
         evaluate(kit, t, places, system.n_c, rows.reshape(-1, system.n_q))
     except Exception:  # a position failed: evaluate one by one

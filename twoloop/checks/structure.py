@@ -69,7 +69,7 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
     basis, factors, shares = np.zeros((max_rank, n_q)), np.zeros((max_rank, max_rank)), np.zeros((n_rows, max_rank))
     gram, parts = np.zeros((n_rows, n_rows)), np.zeros((2, n_rows))
     room = basis, factors, kept, shares, gram, parts
-    n = entry_point(independent.least_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
+    n = entry_point(independent.least_norm_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
     inverse = entry_point(independent.norm_of_inverse)(factors, n, parts[0])
     return (x, left) if WEAK * math.sqrt(n_rows) * inverse < 1.0 else None
 

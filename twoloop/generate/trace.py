@@ -126,7 +126,7 @@ class _CallbackCopier(FunctionCopier):
 
     def _add_copy(self, helper: Any) -> None:
         super()._add_copy(helper)
-        self.known[id(helper)].__globals__.setdefault("type", _symbolic_type)
+        self.copies[id(helper)].__globals__.setdefault("type", _symbolic_type)
 
 
 def _symbolic_type(value: Any, *more: Any) -> Any:

@@ -67,7 +67,7 @@ from twoloop.kernels.evaluation.inner_loop import (
     prepare_mass,
     renew_partition,
 )
-from twoloop.kernels.evaluation.partition import CHANGED
+from twoloop.kernels.evaluation.partition import PARTITION_CHANGED
 from twoloop.kernels.linalg.dense import copy
 
 # error of a rejected step, in tolerances, above which a force is assumed to change suddenly within the step
@@ -126,7 +126,7 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
     code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
     if code == DONE and np.isfinite(error) and control[at.SYMMETRIC] == 1.0:
         code = adopt_midpoint_partition(f, w, t + 0.5 * size, state, new_state)
-        if code == CHANGED:
+        if code == PARTITION_CHANGED:
             f.settle(f, w, options, memory, tolerances, False)
             code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
     if code == DONE and not np.isfinite(error):

@@ -33,7 +33,7 @@ from twoloop.kernels.data.common import (
     merged,
 )
 from twoloop.kernels.data.indices import FORM, GAP, LONGEST_UNSEEN, LOOK, N_ACCEPTED, N_COUNTERS
-from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
+from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 
 ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate; a smaller correction is omitted
 
@@ -266,7 +266,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
     flags = _evaluate_start(checked_kit, b, t, q, v, sizes, b.shifts[: 0 if has_all_entries else len(b.shifts)])
     if has_all_entries and not _has_all_entries(b):
         flags = _evaluate_start(checked_kit, b, t, q, v, sizes, b.shifts)
-    if flags & IN_ORDER == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
+    if flags & WELL_FORMED == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
     if flags & CONSISTENT == 0 and not is_consistent:
         return IN_DOUBT

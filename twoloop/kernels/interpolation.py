@@ -21,7 +21,7 @@ from twoloop.kernels.data.indices import (
     SINGULAR,
 )
 from twoloop.kernels.evaluation.inner_loop import accelerations, find_tangents, renew_partition, restore
-from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
+from twoloop.kernels.evaluation.partition import min_pivot_ratio, partition_is_poor
 from twoloop.kernels.linalg.dense import copy, largest_of
 
 TABLE = types.int64[:, ::1]
@@ -33,7 +33,7 @@ MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest i
 MAX_VELOCITY_ROUNDING = 10.0
 # pivot within an interval, relative to the larger one of the pivots at its ends, below which the position is singular
 SINGULAR_PIVOT_RATIO = 0.01
-SINGULAR_PIVOT = 1e-5  # pivot below which any position is singular; for pivots see least_pivot in partition.py
+SINGULAR_PIVOT = 1e-5  # pivot below which any position is singular; for pivots see min_pivot_ratio in partition.py
 # a position whose pivot is below WEAK_PIVOT is singular, too, if the velocities of the polynomials nearly satisfy the
 # constraints: if their violation, about pivot times change by the projection, is below RESIDUAL tolerances
 RESIDUAL, WEAK_PIVOT = 10.0, 0.05
@@ -136,9 +136,9 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
     n, largest = w.Q.size, 0.0
     for r in (i, last):
         if renew_partition(f, w, t[r], states[r, :n]) == DONE:
-            largest = max(largest, least_pivot(f, w, t[r], states[r, :n]))
+            largest = max(largest, min_pivot_ratio(f, w, t[r], states[r, :n]))
     code = renew_partition(f, w, time, q)
-    pivot = least_pivot(f, w, time, q) if code == DONE else 0.0
+    pivot = min_pivot_ratio(f, w, time, q) if code == DONE else 0.0
     return pivot < max(SINGULAR_PIVOT_RATIO * largest, SINGULAR_PIVOT, min(RESIDUAL / change, WEAK_PIVOT))
 
 

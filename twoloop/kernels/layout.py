@@ -151,7 +151,7 @@ def _static_shapes(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[
         "predicted": (n_q,),
         "mass_values": (static.n_mass_values,),
         "jacobian_values": (static.n_jacobian_values,),
-        "counts": (n_c,),
+        "is_independent": (n_c,),
         "factors": (static.n_factors,),
         "pivot_sizes": (n,),
         "unknowns": (n,),
@@ -211,7 +211,7 @@ def _layout(
         "predicted": (r,),
         "notes": (N_NOTES,),
         "nodes": (n_nodes,),
-        **dict.fromkeys(("mass_values", "jacobian_values", "counts", "factors", "pivot_sizes"), (0,)),
+        **dict.fromkeys(("mass_values", "jacobian_values", "is_independent", "factors", "pivot_sizes"), (0,)),
         **dict.fromkeys(("unknowns", "solutions"), (0,)),
         "matrices": (n_matrices,),  # must be the last array, as it keeps no data from one step to the next
     }

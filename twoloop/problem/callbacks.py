@@ -332,7 +332,7 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
     # numba stores machine code beside the file that the code object names: name that of the user's function
     in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
     in_place.__qualname__ = f"{user.py_func.__qualname__}.{kind}"
-    return compile_callback(kind, in_place, watched, named=user.py_func)
+    return compile_callback(kind, in_place, watched, named_function=user.py_func)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ import numpy as np
 
 from twoloop.checks.arguments import Array, shown
 from twoloop.kernels.compile.caches import (
-    UNWRITABLE,
+    UNWRITABLE_CACHE_WARNING,
     digests_of,
     make_trusted_folder,
     read_trusted,
@@ -138,7 +138,7 @@ def _write(path: Path, text: str) -> None:
         write_trusted(unfinished, text.encode("utf-8"))
         unfinished.replace(path)
     except OSError:
-        warn_once(UNWRITABLE)
+        warn_once(UNWRITABLE_CACHE_WARNING)
         with suppress(OSError):
             unfinished.unlink()
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from twoloop.checks.arguments import Array, check_flag, check_number, check_real, check_size, check_text, shaped, shown
 from twoloop.checks.callbacks import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
-from twoloop.kernels.compile.callbacks import KINDS, STATE
+from twoloop.kernels.compile.callbacks import KINDS, STATE_SIZES
 from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.kernels.data.common import PROGRAMS, Functions, Kit
 from twoloop.kernels.data.indices import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS
@@ -460,9 +460,10 @@ class ConstrainedSystem:
         arrays = []
         for name, value in zip(entry.state, state, strict=True):
             array = check_real(name, value)
-            if array.shape != (n := getattr(self, STATE[name]),):
+            if array.shape != (n := getattr(self, STATE_SIZES[name]),):
                 raise ValueError(
-                    f"{name} must have shape ({n},), as {STATE[name]} = {n} in {self.name!r}; given {shaped(array)}"
+                    f"{name} must have shape ({n},), as {STATE_SIZES[name]} = {n} in {self.name!r}; "
+                    f"given {shaped(array)}"
                 )
             arrays.append(np.ascontiguousarray(array))
         check_callback(self, kind, t, arrays)

@@ -26,7 +26,7 @@ from twoloop.kernels.linalg.band import banded_pays, lapack_addresses
 from twoloop.kernels.linalg.saddle_point import sparse_pays
 from twoloop.kernels.linalg.sparse_lu import column_groups, grouped_entries, newton_program
 from twoloop.kernels.linalg.symbolic_factorization import (
-    N_OFF,
+    N_OFF_DIAGONAL,
     N_PIVOTS,
     N_UPDATES,
     Entries,
@@ -190,7 +190,7 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
     program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff)
     if program is None or program[N_UPDATES] > MAX_STATIC_SHARE * _dense_cost(system.n_q, system.n_c):
         return None
-    n_factors = int(program[N_PIVOTS] + program[N_OFF] + 1)
+    n_factors = int(program[N_PIVOTS] + program[N_OFF_DIAGONAL] + 1)
     static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
     return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, bodies, stiff))
 
@@ -453,6 +453,6 @@ def _set_constants(work: common.Work, system: ConstrainedSystem, form: StaticFor
     """Fill the arrays of a workspace that are constant during a run in the static form."""
     work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
     work.dependent[:] = work.independent[:] = np.arange(system.n_q)
-    work.counts[:] = 1.0
+    work.is_independent[:] = 1.0
     if system.constant_mass and "mass" not in system.entries:
         work.mass_values[:] = system.mass(0.0, q0)[form.mass]

@@ -4,7 +4,10 @@ import re
 
 import numba
 
-LEAST, BELOW = (0, 61), (0, 69)  # supported versions of numba: from LEAST to below BELOW, as in pyproject.toml
+MIN_VERSION, END_VERSION = (
+    (0, 61),
+    (0, 69),
+)  # supported versions of numba: from MIN_VERSION to below END_VERSION, as in pyproject.toml
 
 
 def check_version(installed: str) -> None:
@@ -15,8 +18,8 @@ def check_version(installed: str) -> None:
     ImportError
         If the version is not supported; the message gives the supported versions.
     """
-    if not LEAST <= tuple(int(number) for number in re.findall(r"\d+", installed)[:2]) < BELOW:
-        least, below = (".".join(map(str, version)) for version in (LEAST, BELOW))
+    if not MIN_VERSION <= tuple(int(number) for number in re.findall(r"\d+", installed)[:2]) < END_VERSION:
+        least, below = (".".join(map(str, version)) for version in (MIN_VERSION, END_VERSION))
         raise ImportError(
             f"twoloop uses private parts of numba, and supports versions from {least} to below {below}; numba "
             f"{installed} is installed: pip install 'numba>={least},<{below}'"

@@ -39,13 +39,13 @@ from numba.misc.appdirs import AppDirs
 from twoloop.kernels.compile.dependencies import Digest, NotDigestible, closure_values, reachable_names
 from twoloop.kernels.compile.linking import forget_compiled, jitable_templates
 
-ADVICE = (
+ACCESS_ADVICE = (
     "Code is loaded only from what belongs to you or root and no other user can write: take that right away (chmod "
     "go-w) or set NUMBA_CACHE_DIR to a folder of your own in folders that others cannot write"
 )
 
 
-class Untrusted(OSError):
+class UntrustedFile(OSError):
     """Error for a file that another user could have written; the text gives the reason."""
 
 
@@ -56,13 +56,13 @@ def read_trusted(path: Path) -> bytes:
     ------
     OSError
         If there is no such file.
-    Untrusted
+    UntrustedFile
         If another user could have written the file; a warning is printed on stderr.
     """
     with path.open("rb") as file:
         if reason := _reason_of_mode(os.fstat(file.fileno())):
-            _warn_first(f"twoloop: {path} {reason}, and is not loaded but compiled again. {ADVICE}")
-            raise Untrusted(f"{path} {reason}")
+            _warn_first(f"twoloop: {path} {reason}, and is not loaded but compiled again. {ACCESS_ADVICE}")
+            raise UntrustedFile(f"{path} {reason}")
         return file.read()
 
 
@@ -93,7 +93,9 @@ def trusted_folder(folder: Path) -> Path:
     replacement = Path(AppDirs(appname="twoloop", appauthor=False).user_cache_dir) / "code" / subfolder
     if reason_to_distrust(replacement):
         replacement = Path(_temporary_folder()) / subfolder
-    _warn_first(f"twoloop: no code is loaded from {folder}: {reason}. It is kept in {replacement} instead. {ADVICE}")
+    _warn_first(
+        f"twoloop: no code is loaded from {folder}: {reason}. It is kept in {replacement} instead. {ACCESS_ADVICE}"
+    )
     return replacement
 
 
@@ -149,14 +151,14 @@ def _is_private_group(gid: int) -> bool:
     return is_own and set(group.gr_mem) <= {"root", user.pw_name}
 
 
-_temporary: list[tempfile.TemporaryDirectory[str]] = []  # the temporary folder of this process, once it exists
+_temporary_folders: list[tempfile.TemporaryDirectory[str]] = []  # the temporary folder of this process, once it exists
 
 
 def _temporary_folder() -> str:
     """Return the temporary folder of this process, which is created at the first call."""
-    if not _temporary:
-        _temporary.append(tempfile.TemporaryDirectory(prefix="twoloop-"))
-    return _temporary[0].name
+    if not _temporary_folders:
+        _temporary_folders.append(tempfile.TemporaryDirectory(prefix="twoloop-"))
+    return _temporary_folders[0].name
 
 
 _warnings: list[str] = []  # the warning that `_warn_first` has printed, if any
@@ -181,14 +183,14 @@ class CodeFiles:
     same time.
     """
 
-    def __init__(self, folder: Path, name: str, stamp: Any, limited: bool = False):
-        self.folder, self.name, self.limited = folder, name, limited
-        self.made_of = numba.__version__, stamp
+    def __init__(self, folder: Path, name: str, stamp: Any, is_limited: bool = False):
+        self.folder, self.name, self.is_limited = folder, name, is_limited
+        self.origin = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
         """Write the data for a key to its file, which replaces the previous file for this key."""
-        content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
-        path = self._path(key)
+        content = pickle.dumps((repr((*self.origin, key)), dumps(data)))
+        path = self._path_for_key(key)
         temporary_path = path.with_suffix(f".{uuid.uuid4().hex}")
         make_trusted_folder(self.folder)
         try:
@@ -196,35 +198,35 @@ class CodeFiles:
             temporary_path.replace(path)
         finally:
             temporary_path.unlink(missing_ok=True)
-        if self.limited:
-            for old in sorted(self._all_files(), key=_time_written)[:-MAX_ON_DISK]:
+        if self.is_limited:
+            for old in sorted(self._paths_of_files(), key=_time_written)[:-MAX_ON_DISK]:
                 old.unlink(missing_ok=True)
 
-    def has(self, key: Any) -> bool:
+    def has_file(self, key: Any) -> bool:
         """Return whether there is a file for a key, which may be damaged or out of date."""
-        return self._path(key).exists()
+        return self._path_for_key(key).exists()
 
     def load(self, key: Any) -> Any:
         """Return the data for a key, or None if the file is missing, damaged or out of date."""
         try:
-            content = read_trusted(self._path(key))
+            content = read_trusted(self._path_for_key(key))
         except OSError:
             return None
         if hashlib.sha256(content[CHECKSUM_SIZE:]).digest() != content[:CHECKSUM_SIZE]:
             return None
-        made_of, data = pickle.loads(content[CHECKSUM_SIZE:])
-        return pickle.loads(data) if made_of == repr((*self.made_of, key)) else None
+        origin, data = pickle.loads(content[CHECKSUM_SIZE:])
+        return pickle.loads(data) if origin == repr((*self.origin, key)) else None
 
     def flush(self) -> None:
         """Remove the files of all keys."""
-        for path in self._all_files():
+        for path in self._paths_of_files():
             path.unlink(missing_ok=True)
 
-    def _all_files(self) -> list[Path]:
+    def _paths_of_files(self) -> list[Path]:
         """Return the paths of the files of all keys."""
         return list(self.folder.glob(f"{glob.escape(self.name)}.*.nbc"))
 
-    def _path(self, key: Any) -> Path:
+    def _path_for_key(self, key: Any) -> Path:
         """Return the path of the file for a key."""
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
 
@@ -237,19 +239,19 @@ def _time_written(path: Path) -> float:
         return 0.0
 
 
-UNWRITABLE = (
+UNWRITABLE_CACHE_WARNING = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that only you can write"
 )
 MAX_IN_MEMORY = 50  # largest number of entries of a BoundedCache, in memory
 # numba's class that finds the cache folder in NUMBA_CACHE_DIR; it has a private name in numba 0.61
-_LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
+_LOCATOR_CLASS: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 
 def compile_cached(
     function: Callable[..., Any],
     signature: Any,
-    watched: tuple[str, str] | None,
+    digests: tuple[str, str] | None,
     *,
     announcement: str = "",
     **options: Any,
@@ -262,7 +264,7 @@ def compile_cached(
         Function to compile.
     signature : numba signature
         Its only signature.
-    watched : (str, str) or None
+    digests : (str, str) or None
         Digests of everything on which the machine code depends, see `digests_of`. A file with another first digest is
         out of date. The second digest is part of the key of a file, because functions with the same source may have
         different closure variables. None: the machine code is not stored.
@@ -271,14 +273,14 @@ def compile_cached(
     **options
         Options of numba.njit.
     """
-    dispatcher = njit(**options)(with_unique_name(function, watched))
+    dispatcher = njit(**options)(with_unique_name(function, digests))
     function = dispatcher.py_func
-    if watched is not None:
+    if digests is not None:
         try:
-            dispatcher._cache = _Cache(function, *watched, announcement)
+            dispatcher._cache = _CompiledFunctionCache(function, *digests, announcement)
         except RuntimeError:  # numba finds no folder, for example for functions typed at a prompt
             if Path(inspect.getfile(function)).exists():
-                warn_once(UNWRITABLE)
+                warn_once(UNWRITABLE_CACHE_WARNING)
     with garbage_collection_off():
         dispatcher.compile(signature)
     dispatcher.disable_compile()
@@ -329,33 +331,35 @@ def cache_folder(package: types.ModuleType) -> Path | None:
         return None
 
 
-def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
+def with_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
     """Return a copy of a nested function or lambda with a unique name; return any other function unchanged.
 
     Numba's symbols consist of the qualified name of a function and the number of functions compiled so far in the
     process. If two closures with the same name are compiled by different processes, their symbols may be equal: then
     both run the code that is loaded first.
     """
-    if watched is None or "<" not in function.__qualname__:
+    if digests is None or "<" not in function.__qualname__:
         return function
     code = function.__code__
     copy = types.FunctionType(
         code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
     )
     copy.__kwdefaults__, copy.__module__ = function.__kwdefaults__, function.__module__
-    suffix = hashlib.sha256(repr((watched, code.co_filename, code.co_firstlineno)).encode()).hexdigest()
+    suffix = hashlib.sha256(repr((digests, code.co_filename, code.co_firstlineno)).encode()).hexdigest()
     copy.__qualname__ = f"{function.__qualname__}.{suffix[:16]}"
     return copy
 
 
-class _Cache(FunctionCache):
+class _CompiledFunctionCache(FunctionCache):
     """Numba's cache of a function, with the digests and files of twoloop; after an error, the function is compiled."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         if cache_dir:  # numba would create the folder with access rights that depend on the umask
             with suppress(OSError):
-                make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
+                make_trusted_folder(
+                    Path(cache_dir, _LOCATOR_CLASS.get_suitable_cache_subpath(inspect.getfile(function)))
+                )
         super().__init__(function)
         source_stamp = self._cache_file._source_stamp
         folder = trusted_folder(Path(self._cache_path))
@@ -382,7 +386,7 @@ class _Cache(FunctionCache):
         try:
             super().save_overload(sig, data)
         except OSError:
-            warn_once(UNWRITABLE)
+            warn_once(UNWRITABLE_CACHE_WARNING)
 
 
 def sources_folder() -> Path:
@@ -405,13 +409,13 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
     """Return a decorator like numba.njit(**options), with a cache on disk; the first call compiles the function."""
 
     def decorate(function: Callable[..., Any]) -> Dispatcher:
-        watched = digests_of(function)
-        dispatcher = njit(**options)(with_unique_name(function, watched))
-        if watched is not None:
+        digests = digests_of(function)
+        dispatcher = njit(**options)(with_unique_name(function, digests))
+        if digests is not None:
             # so that a callback that uses this function as a closure variable does not compile the function again
-            _COMPILED_DIGESTS[dispatcher] = watched
+            _COMPILED_DIGESTS[dispatcher] = digests
             with suppress(RuntimeError):  # no folder can be written
-                dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
+                dispatcher._cache = _CompiledFunctionCache(dispatcher.py_func, *digests, "")
         return dispatcher
 
     return decorate
@@ -425,10 +429,10 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
     uses are hashed, too; numba's cache of the helper is replaced by that of twoloop. Returns None if a value may change
     without a change of the digest.
     """
-    watched, helpers = _digests_and_helpers(function)
+    digests, helpers = _digests_and_helpers(function)
     for each in helpers:
         _use_twoloop_cache(each)
-    return watched
+    return digests
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
@@ -438,10 +442,10 @@ def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] 
     try:
         code.add_function(function, enclosed=False)
         closure.add(closure_values(function))
-        watched = code.hash.hexdigest(), closure.hash.hexdigest()
+        digests = code.hash.hexdigest(), closure.hash.hexdigest()
     except NotDigestible:
-        watched = None
-    return watched, [*code.helpers, *closure.helpers]
+        digests = None
+    return digests, [*code.helpers, *closure.helpers]
 
 
 def helper(function: Callable[..., Any]) -> Any:
@@ -467,17 +471,19 @@ def _use_twoloop_cache(helper: Any) -> None:
     Numba's cache does not notice changes of functions in other files that the helper calls. Functions compiled later
     use the code of the helper that numba compiled or loaded first, perhaps before the first call of this function.
     """
-    watched, compiled = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
-    has_changed = compiled is not None and compiled != watched
-    if watched is not None:
-        _COMPILED_DIGESTS[helper] = watched
+    digests, compiled = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
+    has_changed = compiled is not None and compiled != digests
+    if digests is not None:
+        _COMPILED_DIGESTS[helper] = digests
     if jitable_templates(helper):
         if has_changed or compiled is None:
             forget_compiled(helper)
         return
-    if isinstance(helper._cache, FunctionCache) and (has_changed or not isinstance(helper._cache, _Cache)):
+    if isinstance(helper._cache, FunctionCache) and (
+        has_changed or not isinstance(helper._cache, _CompiledFunctionCache)
+    ):
         try:
-            helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
+            helper._cache = NullCache() if digests is None else _CompiledFunctionCache(helper.py_func, *digests, "")
         except RuntimeError:
             helper._cache = NullCache()
     if helper.overloads and (has_changed or (compiled is None and (helper._can_compile or helper.stats.cache_hits))):

@@ -110,21 +110,23 @@ def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ = numba.types.Array(f8, 1, "C", readonly=True)  # type of a read-only vector, with the memory layout of VECTOR
+READ_ONLY_VECTOR = numba.types.Array(
+    f8, 1, "C", readonly=True
+)  # type of a read-only vector, with the memory layout of VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
 # sizes of the vectors among the arguments of callbacks, other than p; lam are the multipliers of C, not those of A
-STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}
+STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
 @dataclass(frozen=True)
-class Kind:
+class CallbackKind:
     """Describe one kind of callback.
 
     Attributes
     ----------
     state : tuple of str
-        Arguments between t and p, keys of `STATE`.
+        Arguments between t and p, keys of `STATE_SIZES`.
     output : str
         Name of the array that the callback fills.
     shape : tuple of str
@@ -175,7 +177,7 @@ class Kind:
     @property
     def read_only_signature(self) -> Any:
         """Return the signature that numba compiles, in which all arrays except for the outputs are read-only."""
-        return self._signature(READ)
+        return self._signature(READ_ONLY_VECTOR)
 
     def _signature(self, input_type: Any) -> Any:
         """Return the signature in which all arrays except for the outputs have the type `input_type`."""
@@ -189,16 +191,18 @@ class Kind:
 
 
 KINDS = {
-    "mass": Kind(
+    "mass": CallbackKind(
         ("q",),
         "M",
         ("n_q", "n_q"),
         "the mass matrix M",
         "Symmetric; positive definite on the velocities that the constraints allow.",
     ),
-    "force": Kind(("q", "v"), "Q", ("n_q",), "the force Q"),
-    "constraint": Kind(("q",), "C", ("n_c",), "the constraints C", "None: n_c is 0.", absent="zeros", needed_by="n_c"),
-    "jacobian": Kind(
+    "force": CallbackKind(("q", "v"), "Q", ("n_q",), "the force Q"),
+    "constraint": CallbackKind(
+        ("q",), "C", ("n_c",), "the constraints C", "None: n_c is 0.", absent="zeros", needed_by="n_c"
+    ),
+    "jacobian": CallbackKind(
         ("q",),
         "Cq",
         ("n_c", "n_q"),
@@ -209,7 +213,7 @@ KINDS = {
         "about 1e-13 of the largest term in the constraint; if gamma is left out, too, it is good to about 1e-9.",
         absent="differences",
     ),
-    "constraint_rate": Kind(
+    "constraint_rate": CallbackKind(
         ("q",),
         "Ct",
         ("n_c",),
@@ -217,7 +221,7 @@ KINDS = {
         "None: the constraints do not depend on time.",
         absent="zeros",
     ),
-    "gamma": Kind(
+    "gamma": CallbackKind(
         ("q", "v"),
         "Qd",
         ("n_c",),
@@ -225,7 +229,7 @@ KINDS = {
         "None: exact if C_q and C_t run on symbols, otherwise by differences of them along the motion.",
         absent="kernels",
     ),
-    "force_by_q": Kind(
+    "force_by_q": CallbackKind(
         ("q", "v"),
         "K",
         ("n_q", "n_q"),
@@ -236,7 +240,7 @@ KINDS = {
         "at a tolerance steps are the same, but fixed steps in which bodies turn far may fail to converge.",
         absent="zeros",
     ),
-    "force_by_v": Kind(
+    "force_by_v": CallbackKind(
         ("q", "v"),
         "D",
         ("n_q", "n_q"),
@@ -244,7 +248,7 @@ KINDS = {
         "None beside force_by_q: the force does not depend on v.",
         absent="zeros",
     ),
-    "reaction_by_q": Kind(
+    "reaction_by_q": CallbackKind(
         ("q", "lam"),
         "R",
         ("n_q", "n_q"),
@@ -252,7 +256,7 @@ KINDS = {
         "None: by differences of C_q, none where C_q does not change.",
         absent="zeros",
     ),
-    "nonholonomic": Kind(
+    "nonholonomic": CallbackKind(
         ("q",),
         "A",
         ("n_a", "n_q"),
@@ -261,10 +265,10 @@ KINDS = {
         absent="zeros",
         needed_by="n_a",
     ),
-    "nonholonomic_rate": Kind(
+    "nonholonomic_rate": CallbackKind(
         ("q",), "b", ("n_a",), "b of the non-holonomic constraints A v + b = 0", "None: zero.", absent="zeros"
     ),
-    "nonholonomic_gamma": Kind(
+    "nonholonomic_gamma": CallbackKind(
         ("q", "v"),
         "Qa",
         ("n_a",),
@@ -272,7 +276,7 @@ KINDS = {
         "None: exact if A and b run on symbols, otherwise by differences of them along the motion.",
         absent="kernels",
     ),
-    "kinematics": Kind(
+    "kinematics": CallbackKind(
         ("q", "v"),
         "C",
         ("n_c",),
@@ -281,7 +285,7 @@ KINDS = {
         absent="zeros",
         more=(("Cq", ("n_c", "n_q")), ("Ct", ("n_c",)), ("Qd", ("n_c",))),
     ),
-    "mass_values": Kind(
+    "mass_values": CallbackKind(
         ("q",),
         "values",
         ("n_mass_values",),
@@ -290,7 +294,7 @@ KINDS = {
         "found by sparse factors. Both triangles.",
         absent="zeros",
     ),
-    "jacobian_values": Kind(
+    "jacobian_values": CallbackKind(
         ("q",),
         "values",
         ("n_jacobian_values",),
@@ -300,7 +304,7 @@ KINDS = {
         absent="zeros",
     ),
 }
-OPTIONAL = tuple(name for name, kind in KINDS.items() if kind.optional)
+OPTIONAL_KINDS = tuple(name for name, kind in KINDS.items() if kind.optional)
 
 
 def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]], Dispatcher]:
@@ -369,43 +373,43 @@ if callback.__doc__:  # python -OO removes docstrings
 
 
 # options of numba: a division by zero yields an infinity, as in the kernels
-_OPTIONS: dict[str, Any] = {"error_model": "numpy"}
+_NUMBA_OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 
 
 def compile_callback(
     kind: str,
     function: Callable[..., Any],
-    watched: tuple[str, str] | None,
-    named: Callable[..., Any] | None = None,
+    digests: tuple[str, str] | None,
+    named_function: Callable[..., Any] | None = None,
     allocates: bool = True,
 ) -> Dispatcher:
     """Compile a function that fills its arrays in place as a callback; raise TypeError if it cannot be compiled.
 
-    `watched`: see `compile_cached`; `named`: function whose name is in the error message, by default `function`;
+    `digests`: see `compile_cached`; `named_function`: the function that error messages name, by default `function`;
     `allocates`: see `callback`.
     """
     compiled, more = with_bounds_checks(function)
-    options = {**_OPTIONS, **more} if allocates else {**_OPTIONS, **more, "_nrt": False}
-    if watched is not None:
-        watched = f"{watched[0]} {options}", watched[1]
+    options = {**_NUMBA_OPTIONS, **more} if allocates else {**_NUMBA_OPTIONS, **more, "_nrt": False}
+    if digests is not None:
+        digests = f"{digests[0]} {options}", digests[1]
     try:
-        dispatcher = compile_cached(compiled, KINDS[kind].read_only_signature, watched, **options)
+        dispatcher = compile_cached(compiled, KINDS[kind].read_only_signature, digests, **options)
     except Exception as error:  # not only errors of numba: its assertions may fail, too
-        dispatcher = _compile_writable(kind, compiled, watched, named or function, error, options)
+        dispatcher = _compile_with_writable_inputs(kind, compiled, digests, named_function or function, error, options)
     else:
         add_signature(dispatcher, KINDS[kind].signature)
-    if watched is not None:
+    if digests is not None:
         # register the digest now, because values that the function uses may change after its compilation
-        register_digest(dispatcher, f"{kind} {watched}")
+        register_digest(dispatcher, f"{kind} {digests}")
     frozen_values(dispatcher, function)
     return dispatcher
 
 
-def _compile_writable(
+def _compile_with_writable_inputs(
     kind: str,
     function: Callable[..., Any],
-    watched: tuple[str, str] | None,
-    named: Callable[..., Any],
+    digests: tuple[str, str] | None,
+    named_function: Callable[..., Any],
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
@@ -414,13 +418,13 @@ def _compile_writable(
     `error` is the error of the compilation with read-only inputs.
     """
     try:
-        dispatcher = compile_cached(function, KINDS[kind].signature, watched, **options)
+        dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)
     except Exception as second_error:
-        raise TypeError(_failure_message(kind, named, second_error)) from None
+        raise TypeError(_failure_message(kind, named_function, second_error)) from None
     if _HELPER_REJECTS_READ_ONLY.search(plain := _without_colours(error)) and "setitem" not in plain:
         return dispatcher
     raise TypeError(
-        f"{kind}: the function {_describe(named)} must not change the arrays that it is given "
+        f"{kind}: the function {_name_and_location(named_function)} must not change the arrays that it is given "
         f"({', '.join([*KINDS[kind].state, 'p'])}), which are those of the run. Copy first\n"
         f"Numba says: {_informative_line(error)}"
     ) from None
@@ -450,22 +454,22 @@ def zero_callback(kind: str) -> Dispatcher:
 def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
     """Return the error message for a function that numba cannot compile, with one line of numba's own message."""
     return (
-        f"{kind}: numba cannot compile the function {_describe(function)}; it must use numbers, numpy arrays of one "
-        f"type and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
+        f"{kind}: numba cannot compile the function {_name_and_location(function)}; it must use numbers, numpy arrays "
+        f"of one type and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
         f"Numba says: {_informative_line(error)}"
     )
 
 
-def _describe(function: Callable[..., Any]) -> str:
+def _name_and_location(function: Callable[..., Any]) -> str:
     """Return the name of a function with its file and line."""
     name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
 # pattern of an excerpt of a source file in numba's messages, which ends with the mark ^ in a line of its own
-_EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
+_SOURCE_EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
 # pattern of beginnings of lines in numba's messages that give no reason, but only refer to other lines
-_UNINFORMATIVE = re.compile(
+_UNINFORMATIVE_LINE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"
 )
@@ -479,7 +483,9 @@ def _without_colours(error: Exception) -> str:
 def _informative_line(error: Exception) -> str:
     """Return the type of an error, and the last line of numba's message that gives a reason."""
     message = _without_colours(error)
-    message = re.sub(r":\s*>>> ", ": ", _EXCERPT.sub("", message))  # >>> marks a signature without a match
+    message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # >>> marks a signature without a match
     lines = [line.strip() for line in message.splitlines() if line and not line.startswith("    ")]
-    informative = [line for line in lines if line and not _UNINFORMATIVE.match(line) and not line.startswith("def ")]
+    informative = [
+        line for line in lines if line and not _UNINFORMATIVE_LINE.match(line) and not line.startswith("def ")
+    ]
     return f"{type(error).__name__}: {informative[-1] if informative else message.strip()[:200]}"

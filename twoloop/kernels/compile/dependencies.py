@@ -64,7 +64,7 @@ class Digest:
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
         self.names: set[str] = set()  # names of attributes of modules that the function being added may use
-        self.seen: dict[tuple[int, str], int] = {}  # position of each value added so far, by its id and name
+        self.positions: dict[tuple[int, str], int] = {}  # position of each value added so far, by its id and name
         self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it calls
 
     def add(self, value: Any) -> None:
@@ -138,10 +138,10 @@ class Digest:
     def _is_new(self, value: Any, name: str = "") -> bool:
         """Register a new value and return True; hash the position of a value registered before, and return False."""
         key = (id(value), name)
-        if key in self.seen:
-            self.hash.update(f"<again {self.seen[key]}>".encode())
+        if key in self.positions:
+            self.hash.update(f"<again {self.positions[key]}>".encode())
             return False
-        self.seen[key] = len(self.seen)
+        self.positions[key] = len(self.positions)
         return True
 
 
@@ -351,14 +351,14 @@ class FunctionCopier:
 
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
         self.wrap = wrap
-        self.known: dict[Any, Any] = {}
+        self.copies: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
         """Return the replacement of a value, or the value itself; `names`: attributes to replace in a module."""
         if self.is_copied(value):
-            if id(value) not in self.known:
+            if id(value) not in self.copies:
                 self._add_copy(value)
-            return self.known[id(value)]
+            return self.copies[id(value)]
         if type(value) is tuple:
             return tuple(self.value(each, names) for each in value)
         if isinstance(value, types.ModuleType) and not is_library(value.__name__):
@@ -372,26 +372,26 @@ class FunctionCopier:
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
         """Return a copy of a module with replacements of the attributes listed in `names`."""
         key = (id(module), names)
-        if key not in self.known:
-            self.known[key] = copy = types.ModuleType(module.__name__)
+        if key not in self.copies:
+            self.copies[key] = copy = types.ModuleType(module.__name__)
             vars(copy).update(vars(module))
             vars(copy).update({name: self.value(vars(module)[name], names) for name in names & set(vars(module))})
-        return self.known[key]  # type: ignore[no-any-return]
+        return self.copies[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
         """Return the replacement of a function that is not a compiled helper itself."""
         self._add_copy(function)
-        return self.known[id(function)]
+        return self.copies[id(function)]
 
     def _add_copy(self, helper: Any) -> None:
-        """Add the replacement of a helper or function to `self.known`."""
+        """Add the replacement of a helper or function to `self.copies`."""
         function = getattr(helper, "py_func", helper)
         used_names, names = names_of_code(function.__code__), frozenset(reachable_names(function))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.known[id(helper)] = self.wrap(copy, helper)  # its values, replaced below, may include the helper itself
+        self.copies[id(helper)] = self.wrap(copy, helper)  # its values, replaced below, may include the helper itself
         for name in used_names & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
         if function.__defaults__ is not None:

@@ -13,10 +13,10 @@ from typing import Any
 from llvmlite import binding
 from numba.core.registry import cpu_target
 
-from twoloop.kernels.compile.caches import UNWRITABLE, BoundedCache, CodeFiles, sources_folder, warn_once
+from twoloop.kernels.compile.caches import UNWRITABLE_CACHE_WARNING, BoundedCache, CodeFiles, sources_folder, warn_once
 
 # whether this version of llvmlite can run single passes of LLVM
-SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
+HAS_SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
 class GeneratedFunctions:
@@ -36,7 +36,7 @@ class GeneratedFunctions:
     """
 
     def __init__(self, names: list[str], content: bytes):
-        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _new_target_machine())
         object_file = binding.ObjectFileRef.from_data(content)
         self._engine.add_object_file(object_file)
         self._engine.finalize_object()
@@ -46,13 +46,13 @@ class GeneratedFunctions:
 class DeferredFunctions:
     """Functions that are generated when their addresses are first used, because many runs do not need them."""
 
-    def __init__(self, make: Callable[[], GeneratedFunctions]):
-        self._make = make
+    def __init__(self, generate: Callable[[], GeneratedFunctions]):
+        self._generate = generate
 
     @cached_property
     def functions(self) -> GeneratedFunctions:
         """Return the functions, which stay in memory with this object."""
-        return self._make()
+        return self._generate()
 
     @property
     def addresses(self) -> dict[str, int]:
@@ -60,7 +60,7 @@ class DeferredFunctions:
         return self.functions.addresses
 
 
-_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # generated functions by kind, then by key
+_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # generated functions by kind, then by key
 
 
 def generated_functions(
@@ -83,7 +83,7 @@ def generated_functions(
     passes : bool
         Whether LLVM optimises the code.
     """
-    if (functions := _IN_MEMORY[kind].get(key)) is not None:
+    if (functions := _FUNCTIONS_IN_MEMORY[kind].get(key)) is not None:
         return functions  # type: ignore[no-any-return]
     files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
@@ -96,15 +96,15 @@ def generated_functions(
         try:
             files.save(disk_key, stored)
         except OSError:
-            warn_once(UNWRITABLE)
+            warn_once(UNWRITABLE_CACHE_WARNING)
     names, content = stored
-    _IN_MEMORY[kind][key] = functions = GeneratedFunctions(names, content)
+    _FUNCTIONS_IN_MEMORY[kind][key] = functions = GeneratedFunctions(names, content)
     return functions
 
 
 def are_cached(kind: str, stamp: str, key: str) -> bool:
     """Return whether the functions that `generated_functions` would return are in memory or on disk."""
-    return key in _IN_MEMORY[kind] or _code_files(kind, stamp).has(_disk_key(key))
+    return key in _FUNCTIONS_IN_MEMORY[kind] or _code_files(kind, stamp).has_file(_disk_key(key))
 
 
 def _code_files(kind: str, stamp: str) -> CodeFiles:
@@ -119,23 +119,23 @@ def _disk_key(key: str) -> Any:
 
 def object_code(text: str, passes: bool = True) -> bytes:
     """Compile the text of an LLVM module to object code for this processor; with `passes`, optimise it first."""
-    machine = _compiler()
-    target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
+    machine = _shared_target_machine()
+    target = f'target triple = "{_target_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
     if passes:
-        manager, builder = _two_passes() if SINGLE_PASSES else _all_passes()
+        manager, builder = _two_pass_manager() if HAS_SINGLE_PASSES else _all_pass_manager()
         manager.run(module, builder)
     content: bytes = machine.emit_object(module)
     return content
 
 
 @cache
-def _compiler() -> Any:
-    return _machine()
+def _shared_target_machine() -> Any:
+    return _new_target_machine()
 
 
 @cache
-def _two_passes() -> tuple[Any, Any]:
+def _two_pass_manager() -> tuple[Any, Any]:
     """Return a manager of two passes, which make the code of small mechanisms a tenth faster, and their builder.
 
     All other passes together gain no further speed. Passes are created once per process, because LLVM leaks about
@@ -147,26 +147,26 @@ def _two_passes() -> tuple[Any, Any]:
     return passes, _pass_builder()
 
 
-def _all_passes() -> tuple[Any, Any]:
+def _all_pass_manager() -> tuple[Any, Any]:
     """Return a manager of all passes, and their builder, for a single module; only llvmlite 0.44 requires this."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 
 
 def _pass_builder() -> Any:
-    return binding.create_pass_builder(_compiler(), binding.create_pipeline_tuning_options(speed_level=1))
+    return binding.create_pass_builder(_shared_target_machine(), binding.create_pipeline_tuning_options(speed_level=1))
 
 
 @cache
-def _triple() -> str:
+def _target_triple() -> str:
     return str(binding.get_process_triple())
 
 
-def _machine() -> Any:
+def _new_target_machine() -> Any:
     """Return a new LLVM description of the processor for which numba compiles; each engine needs its own."""
     options: dict[str, Any] = {"opt": 1}  # level 2 takes a quarter longer and gains nothing in straight-line code
     cpu_target.target_context.codegen()._customize_tm_options(options)
-    return binding.Target.from_triple(_triple()).create_target_machine(**options)
+    return binding.Target.from_triple(_target_triple()).create_target_machine(**options)
 
 
 def has_wide_vectors() -> bool:

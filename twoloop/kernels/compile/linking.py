@@ -88,14 +88,14 @@ def forget_compiled(function: Any) -> None:
 _numba_fix_index = arrayobj.fix_integer_index
 
 
-def _resolve_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+def _resolved_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
     """Emit code for an index of an array; in kernels and helpers, a negative index does not count from the end."""
     if kind.signed and isinstance(context.active_code_library, _HelperLibrary | _KernelLibrary):
         return context.cast(builder, index, kind, types.intp)
     return _numba_fix_index(context, builder, kind, index, size)
 
 
-_numba_indexing: Any = arrayobj.basic_indexing
+_numba_basic_indexing: Any = arrayobj.basic_indexing
 
 
 def _element_address(
@@ -107,7 +107,7 @@ def _element_address(
     """
     is_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not is_element or options.get("boundscheck"):
-        return _numba_indexing(context, builder, kind, array, index_types, indices, **options)
+        return _numba_basic_indexing(context, builder, kind, array, index_types, indices, **options)
     sizes = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
     index_arguments = zip(index_types, indices, sizes, strict=True)
     final_indices = [arrayobj.fix_integer_index(context, builder, *each) for each in index_arguments]
@@ -115,16 +115,16 @@ def _element_address(
 
 
 _numba_call_type: Any = BaseFunction.get_call_type
-_call_types: dict[Any, tuple[Any, Any]] = {}
+_call_signatures: dict[Any, tuple[Any, Any]] = {}
 # options and their texts by the id of the options; the options are stored so that no other object gets their id
-_options: dict[int, tuple[Any, str]] = {}
+_option_texts: dict[int, tuple[Any, str]] = {}
 
 
 def _options_text(options: Any) -> str:
     """Return numba's options of a compilation as text, cached."""
-    if id(options) not in _options:
-        _options[id(options)] = options, repr(options and options._values)
-    return _options[id(options)][1]
+    if id(options) not in _option_texts:
+        _option_texts[id(options)] = options, repr(options and options._values)
+    return _option_texts[id(options)][1]
 
 
 def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
@@ -133,35 +133,35 @@ def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     Without this cache, numba tries all implementations of an operator at each call: a tenth of the compile time.
     """
     key = self, args, tuple(kws.items()), _options_text(ConfigStack.top_or_none())
-    if key not in _call_types:
+    if key not in _call_signatures:
         signature = _numba_call_type(self, context, args, kws)
-        _call_types[key] = signature, self._impl_keys[signature.args]
-    signature, self._impl_keys[signature.args] = _call_types[key]
+        _call_signatures[key] = signature, self._impl_keys[signature.args]
+    signature, self._impl_keys[signature.args] = _call_signatures[key]
     return signature
 
 
-_numba_size: Any = BaseContext.get_abi_sizeof
-_sizes: dict[str, int] = {}
+_numba_type_size: Any = BaseContext.get_abi_sizeof
+_type_sizes: dict[str, int] = {}
 
 
-def _cached_size(self: Any, kind: Any) -> Any:
+def _cached_type_size(self: Any, kind: Any) -> Any:
     """Return the size of a type, bytes, cached; numba would make LLVM parse a module for each variable."""
     name = str(kind)
-    if name not in _sizes:
-        _sizes[name] = _numba_size(self, kind)
-    return _sizes[name]
+    if name not in _type_sizes:
+        _type_sizes[name] = _numba_type_size(self, kind)
+    return _type_sizes[name]
 
 
 _numba_inlined_passes: Any = InlineWorker.run_untyped_passes
-_inlined: dict[Any, Any] = {}
+_inlined_code: dict[Any, Any] = {}
 
 
 def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
     """Return the intermediate code of an inlined function, cached; numba would analyse the function at each call."""
-    if (function, enable_ssa) not in _inlined:
-        _inlined[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
+    if (function, enable_ssa) not in _inlined_code:
+        _inlined_code[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
-    code = copy(_inlined[function, enable_ssa])
+    code = copy(_inlined_code[function, enable_ssa])
     code.func_id = FunctionIdentity.from_function(function)  # new for each copy: it determines the names of variables
     return code
 
@@ -169,7 +169,7 @@ def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> 
 _LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types of parts of a statement that contain no variables
 
 
-def _variables(self: Any, part: Any) -> list[Any]:
+def _variables_of_statement(self: Any, part: Any) -> list[Any]:
     """Return the variables of a statement; numba's version is slower, because it calls a function for each part."""
     if isinstance(part, ir.Var):
         return [part]
@@ -181,7 +181,7 @@ def _variables(self: Any, part: Any) -> list[Any]:
             if type(each) is ir.Var:
                 variables.append(each)
             elif type(each) not in _LEAF_TYPES:
-                variables += _variables(self, each)
+                variables += _variables_of_statement(self, each)
     return variables
 
 
@@ -200,27 +200,27 @@ def _load_registries_once(self: Any) -> None:
         _numba_load_registries(self)
 
 
-_LOCKS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of numba's events of locks
+_LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of numba's events of locks
 
 
 def _without_lock_events(report: Any) -> Any:
     """Return a function that reports all events except those of locks, of which each kernel has thousands."""
-    return lambda kind, *args, **named: None if kind in _LOCKS else report(kind, *args, **named)
+    return lambda kind, *args, **named: None if kind in _LOCK_EVENTS else report(kind, *args, **named)
 
 
 # functions of numba that are replaced, as attributes of their owner: owner, name and replacement
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (Function, "get_call_type", _cached_call_type),
-    (arrayobj, "fix_integer_index", _resolve_index),
+    (arrayobj, "fix_integer_index", _resolved_index),
     (arrayobj, "basic_indexing", _element_address),
-    (BaseContext, "get_abi_sizeof", _cached_size),
+    (BaseContext, "get_abi_sizeof", _cached_type_size),
     (InlineWorker, "run_untyped_passes", _cached_inlined_code),
-    (ir.Inst, "_rec_list_vars", _variables),
+    (ir.Inst, "_rec_list_vars", _variables_of_statement),
     (CPUContext, "load_additional_registries", _load_registries_once),
     (event, "start_event", _without_lock_events(event.start_event)),
     (event, "end_event", _without_lock_events(event.end_event)),
 ]
-_MISSING = object()  # stands for an attribute that an owner does not have
+_MISSING_ATTRIBUTE = object()  # stands for an attribute that an owner does not have
 _depth = [0]  # number of nested compilations of kernels
 
 
@@ -228,7 +228,7 @@ _depth = [0]  # number of nested compilations of kernels
 def kernel_rules() -> Iterator[None]:
     """Return a context for compiling a kernel, in which functions of numba are replaced by those of `_RULES`."""
     if _depth[0] == 0:
-        before = [vars(owner).get(name, _MISSING) for owner, name, _ in _RULES]
+        before = [vars(owner).get(name, _MISSING_ATTRIBUTE) for owner, name, _ in _RULES]
         for owner, name, rule in _RULES:
             setattr(owner, name, rule)
     _depth[0] += 1
@@ -238,13 +238,13 @@ def kernel_rules() -> Iterator[None]:
         _depth[0] -= 1
         if _depth[0] == 0:
             for (owner, name, _), original in zip(_RULES, before, strict=True):
-                if original is _MISSING:
+                if original is _MISSING_ATTRIBUTE:
                     delattr(owner, name)
                 else:
                     setattr(owner, name, original)
 
 
-class _WithoutEnvironment:
+class _CodegenWithoutEnvironment:
     """Wrapper of numba's code generator for code that is never loaded, so that its environment needs no address."""
 
     def __init__(self, codegen: Any):
@@ -262,7 +262,7 @@ class _HelperLibrary(CPUCodeLibrary):
 
     @property
     def codegen(self) -> Any:
-        return _WithoutEnvironment(self._codegen)
+        return _CodegenWithoutEnvironment(self._codegen)
 
     def get_pointer_to_function(self, name: str) -> int:
         return 0

@@ -155,7 +155,7 @@ def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any)
 
 
 @infer_getattr
-class _Fields(AttributeTemplate):
+class _FieldTypes(AttributeTemplate):
     """Types of the attributes of a `Reference`, for numba."""
 
     key = Reference
@@ -164,13 +164,13 @@ class _Fields(AttributeTemplate):
         if field not in typ.functions:
             return typ.arrays.get(field)
 
-        class Call(AbstractTemplate):
+        class FieldCall(AbstractTemplate):
             key = (typ.name, field)
 
             def generic(self, args: Any, kws: Any) -> Any:
                 return typ.functions[field].replace(recvr=typ)
 
-        return types.BoundFunction(Call, typ)
+        return types.BoundFunction(FieldCall, typ)
 
 
 @lower_getattr_generic(Reference)
@@ -207,7 +207,7 @@ def _define_call(typ: Reference, field: str, signature: Signature) -> None:
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
-    def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def lower_call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         convention = context.call_conv
         kind = convention.get_function_type(signature.return_type, signature.args).as_pointer()
         function = _load_word(context, builder, args[0], offset, kind)
@@ -235,7 +235,7 @@ def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
-    def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def lower_call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = ir.FunctionType(_llvm_type(signature.return_type), [_llvm_type(each) for each in signature.args])
         function = _load_word(context, builder, args[0], offset, kind.as_pointer())
         llvm_arguments = [

@@ -28,7 +28,7 @@ from twoloop.kernels.control.step_size import project_and_evaluate
 from twoloop.kernels.data.common import allowed_error, compiled, finite_vector
 from twoloop.kernels.data.indices import ATOL, DONE, FORM, GAP, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
-from twoloop.kernels.linalg.symbolic_factorization import jacobian_of
+from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
 N_PARTS = 12  # number of parts of an interval, at whose ends C_t and b are sampled
 # coefficients of the twelfth difference
@@ -78,7 +78,7 @@ def _allowed_error(f, w, tolerances, x, row):
     """Return the error in row `row` of G x that the tolerances of x (n_q coordinates or velocities) allow."""
     largest = 0.0
     if f.flags[FORM] == STATIC:
-        rows, columns, _ = jacobian_of(f.static_program)
+        rows, columns, _ = jacobian_entries_of(f.static_program)
         for k in range(rows.size):
             if rows[k] == row:
                 tolerance = tolerances[ATOL + columns[k]] + tolerances[RTOL] * abs(x[columns[k]])

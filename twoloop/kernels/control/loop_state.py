@@ -97,7 +97,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SHORTEST_CHANGE,  # shortest time between two sudden changes, s
     MOTION_SAMPLED_TO,  # time of the last sample along the motion, s
     SAMPLES_MOTION,  # 1 while callbacks are sampled along the motion, at states that the motion may not reach
-    # smallest result of least_pivot (partition.py) at output times and grid points, where steps have to end
+    # smallest result of min_pivot_ratio (partition.py) at output times and grid points, where steps have to end
     PIVOT_AT_OUTPUT,
     PIVOT_PASSED,  # smallest pivot within steps since BRIDGE is SUSPENDED, relative to LARGEST_PIVOT; 0: none yet
     N_CLOCK,

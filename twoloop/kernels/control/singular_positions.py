@@ -18,7 +18,7 @@ from twoloop.kernels.data.indices import (
     STRAIGHT,
 )
 from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
-from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, least_pivot, partition_is_poor, smallest_pivot
+from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_ratio, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a singular position is suspected
@@ -160,7 +160,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
 @merged
 def record_pivot_at_output(f, w, clock, state):
     """Update clock[PIVOT_AT_OUTPUT], the smallest pivot at output times and grid times, by the pivot at `state`."""
-    pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
+    pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
     if f.flags[FORM] == STATIC and pivot > 0.0:
         # pivots of the static form are sines of angles, all of them small in large mechanisms: only the ratio to the
         # largest pivot so far shows a singular position

@@ -103,7 +103,7 @@ class Work(NamedTuple):
     # the fields from here to `solutions` are those of the static form, and are empty in other forms; N is n_q + n_c
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
-    counts: Any  # (n_c) 1 for independent rows, else 0
+    is_independent: Any  # (n_c) 1 for independent rows, else 0
     factors: Any  # numbers of the factors, in the slots of the program
     pivot_sizes: Any  # (N) squared norms of the rows, to which pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (N) right-hand side on entry to a solver, solution on return

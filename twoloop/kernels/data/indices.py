@@ -4,7 +4,7 @@ Kernels keep their state in arrays of numbers, because compiled code passes arra
 the indices of one array; control/loop_state.py has the indices that only the loop over steps uses.
 """
 
-from twoloop.kernels.compile.callbacks import OPTIONAL
+from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
 
 # codes: DONE, or the reason why an evaluation or a step failed
 (
@@ -30,7 +30,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
 CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; for STATIC see sparse_inner_loop.py
 # indices of the flags of optional callbacks: 1 if the callback is given
-GIVEN = {name: index for index, name in enumerate(OPTIONAL, FIRST_GIVEN)}
+GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
     GIVEN[name] for name in ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q", "kinematics")

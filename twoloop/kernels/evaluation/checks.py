@@ -23,12 +23,12 @@ from twoloop.kernels.data.indices import (
     REACTION_BY_Q_GIVEN,
 )
 from twoloop.kernels.evaluation import operations as op
-from twoloop.kernels.evaluation.operations import operation
+from twoloop.kernels.evaluation.operations import result_of_operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
-NO_ENTRY = 1e-12  # an entry of C_q up to this, relative to the largest in its row, is a rounding error of zero
+NO_ENTRY = 1e-12  # largest entry of C_q, relative to the largest one in its row, that counts as zero, rounded
 MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares in column_units
-NEGLIGIBLE = 1e-6  # a coordinate up to this, relative to the largest one, counts as zero in linear_ranges
+NEGLIGIBLE = 1e-6  # largest coordinate, relative to the largest one of its row, that linear_ranges leaves out
 
 
 @exact
@@ -42,8 +42,11 @@ def _sort(values):
 
 
 @exact
-def _fit_columns(rows, columns, mask, logs):
-    """Store in `columns` the logs of the columns' units that best fit the rows' units; return whether none changed."""
+def _fit_column_units(rows, columns, mask, logs):
+    """Store in `columns` the logarithms of the coordinates' units that best fit the rows' units, given in `rows`.
+
+    `logs` has the logarithms of |entries|, `mask` has 1 for each entry. Returns whether no unit changed.
+    """
     unchanged = True
     for j in range(columns.size):
         total, n = 0.0, 0
@@ -58,8 +61,8 @@ def _fit_columns(rows, columns, mask, logs):
 
 
 @exact
-def _fit_rows(columns, rows, mask, logs):
-    """Store in `rows` the logs of the rows' units that best fit the columns' units, see `_fit_columns`."""
+def _fit_row_units(columns, rows, mask, logs):
+    """Store in `rows` the logarithms of the rows' units that best fit the coordinates' units, given in `columns`."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
@@ -74,8 +77,8 @@ def column_units(matrix, typical, columns, mask, logs, rows, scratch):
     """Store in `columns` (n_q) the units of the coordinates in which the entries of C_q (`matrix`) have similar sizes.
 
     The units minimize the sum over all entries of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2. Their
-    common factor is chosen so that the median ratio of the units to `typical` is 1. Coordinates without entries get
-    their typical units. The last four arguments are scratch.
+    common factor is chosen so that the median ratio of the units to the units `typical` (n_q) is 1. Coordinates without
+    entries get their typical units. The last four arguments are scratch.
     """
     n_used, log_factor = 0, 0.0
     for i in range(rows.size):
@@ -86,8 +89,8 @@ def column_units(matrix, typical, columns, mask, logs, rows, scratch):
     for j in range(columns.size):
         columns[j] = 0.0
     for _ in range(MAX_SWEEPS):
-        _fit_rows(columns, rows, mask, logs)
-        if _fit_columns(rows, columns, mask, logs):
+        _fit_row_units(columns, rows, mask, logs)
+        if _fit_column_units(rows, columns, mask, logs):
             break
     for j in range(columns.size):
         has_entry = False
@@ -130,13 +133,15 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
             ranges[i] = scratch[(n - 1) // 2]
 
 
-# flags that evaluate_start returns. IN_ORDER: all values are finite, M is symmetric, no row is empty. CONSISTENT: the
-# state satisfies the constraints up to rounding. DEFINITE: M varies and is positive definite by a margin. INDEFINITE: M
-# varies and is not positive definite by a margin
-IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # largest distance from a stored position, relative to the stored sizes, at which these sizes apply
+# flags that evaluate_start returns. WELL_FORMED: all values are finite, M is symmetric, no row is empty. CONSISTENT:
+# the state satisfies the constraints up to rounding. DEFINITE: M varies, and all its eigenvalues are above their limit
+# by EIGENVALUE_MARGIN. INDEFINITE: M varies, and an eigenvalue is below its limit by EIGENVALUE_MARGIN
+WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
+MAX_RELATIVE_DISTANCE = (
+    0.5  # largest distance from a stored position, relative to the stored sizes, at which these sizes apply
+)
 ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
-EIGENVALUE_MARGIN = 2.0  # factor by which eigenvalues must differ from their limit, so that rounding does not decide
+EIGENVALUE_MARGIN = 2.0  # factor by which eigenvalues must differ from their limit, as rounding errors are smaller
 
 
 def results_size(n: int, n_c: int, n_a: int) -> int:
@@ -162,7 +167,7 @@ def _has_empty_row(rows):
 
 @exact
 def _is_symmetric(mass, tolerance):
-    """Return whether M is symmetric, up to differences of `tolerance` times its largest entry."""
+    """Return whether M is symmetric, up to differences of `tolerance` times max|M|."""
     largest, asymmetry, is_exactly_symmetric = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
@@ -177,9 +182,9 @@ def _is_symmetric(mass, tolerance):
 
 @exact
 def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
-    """Return whether a sum, `value`, is a rounding error: at most `tolerance` times the sum of the |terms|.
+    """Return whether the constraint `value` is a rounding error: at most `tolerance` times the sum of its |terms|.
 
-    The terms are `rate` and row[j] state[j] for all j; |state[j]| counts as at least sizes[j] and at least `min_size`.
+    The terms are `rate` and row[j] * state[j] for all j; |state[j]| counts as at least sizes[j] and `min_size`.
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):
@@ -189,10 +194,10 @@ def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
 
 @exact
 def _is_near(q, sizes, stored_q):
-    """Return whether each coordinate in q differs from `stored_q` by at most NEAR_SHARE times its entry in `sizes`."""
+    """Return whether |q_j - stored_q[j]| is at most MAX_RELATIVE_DISTANCE times sizes[j] for each coordinate j."""
     is_near = True
     for j in range(q.size):
-        is_near = is_near and abs(q[j] - stored_q[j]) <= NEAR_SHARE * sizes[j]
+        is_near = is_near and abs(q[j] - stored_q[j]) <= MAX_RELATIVE_DISTANCE * sizes[j]
     return is_near
 
 
@@ -208,29 +213,29 @@ def _has_same_entries(rows, entries):
 
 
 @exact
-def _find_stored_sizes(q, rows, n_c, sizes):
-    """Return the index in `sizes` at which the data of a stored position near q begin; -1 if no such data exist."""
+def _index_of_near_position(q, rows, n_c, records):
+    """Return the index in `records`, see `evaluate_start`, where the record of a position near q begins; -1 if none."""
     n = q.size
     stride = 2 * n + n_c * n
-    for k in range(0, sizes.size, stride):
-        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has_same_entries(
-            rows, sizes[k + 2 * n : k + stride]
+    for k in range(0, records.size, stride):
+        if _is_near(q, records[k : k + n], records[k + n : k + 2 * n]) and _has_same_entries(
+            rows, records[k + 2 * n : k + stride]
         ):
             return k
     return -1
 
 
 @exact
-def _is_consistent(C, rate, rows, q, v, sizes, tolerance):
-    """Return whether (q, v) satisfies the constraints, with values C, `rows` and `rate`, up to rounding.
+def _is_consistent(C, rate, rows, q, v, records, tolerance):
+    """Return whether (q, v) satisfies the constraints up to rounding; C, `rows` and `rate` are their values there.
 
-    The size of a coordinate counts as at least its stored size, and at least the rounding error of the largest
-    coordinate: if the coordinates of a constraint are zero but for rounding, as those out of the plane of a planar
-    motion, the value of the constraint is not small relative to its terms.
+    The size of a coordinate counts as at least its size in `records` (see `evaluate_start`), and at least the rounding
+    error of the largest coordinate: if all coordinates of a constraint are rounding errors of zero, as coordinates out
+    of the plane of a planar motion are, the value of the constraint is not small relative to its terms.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
-    begin = _find_stored_sizes(q, rows, C.size, sizes)
-    stored_sizes = q if begin < 0 else sizes[begin : begin + q.size]
+    begin = _index_of_near_position(q, rows, C.size, records)
+    stored_sizes = q if begin < 0 else records[begin : begin + q.size]
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
@@ -252,7 +257,7 @@ def _record_entries(rows, pattern):
 
 @exact
 def _record_entries_near(f, t, q, shifts, position, rows, n_c, pattern):
-    """Set `pattern` to 1 also where C_q or A is nonzero at a position q + max|q| shifts[k].
+    """Set `pattern` to 1 where C_q or A is nonzero at one of the positions q + max|q| shifts[k]; keep other entries.
 
     `position` and `rows` are scratch.
     """
@@ -268,7 +273,7 @@ def _record_entries_near(f, t, q, shifts, position, rows, n_c, pattern):
 
 @exact
 def _is_definite(mass, min_eigenvalue, factors):
-    """Return whether all eigenvalues of M exceed `min_eigenvalue` times its largest entry; `factors` is scratch."""
+    """Return whether all eigenvalues of M exceed `min_eigenvalue` times max|M|; `factors` is scratch."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
@@ -280,14 +285,15 @@ def _is_definite(mass, min_eigenvalue, factors):
 
 
 @kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern, roundings):
-    """Evaluate all callbacks at (t, q, v), and store their results; return the flags IN_ORDER to INDEFINITE that hold.
+def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, pattern, roundings):
+    """Evaluate all callbacks at (t, q, v), and store their results; return the sum of the flags that apply.
 
-    Arguments:
+    Flags are WELL_FORMED to INDEFINITE. Arguments:
 
     - roundings: allowed relative rounding errors of constraints, of the symmetry of M, and of its eigenvalues
-    - sizes: stored positions and the sizes of their coordinates (`keep` of checks/scales.py), which are lower bounds on
-      the sizes near these positions
+    - records: for each of several positions: the size of each coordinate, the position, and where C_q is nonzero (see
+      `keep` of checks/scales.py). Near such a position, |q_j| counts as at least the recorded size of coordinate j when
+      the rounding errors of constraints are judged
     - shifts: displacements of q, relative to max|q|, at which nonzero entries of C_q and A are also recorded
     - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
     - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results, and scratch
@@ -331,8 +337,8 @@ def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern,
             return 0
     result_flags = 0
     if _is_symmetric(mass, roundings[1]) and not _has_empty_row(rows):
-        result_flags = IN_ORDER
-        if _is_consistent(results[force:C], results[C:rate], rows, q, v, sizes, roundings[0]):
+        result_flags = WELL_FORMED
+        if _is_consistent(results[force:C], results[C:rate], rows, q, v, records, roundings[0]):
             result_flags |= CONSISTENT
     if flags[CONSTANT_MASS] == 0:  # neither DEFINITE nor INDEFINITE if the smallest eigenvalue is within the margin
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
@@ -346,7 +352,7 @@ def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern,
 
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
-def rows_at(f, t, positions, n_c, rows):
+def rows_at_positions(f, t, positions, n_c, rows):
     """Store in `rows`, zero on entry, C_q (n_c rows) and A at each of the `positions`, one position after another."""
     n_rows = len(rows) // len(positions)
     for k in range(len(positions)):
@@ -357,7 +363,7 @@ def rows_at(f, t, positions, n_c, rows):
 
 @exact
 def _is_close(fused, separate, tolerance, rounding_errors):
-    """Return whether entries in row i of both matrices differ by at most rounding_errors[i] + allowed max|separate|."""
+    """Return whether rows i of both matrices differ by at most tolerance * max|separate| + rounding_errors[i]."""
     largest = 0.0
     for i in range(separate.shape[0]):
         for j in range(separate.shape[1]):
@@ -371,7 +377,7 @@ def _is_close(fused, separate, tolerance, rounding_errors):
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
 def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, tolerance, rounding):
-    """Return whether results of fused and separate callbacks differ by at most `tolerance` times the largest result.
+    """Return whether `kinematics` agrees with the separate callbacks, up to `tolerance` times the largest result.
 
     Values of C may also differ by `rounding` times the sum of their |terms|. `fused` and `separate`, (3 + n_q, n_c),
     are zero on entry, and contain C, C_t, gamma and C_q on return; `rounding_errors` (n_c), zero on entry, is scratch.
@@ -399,7 +405,7 @@ VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, an
 EPS = 2.0**-52
 # largest difference between a callback and its trace, apart from rounding, relative to the callback's largest value
 MAX_DIFFERENCE = 1e-9
-ROUNDING_FACTOR = 200.0 * EPS  # largest rounding error of a traced number, relative to its entry in `bounds`
+ROUNDING_FACTOR = 200.0 * EPS  # accepted rounding error of a traced number, relative to its entry in `bounds`
 
 
 @exact
@@ -416,7 +422,7 @@ def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
 @exact
 def _operation_with_bound(kind, x, bound_x, y, bound_y):
     """Return the result of an operation on x and y, and its error bound, from the error bounds of x and y."""
-    z = operation(kind, x, y)
+    z = result_of_operation(kind, x, y)
     if kind == op.PRODUCT:
         bound = abs(x) * bound_y + abs(y) * bound_x
     elif kind == op.RECIPROCAL:
@@ -437,7 +443,10 @@ def _operation_with_bound(kind, x, bound_x, y, bound_y):
 
 @exact
 def _run_trace(program, columns, coefficients, constants, nodes, values, bounds):
-    """Store results of a traced program in `values`, their error bounds in `bounds`; `nodes` begins with the inputs."""
+    """Run a traced program: store its results in `values`, and their error bounds, in units of EPS, in `bounds`.
+
+    `nodes` contains the inputs t, q and v first, and receives the other nodes.
+    """
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
         x, bound_x = _sum_with_bound(columns, coefficients, constants[i, 0], nodes, first, second)
@@ -451,7 +460,7 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
 
 @exact
 def _count_differences(called, traced, bounds):
-    """Return the number of entries of `called` that are not finite, or differ from `traced`, see `compare_traces`."""
+    """Return how many entries of `called` are not finite or differ from `traced`, by the limit of `compare_traces`."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0

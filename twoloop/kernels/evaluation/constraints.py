@@ -46,7 +46,7 @@ def _clear_recorded_entries(w):
 
 @merged
 def clear_rows(f, w):
-    """Set w.G to zero; in the augmented form only the entries in w.places (VERIFY_PATTERN detects others later)."""
+    """Set w.G to zero; in the augmented form only its recorded entries (the task VERIFY_PATTERN detects new ones)."""
     if f.flags[FORM] == AUGMENTED:
         _clear_recorded_entries(w)
     else:
@@ -55,7 +55,7 @@ def clear_rows(f, w):
 
 @merged
 def row_residual(w, v, rows):
-    """Store G v + (C_t, b) of the rows with the indices `rows` in w.z, from w.G and w.Rate."""
+    """Store in w.z the residuals G v + (C_t, b) of the rows with the indices `rows`, from w.G and w.Rate."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -92,7 +92,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store right-hand sides in the rows of D: -G_j for each independent column j of G, then -`rate`."""
+    """Store right-hand sides in the rows of D: -G_j for each independent column j of G, and -`rate` in the last row."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -101,19 +101,19 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-# MAX_DIFFERENCE_STEP: largest difference step, s, and largest change of q in a difference step, relative to max|q|.
-# MIN_STEP_RATIO: smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
+# MAX_DIFFERENCE_STEP: largest step of a finite difference, s; also the largest change of q during this step, relative
+# to max|q|. MIN_STEP_RATIO: smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
-ROUNDING_DISAGREEMENT = 1e-9  # disagreement of the two differences, relative to Gamma, that rounding alone may cause
-# disagreement of the two differences, relative to Gamma, below which the difference step is doubled, because a larger
-# step reduces rounding errors
-ENLARGE_BELOW = 1e-11
+ROUNDING_DISAGREEMENT = 1e-9  # largest difference between the two values of Gamma, relative, that rounding may cause
+# the step of the finite differences is doubled if the values of Gamma with e and 2 e differ by less than this,
+# relative: a larger step reduces rounding errors
+ENLARGE_STEP_BELOW = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2: with the step e, and with the step 2 e
-ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-# step of one-sided differences, relative to the step of central differences: smaller, because their order is lower
+ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
+# step of one-sided differences, relative to that of central differences, whose order is higher, 4 instead of 2
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0
-# rounding error of Gamma if the terms of G v cancel, relative to the largest term divided by largest_difference_step
+# rounding error of Gamma if terms of the sum G v cancel, relative to the largest term over largest_difference_step
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this times the required accuracy
 
@@ -138,7 +138,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(notes, t, e):
-    """Return the side of t for differences: 1, after t, or -1, before t, if C_t or b jumps near t; else 0, both."""
+    """Return 1 for differences after t, or -1 for differences before t, if C_t or b jumps near t; else 0, for both."""
     since_jump, until_jump = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -147,10 +147,10 @@ def _difference_side(notes, t, e):
 
 @compiled
 def _fill_gamma(f, w, t, q, v, e, first, last):
-    """Store Gamma[first:last], by differences with the steps e and 2 e, in w.Gamma; return three maxima.
+    """Store Gamma[first:last] in w.Gamma, by differences with the steps e and 2 e; return three maxima.
 
-    They are max|Gamma|, the largest disagreement of the two differences (both NaN if not finite), and the largest
-    |term| of G v.
+    The maxima are max|Gamma|, the largest disagreement of the two differences (both NaN if Gamma is not finite), and
+    the largest |term| in the sums G v.
     """
     Gamma_coarse = w.Gamma_tried[0]
     side = _difference_side(w.notes, t, e)
@@ -173,8 +173,8 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
                 w.g[i] += w.Gx[i, j] * v[j]
                 largest_term = max(largest_term, abs(w.Gx[i, j] * v[j]))
             if side != 0.0:
-                w.Gamma[i] -= ONE_SIDED[k] * w.g[i] / (side * e)
-                Gamma_coarse[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
+                w.Gamma[i] -= ONE_SIDED_WEIGHTS[k] * w.g[i] / (side * e)
+                Gamma_coarse[i] -= ONE_SIDED_WEIGHTS_COARSE[k] * w.g[i] / (side * e)
             elif k == 0 or k == 3:
                 Gamma_coarse[i] -= w.g[i] / (2.0 * shift)
             else:
@@ -192,16 +192,16 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(notes):
-    """Return the largest accepted disagreement of the two differences, much larger than the error of Gamma."""
+    """Return the largest accepted difference between Gamma with the steps e and 2 e; the error of Gamma is smaller."""
     return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
 
 
 @compiled
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
-    """Store Gamma[first:last] in w.Gamma, by ever smaller difference steps until Gamma changes little; return a code.
+    """Store Gamma[first:last] in w.Gamma, by differences with the best of several steps; return a code.
 
-    Uses the step at which Gamma changes least, and stores it as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if even
-    this change is too large, else DONE.
+    Steps are divided by 4 until Gamma changes little. The best step is the one at which Gamma changes least; it is
+    stored as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if even this change is too large, else DONE.
     """
     least_change = np.inf
     step_ratio = 1.0
@@ -234,8 +234,9 @@ def gamma_by_differences(f, w, t, q, v, first, last):
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
-    Errors are relative to the largest entry of Gamma so far in this run. The difference step is GAMMA_STEP_RATIO times
-    largest_difference_step; it is chosen anew if the two differences disagree, as for drives of several kilohertz.
+    Errors are relative to the largest entry of Gamma so far in this run. The step e is GAMMA_STEP_RATIO times
+    largest_difference_step. A new step is chosen if the differences with e and 2 e disagree, as for drives of several
+    kilohertz.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.notes[GAMMA_STEP_RATIO] * largest_step)
@@ -245,7 +246,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
             return DONE  # the caller reports values that are not finite; without a scale, errors cannot be judged
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
-        if disagreement < ENLARGE_BELOW * w.notes[GAMMA_SCALE]:
+        if disagreement < ENLARGE_STEP_BELOW * w.notes[GAMMA_SCALE]:
             w.notes[GAMMA_STEP_RATIO] = min(1.0, 2.0 * w.notes[GAMMA_STEP_RATIO])
         if disagreement <= _max_disagreement(w.notes):
             return DONE

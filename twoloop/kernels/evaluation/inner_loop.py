@@ -55,20 +55,20 @@ from twoloop.kernels.evaluation.partition import (
     MAX_ITERATIONS,
     MIN_CORRECTION,
     ROUNDING_OF_CORRECTIONS,
+    check_redundant_rows,
     choose_oriented_partition,
-    factor_dependent,
-    factor_rows,
+    evaluate_and_factor_columns,
+    factor_dependent_columns,
     find_null_space,
+    is_on_constraints,
     partition_of_midpoint,
     record_entries,
-    redundant_rows_hold,
     restore_positions,
     restore_velocities,
-    rows_hold,
     write_programs,
 )
 from twoloop.kernels.linalg import saddle_point
-from twoloop.kernels.linalg.band import banded_mass
+from twoloop.kernels.linalg.band import has_banded_mass
 from twoloop.kernels.linalg.dense import has_new_entries, largest_of
 from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm, solve
 
@@ -105,16 +105,16 @@ def mass_matrix(f, w, t, q):
 
 @merged
 def factor_mass_at(f, w, t, q):
-    """Store M(t, q) in w.M, and factors of M in w.L if the form of the equations needs them; return a code."""
+    """Store M(t, q) in w.M, and the factors of M in w.L if the form of the equations uses them; return a code."""
     w.notes[FACTORED] = 0.0
     mass_matrix(f, w, t, q)
-    code = factor_mass(f, w) if f.flags[FORM] == MULTIPLIERS or banded_mass(f) else DONE
+    code = factor_mass(f, w) if f.flags[FORM] == MULTIPLIERS or has_banded_mass(f) else DONE
     return code if finite(w.M) else not_finite(w.notes, MASS, t, q)
 
 
 @merged
-def factor_at(f, w, t, q):
-    """Factor the equations of accelerations at (t, q), from the rows, their factors and w.D in w; return a code."""
+def factor_equations_at(f, w, t, q):
+    """Factor the equations of the accelerations at (t, q), from the rows of G, their factors and w.D; return a code."""
     if f.flags[CONSTANT_MASS] == 0:
         w.notes[FACTORED] = 0.0
         mass_matrix(f, w, t, q)
@@ -125,10 +125,10 @@ def factor_at(f, w, t, q):
 
 
 @merged
-def accelerate(f, w, t, q, v, a):
-    """Store in `a` the accelerations at (q, v), from the rows at q, their factors and w.D in w; return a code."""
+def compute_accelerations(f, w, t, q, v, a):
+    """Store the accelerations at (q, v) in `a`, from the rows of G, their factors and w.D; return a code."""
     w.counters[N_EVALUATIONS] += 1
-    code = factor_at(f, w, t, q)
+    code = factor_equations_at(f, w, t, q)
     if code == DONE:
         code = acceleration_constraint(f, w, t, q, v)
     if code != DONE:
@@ -147,7 +147,7 @@ def accelerate(f, w, t, q, v, a):
 
 @compiled
 def _record_gamma_scale(w, a):
-    """Increase GAMMA_SCALE, the scale of errors of Gamma, to at least the largest sum of |terms| in a row of G a."""
+    """Increase GAMMA_SCALE, the scale of errors of Gamma, to at least the largest sum over j of |G_ij a_j|."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.places[i], w.places[i + 1]):
@@ -156,8 +156,8 @@ def _record_gamma_scale(w, a):
 
 
 @merged
-def equilibrate(f, w, a, lam):
-    """Store in lam the multipliers of all rows, G^T lam = Q - M a, of least norm if rows are redundant."""
+def compute_multipliers(f, w, a, lam):
+    """Store in lam the multipliers of all rows: G^T lam = Q - M a. If rows are redundant, lam has the least norm."""
     lam[:] = 0.0
     saddle_point.multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
@@ -166,31 +166,31 @@ def equilibrate(f, w, a, lam):
 
 @merged
 def _factor_rows_at(f, w, t, q, v):
-    """Store in w the rows at (q, v), their factors and, for NULL_SPACE, w.D; return a code.
+    """Store in w the rows of G at q, their factors and, for NULL_SPACE, the null space w.D; return a code.
 
-    The state (q, v) may be off the constraints.
+    The fused callback also computes Gamma, which depends on v. The state (q, v) may be off the constraints.
     """
     if f.flags[KINEMATICS_GIVEN] == 1:
         kinematics(f, w, t, q, v)
         w.notes[KNOWN] = 1.0
-        code = factor_rows(w, t, q)
+        code = factor_dependent_columns(w, t, q)
     else:
-        code = factor_dependent(f, w, t, q)
+        code = evaluate_and_factor_columns(f, w, t, q)
     if code == DONE and f.flags[FORM] == NULL_SPACE:
         find_null_space(f, w, t, q)
     return code
 
 
 @merged
-def accelerate_at(f, w, t, q, v, a):
-    """Factor the rows at (q, v), which may be off the constraints, and store the accelerations; return a code."""
+def compute_accelerations_at(f, w, t, q, v, a):
+    """Store in `a` the accelerations at the state (q, v), which may be off the constraints; return a code."""
     code = _factor_rows_at(f, w, t, q, v)
-    return accelerate(f, w, t, q, v, a) if code == DONE else code
+    return compute_accelerations(f, w, t, q, v, a) if code == DONE else code
 
 
 @merged
 def _add_least_correction(f, w, x):
-    """Add to x the least correction in the metric of M that changes G x by w.g; return its largest entry."""
+    """Add to x the least correction, in the metric of M, that changes G x by w.g; return max|correction|."""
     w.Q[:] = 0.0
     solve(f, w, w.Q, w.g, w.y)
     largest = 0.0
@@ -204,7 +204,7 @@ def _add_least_correction(f, w, x):
 
 @merged
 def _correct_state(f, w, q, v):
-    """Move q and v towards the constraints, by the factors at q; return the largest corrections of q and of v."""
+    """Correct q and v in place by one pass of the projection, with the factors at q; return their max|corrections|."""
     rows, n_c = w.rows_v, w.C.size
     for i in range(rows.size):
         w.g[rows[i]] = -w.C[rows[i]] if rows[i] < n_c else 0.0
@@ -221,16 +221,16 @@ def project_state(f, w, t, q, v, theta, a, lam):
 
     Rows of A constrain velocities only; positions are corrected in directions that these rows allow.
 
-    Passes end when the correction of positions is at most theta, and that of velocities at most theta max(1, max|v|).
-    They also end when the correction of positions is at most theta times the smallest pivot: the inverse of this pivot
-    bounds how fast tangents turn, so that velocities are accurate after the same pass.
+    The last pass corrects positions by at most theta, and velocities by at most theta max(1, max|v|). A pass is also
+    the last one if its correction of positions is at most theta times the smallest pivot: the inverse of this pivot
+    bounds how fast tangents turn, so that velocities are accurate, too.
     """
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):
         code = _factor_rows_at(f, w, t, q, v)
         if code == DONE:
-            code = factor_at(f, w, t, q)
+            code = factor_equations_at(f, w, t, q)
         if code != DONE:
             return code
         if f.flags[KINEMATICS_GIVEN] == 0:
@@ -250,13 +250,13 @@ def project_state(f, w, t, q, v, theta, a, lam):
             break
         if correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            if not (correction_q <= limit or (correction_q <= AMPLIFICATION * limit and rows_hold(w, q))):
+            if not (correction_q <= limit or (correction_q <= AMPLIFICATION * limit and is_on_constraints(w, q))):
                 return INNER_DIVERGED
             break
         last_correction = max(correction_q, theta)
-    code = accelerate(f, w, t, q, v, a)
+    code = compute_accelerations(f, w, t, q, v, a)
     if code == DONE:
-        equilibrate(f, w, a, lam)
+        compute_multipliers(f, w, a, lam)
     return code
 
 
@@ -265,7 +265,10 @@ ROUNDING_OF_Q = 2e-14  # change of q that counts as rounding, relative to max|q|
 
 @merged
 def _verify_pattern(w):
-    """Return DONE if w.G has no new nonzero entry; else write new programs, and return INNER_DIVERGED or SINGULAR."""
+    """Return DONE if w.pattern has all nonzero entries of w.G; else write new programs, and return a code of failure.
+
+    The code is INNER_DIVERGED, or SINGULAR if no program exists.
+    """
     if not record_entries(w):
         return DONE
     return INNER_DIVERGED if write_programs(w) else SINGULAR
@@ -274,7 +277,7 @@ def _verify_pattern(w):
 @compiled
 def _do_other_task(f, w, task, t, q, v):
     if task == tasks.FIND_NULL_SPACE:
-        code = factor_dependent(f, w, t, q)
+        code = evaluate_and_factor_columns(f, w, t, q)
         if code == DONE:
             find_null_space(f, w, t, q)
         return code
@@ -286,18 +289,18 @@ def _do_other_task(f, w, task, t, q, v):
         return partition_of_midpoint(f, w, t, q, v)
     if task == tasks.VERIFY_PATTERN:
         return _verify_pattern(w)
-    return redundant_rows_hold(f, w, t, q, v)
+    return check_redundant_rows(f, w, t, q, v)
 
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task`, one of the numbers in tasks.py, at (t, q, v); return a code. Functions below explain the tasks."""
+    """Do `task`, a number of tasks.py, at (t, q, v); return a code. The functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
         return _do_other_task(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN) and w.notes[TIME_IS_UP] == 1.0:
         return STOPPED
     if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT are for methods that integrate all coordinates
-        return accelerate_at(f, w, t, q, v, a)
+        return compute_accelerations_at(f, w, t, q, v, a)
     if task == tasks.PROJECT:
         return project_state(f, w, t, q, v, tolerance, a, lam)
     code = DONE
@@ -312,15 +315,15 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if task == tasks.RESTORE:
         return code
     if task != tasks.MULTIPLIERS:
-        code = accelerate(f, w, t, q, v, a)
+        code = compute_accelerations(f, w, t, q, v, a)
     if code == DONE and task != tasks.EVALUATE:
-        equilibrate(f, w, a, lam)
+        compute_multipliers(f, w, a, lam)
     return code
 
 
 @merged
 def evaluate(f, w, t, q, v, tolerance, a):
-    """Compute from the independent entries of q and v the dependent ones, and the accelerations `a`; return a code.
+    """Compute the dependent entries of q and v from the independent ones, and the accelerations `a`; return a code.
 
     Velocities and accelerations are computed with the Jacobian that was factored last, at a position that differs from
     the final q by at most w.notes[REUSE].
@@ -330,7 +333,10 @@ def evaluate(f, w, t, q, v, tolerance, a):
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Do what `evaluate` does, but up to rounding, for a state that may be accepted; also store lam; return a code."""
+    """Compute the dependent entries of q and v, the accelerations `a` and the multipliers lam; return a code.
+
+    The errors are rounding errors, as a state that may be accepted requires; for other states `evaluate` is faster.
+    """
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
@@ -342,7 +348,7 @@ def evaluate_as_given(f, w, t, q, v, a):
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints in place, and store a and lam, see `project_state`; return a code."""
+    """Project (q, v) onto the constraints in place, and store `a` and lam; return a code. See `project_state`."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -351,7 +357,7 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore(f, w, t, q, v, tolerance):
-    """Compute from the independent entries of q and v the dependent ones, up to rounding; return a code."""
+    """Compute the dependent entries of q and v from the independent ones, up to rounding; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
@@ -369,13 +375,13 @@ def multipliers(f, w, t, q, v, a, lam):
 
 @merged
 def find_tangents(f, w, t, q):
-    """Factor the rows at a position q on the constraints, and store the null space of G in w.D; return a code."""
+    """Store the null space of G at q in w.D, and the rows and their factors in w; return a code."""
     return f.inner(f, w, tasks.FIND_NULL_SPACE, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def prepare_mass(f, w, t, q):
-    """Store M(t, q) in w, and the factors of M if the form of the equations needs them; return a code."""
+    """Store M(t, q) in w, and the factors of M if the form of the equations uses them; return a code."""
     return f.inner(f, w, tasks.PREPARE_MASS, t, q, q, 0.0, w.x, w.lam)
 
 
@@ -387,7 +393,7 @@ def renew_partition(f, w, t, q):
 
 @merged
 def adopt_midpoint_partition(f, w, t_mid, state, new_state):
-    """Adopt the partition chosen by pivoting at the middle of a step; return a code, see `partition_of_midpoint`."""
+    """Adopt the partition that pivoting chooses at the middle of a step; return the code of `partition_of_midpoint`."""
     return f.inner(f, w, tasks.ADOPT_MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 
@@ -399,13 +405,13 @@ def check_redundant(f, w, t, q, v):
 
 @merged
 def rounding_floor(q):
-    """Return the change in a fixed-point iteration that rounding of q may cause: a stagnant iteration has converged."""
+    """Return the largest change that rounding of q may cause in an iteration; below it, the iteration has converged."""
     return max(ROUNDING_OF_CORRECTIONS, ROUNDING_OF_Q * largest_of(q))
 
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by the mechanism's generated code or, where this fails, by the general inner loop; return a code."""
+    """Do a task by the code generated for the mechanism or, if it fails, by the general inner loop; return a code."""
     if task == tasks.EVALUATE_AS_GIVEN:
         w.counters[N_EVALUATIONS] += 1
         w.counters[N_FACTORIZATIONS] += 1

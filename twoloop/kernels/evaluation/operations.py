@@ -15,14 +15,15 @@ PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGE
 # columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of its result among
 # the nodes, or among the results for RESULT. FIRST to SECOND - 1 and SECOND to END - 1: terms of its two arguments
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# indices of the sizes at the beginning of a program, a vector of integers; HEAD is the number of sizes. The rows of the
-# table, the node of each term, and the index of each result in its array follow. The last nodes are the results
-N_NODES, N_ROWS, N_TERMS, N_RESULTS, HEAD = range(5)
+# indices of the sizes at the beginning of a program, a vector of integers; N_SIZES is the number of sizes. After the
+# sizes, the program contains the rows of the table, the node of each term, and the index of each result in its array.
+# The last nodes are the results
+N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 
 @exact
-def operation(kind, x, y):
-    """Return the result of an operation of kind `kind` on x; y is the second factor of a product."""
+def result_of_operation(kind, x, y):
+    """Return the result of the operation `kind`, such as SINE, on x; y is the second factor of a product."""
     if kind == PRODUCT:
         z = x * y
     elif kind == RECIPROCAL:
@@ -45,8 +46,11 @@ def operation(kind, x, y):
 
 
 @exact
-def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return numbers[constant] plus the sum of coefficient times node over terms begin to end - 1; see run_table."""
+def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, end):
+    """Return numbers[constant] plus the sum of coefficient times node over the terms `begin` to `end` - 1.
+
+    `columns` and `coefficients` are as in `run_table`.
+    """
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
@@ -68,29 +72,29 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
     for i in range(n_rows):
         row = rows + N_COLUMNS * i
         begin, middle, end = int(table[row + FIRST]), int(table[row + SECOND]), int(table[row + END])
-        x = affine(nodes, table, columns, numbers, coefficients, constants + 2 * i, begin, middle)
-        y = affine(nodes, table, columns, numbers, coefficients, constants + 2 * i + 1, middle, end)
-        nodes[int(table[row + NODE])] = operation(int(table[row + KIND]), x, y)
+        x = affine_sum(nodes, table, columns, numbers, coefficients, constants + 2 * i, begin, middle)
+        y = affine_sum(nodes, table, columns, numbers, coefficients, constants + 2 * i + 1, middle, end)
+        nodes[int(table[row + NODE])] = result_of_operation(int(table[row + KIND]), x, y)
 
 
 @exact
 def _run_program(program, numbers, nodes, t, q, v):
     """Compute all `nodes` of a program that replaces a callback of a system, from the inputs t, q and v."""
     n_rows = program[N_ROWS]
-    columns = HEAD + N_COLUMNS * n_rows
-    run_table(program, HEAD, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
+    columns = N_SIZES + N_COLUMNS * n_rows
+    run_table(program, N_SIZES, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
 
 
 @exact
 def _result_indices(program):
-    """Return the number of results, the first node that is a result, and where `program` lists the results' indices."""
+    """Return the number of results, the first node that is a result, and where the list of result indices begins."""
     n = program[N_RESULTS]
-    return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
+    return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Store entries of Gamma without a callback; return False if there is no program, or a value is not finite."""
+    """Store Gamma in w.Gamma by its traced program; return False if there is no program, or a value is not finite."""
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -105,7 +109,10 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in rows of G, zero on entry; return False if there is no program, or a value is not finite."""
+    """Store C_q in G by its traced program; return False if there is no program, or a value is not finite.
+
+    G is zero on entry.
+    """
     program = f.jacobian_program
     if program.size == 0:
         return False

@@ -54,9 +54,8 @@ from twoloop.kernels.linalg.markowitz_lu import (
 )
 
 RANK_TOLERANCE = 1e-11  # largest pivot that counts as zero, for rows scaled to 1
-CHANGED = -1  # code returned instead of DONE if a new partition has been adopted
-# largest number of rows that are eliminated only to measure how near a singular position is: with more rows, this takes
-# too long
+PARTITION_CHANGED = -1  # code returned instead of DONE if a new partition has been adopted
+# largest number of rows of G that min_pivot_ratio eliminates: with more rows, the elimination takes too long
 MAX_ROWS_ELIMINATED = 200
 SENSITIVITY_GROWTH = 3.0  # a partition is poor if max|C_qd^-1 C_qi| has grown by more than this factor since its choice
 
@@ -73,7 +72,7 @@ def scale_rows(A):
 
 
 @merged
-def _max_abs_from(row, first):
+def _max_abs_from_column(row, first):
     maximum = 0.0
     for j in range(first, row.size):
         if abs(row[j]) > maximum:  # false for NaN
@@ -82,29 +81,29 @@ def _max_abs_from(row, first):
 
 
 @compiled
-def full_pivoting(A, order, row_order, largest, first, last, max_rank):
+def full_pivoting(A, order, row_order, row_maxima, first, last, max_rank):
     """Do Gaussian elimination of A in place with full pivoting, from pivot `first` on; return the numerical rank.
 
     Pivots are chosen in the rows before row `last`; there are at most `max_rank` pivots, including those before
-    `first`. `order` and `row_order` are permuted as the columns and rows of A; `largest` (one per row) is scratch.
+    `first`. `order` and `row_order` are permuted as the columns and rows of A; `row_maxima` is scratch.
     """
     n_q = A.shape[1]
     k = first
     for i in range(k, last):
-        largest[i] = _max_abs_from(A[i], k)
+        row_maxima[i] = _max_abs_from_column(A[i], k)
     while k < min(last, n_q) and k < max_rank:
         pivot_row = k
         for i in range(k + 1, last):
-            if largest[i] > largest[pivot_row]:
+            if row_maxima[i] > row_maxima[pivot_row]:
                 pivot_row = i
-        if not largest[pivot_row] > RANK_TOLERANCE:
+        if not row_maxima[pivot_row] > RANK_TOLERANCE:
             return k
         pivot_column = k
-        while abs(A[pivot_row, pivot_column]) != largest[pivot_row]:
+        while abs(A[pivot_row, pivot_column]) != row_maxima[pivot_row]:
             pivot_column += 1
         if pivot_row != k:
             row_order[k], row_order[pivot_row] = row_order[pivot_row], row_order[k]
-            largest[pivot_row] = largest[k]
+            row_maxima[pivot_row] = row_maxima[k]
             for j in range(n_q):
                 A[k, j], A[pivot_row, j] = A[pivot_row, j], A[k, j]
         if pivot_column != k:
@@ -117,17 +116,18 @@ def full_pivoting(A, order, row_order, largest, first, last, max_rank):
                 for j in range(k + 1, n_q):
                     A[i, j] -= factor * A[k, j]
                 if i < last:
-                    largest[i] = _max_abs_from(A[i], k + 1)
+                    row_maxima[i] = _max_abs_from_column(A[i], k + 1)
         k += 1
     return k
 
 
 @compiled
-def least_pivot(f, w, t, q):
+def min_pivot_ratio(f, w, t, q):
     """Return the ratio of the smallest to the largest pivot of C_q and A at (t, q), without changing the partition.
 
-    Rows are not scaled, because this would hide that a row has a small norm at a singular position. In the static form,
-    or with more than MAX_ROWS_ELIMINATED rows, the result is w.notes[PIVOT], from the last choice of a partition.
+    Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the static
+    form, or with more than MAX_ROWS_ELIMINATED rows, the result is the smallest pivot of the last choice of a
+    partition, w.notes[PIVOT].
     """
     if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.notes[PIVOT]
@@ -151,7 +151,7 @@ def least_pivot(f, w, t, q):
 
 @compiled
 def _find_pivot_order(w, max_rank, max_rank_v):
-    """Store in w.row_order and w.order the rows and columns of the pivots of w.Gx: those of C_q, then those of A.
+    """Store in w.row_order and w.order the rows and columns of the pivots of w.Gx: first pivots in C_q, then in A.
 
     Returns the rank of C_q, at most `max_rank`, and the rank of C_q and A together, at most `max_rank_v`.
     """
@@ -166,7 +166,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.notes[PIVOT] = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # end of the rows to be eliminated, after rows of A have replaced redundant rows of C_q
+    last = rank  # end of the rows to eliminate: rows of A replace the redundant rows of C_q, from row `rank` on
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -195,7 +195,7 @@ def smallest_pivot(f, w, t, q):
 
 
 @merged
-def _copy_sorted(source, target):
+def _copy_in_ascending_order(source, target):
     for k in range(source.size):
         i = k
         while i > 0 and target[i - 1] > source[k]:
@@ -205,17 +205,17 @@ def _copy_sorted(source, target):
 
 
 @compiled
-def _adopt_order(w):
+def _adopt_pivot_order(w):
     """Store the partition with the pivot order in w, and write its programs; return False if C_qd is singular."""
     rank, rank_v = w.rows.size, w.rows_v.size
     # indices are stored in ascending order, so that equal sets of coordinates are equal partitions
-    _copy_sorted(w.row_order[:rank], w.rows)
-    _copy_sorted(w.order[:rank], w.dependent)
-    _copy_sorted(w.order[rank:], w.independent)
+    _copy_in_ascending_order(w.row_order[:rank], w.rows)
+    _copy_in_ascending_order(w.order[:rank], w.dependent)
+    _copy_in_ascending_order(w.order[rank:], w.independent)
     if w.Rate.size > w.C.size:
-        _copy_sorted(w.row_order[:rank_v], w.rows_v)
-        _copy_sorted(w.order[:rank_v], w.dependent_v)
-        _copy_sorted(w.order[rank_v:], w.independent_v)
+        _copy_in_ascending_order(w.row_order[:rank_v], w.rows_v)
+        _copy_in_ascending_order(w.order[:rank_v], w.dependent_v)
+        _copy_in_ascending_order(w.order[rank_v:], w.independent_v)
     w.notes[SENSITIVITY] = 0.0
     w.notes[LEANING] = 0.0
     w.notes[ORIENTATION] = 0.0
@@ -230,7 +230,7 @@ def _adopt_order(w):
 @compiled
 def write_programs(w):
     """Write the programs that factor the dependent columns of w.G; return False if these columns are singular."""
-    _record_columns(w)
+    _record_columns_of_entries(w)
     w.notes[FACTORED] = 0.0
     is_regular = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
     if is_regular and w.Rate.size > w.C.size:
@@ -239,8 +239,8 @@ def write_programs(w):
 
 
 @compiled
-def _record_columns(w):
-    """Store in w.places (see Work) the columns in which each row of w.G has entries, from w.pattern."""
+def _record_columns_of_entries(w):
+    """Store in w.places (see Work) the column indices of the entries of each row of w.G, from w.pattern."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -254,7 +254,7 @@ def _record_columns(w):
 
 @compiled
 def record_entries(w):
-    """Set w.pattern to 1 where w.G is not zero; return whether an entry is new, so that programs must be rewritten."""
+    """Set w.pattern to 1 where w.G is not zero; return whether this changes w.pattern: then rewrite the programs."""
     if not note_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -263,9 +263,9 @@ def record_entries(w):
 
 @compiled
 def choose_partition(f, w, t, q):
-    """Choose dependent and independent coordinates at (t, q), and the independent rows, and store them; return a code.
+    """Choose and store the dependent and independent coordinates and the independent rows at (t, q); return a code.
 
-    The code is SINGULAR if the rank is less than that of the previous partition, and RANK_DIFFERS, with the ranks in
+    The code is SINGULAR if the rank is less than that of the previous partition. It is RANK_DIFFERS, with the ranks in
     w.notes, if this is the first partition and the workspace is allocated for other ranks.
     """
     w.entries[:] = 0.0
@@ -282,19 +282,20 @@ def choose_partition(f, w, t, q):
         return RANK_DIFFERS
     if rank < w.rows.size or rank_v < w.rows_v.size:
         return SINGULAR
-    return DONE if _adopt_order(w) else SINGULAR
+    return DONE if _adopt_pivot_order(w) else SINGULAR
 
 
 @compiled
 def partition_of_midpoint(f, w, t_mid, state, new_state):
-    """Adopt the partition that full pivoting chooses at the middle of a step; return CHANGED, DONE or SINGULAR.
+    """Adopt the partition that full pivoting chooses at the middle of a step; return a code.
 
-    The reversed step has the same middle, so that the partition, and with it the step by a symmetric tableau, is
-    symmetric in time. A partition that is used until it is poor would depend on the direction of time.
+    The code is PARTITION_CHANGED, DONE or SINGULAR. The reversed step has the same middle, so that the partition, and
+    with it the step by a symmetric tableau, is symmetric in time. A partition that is used until it is poor would
+    depend on the direction of time.
 
-    The middle is computed from the attempt with the current partition, and is not checked again after the step is
-    repeated with the new one. If two partitions are equally good within the difference of the two attempts, O(h^(p+1)),
-    the reversed step may choose the other one.
+    The middle is the mean of `state` and `new_state`, the end of the attempt with the current partition. The choice is
+    not checked again after the step is repeated with the new partition. So the reversed step may choose another
+    partition if two partitions are equally good within the difference of the two attempts, O(h^(p+1)).
     """
     n = w.Q.size
     for j in range(n):
@@ -312,7 +313,7 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
     if is_same and not has_new_entry and _is_same_set(w.independent_v, w.order[rank_v:]):
         return DONE
     w.counters[N_PARTITIONS] += 1
-    return CHANGED if _adopt_order(w) else SINGULAR
+    return PARTITION_CHANGED if _adopt_pivot_order(w) else SINGULAR
 
 
 @merged
@@ -339,16 +340,16 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| of an independent row in a redundant row, in w.minimum, for rows scaled to 1."""
+    """Return the largest |coefficient| in w.minimum, of independent rows in redundant rows, all rows scaled to 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
     for row in range(w.Rate.size):
         if contains(w.rows_v, row):
             continue
-        row_scale = _max_abs_from(w.G[row], 0)
+        row_scale = _max_abs_from_column(w.G[row], 0)
         for k in range(rows.size):
-            scaled_coefficient = abs(w.minimum[begin + k]) * _max_abs_from(w.G[rows[k]], 0)
+            scaled_coefficient = abs(w.minimum[begin + k]) * _max_abs_from_column(w.G[rows[k]], 0)
             if scaled_coefficient > largest * row_scale:
                 largest = scaled_coefficient / row_scale
         begin += rows.size
@@ -357,11 +358,12 @@ def _largest_coefficient(w):
 
 @compiled
 def partition_is_poor(w):
-    """Return whether dependent coordinates move much faster, relative to independent ones, than with a new partition.
+    """Return whether the dependent coordinates have become so sensitive that a new partition is needed.
 
-    The measure is max|C_qd^-1 C_qi|, from w.D. It is near 1 after full pivoting, and grows without bound where the
-    independent coordinates stop being valid. Coefficients of independent rows in redundant rows are compared in the
-    same way: they grow where the independent rows become dependent, so that C_qd is singular, but not C_q.
+    The sensitivity to the independent coordinates is max|C_qd^-1 C_qi|, from w.D. It is near 1 after full pivoting, and
+    grows without bound where the independent coordinates stop being valid. The largest coefficient of an independent
+    row in a redundant row is compared in the same way: it grows where the independent rows become dependent, although
+    the rank stays the same.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
@@ -382,11 +384,11 @@ def partition_is_poor(w):
 MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # largest ratio of a correction to the previous one at which an iteration counts as convergent
 ROUNDING_OF_CORRECTIONS = 1e-12  # largest correction due to rounding alone, relative to the largest coordinate
-# factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding: the rounding error of a position of
-# 1 m turns a rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
+# factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding, because lever arms amplify errors:
+# the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
 AMPLIFICATION = 1e3
 ROUNDING_OF_ROWS = 2e-15  # largest |C_i| that counts as a rounding error, relative to the largest |G_ij q_j|
-MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.notes[ROUNDED], the rounding of positions
+MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.notes[ROUNDED], the rounding error of q
 MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
 
 
@@ -403,7 +405,7 @@ def _factor_in_new_order(w, t, q):
 
 
 @merged
-def factor_rows(w, t, q):
+def factor_dependent_columns(w, t, q):
     """Factor the dependent columns of w.G; return DONE, SINGULAR or NOT_FINITE."""
     w.notes[FACTORED] = 0.0
     ratio = factor(w.entries, w.index, w.values)
@@ -416,16 +418,16 @@ def factor_rows(w, t, q):
 
 
 @merged
-def factor_dependent(f, w, t, q):
+def evaluate_and_factor_columns(f, w, t, q):
     """Store C_q and A at (t, q) in w.G, and factor the dependent columns; return DONE, SINGULAR or NOT_FINITE."""
     w.notes[KNOWN] = 0.0
     clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
-    return factor_rows(w, t, q)
+    return factor_dependent_columns(w, t, q)
 
 
 @compiled
-def rows_hold(w, q):
+def is_on_constraints(w, q):
     """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
     for i in range(w.C.size):
         largest_term = 0.0
@@ -440,8 +442,9 @@ def rows_hold(w, q):
 def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve eq. (15) by Newton's method for the dependent positions in q; return a code.
 
-    The iteration ends after a correction of at most `tolerance`. On return, rows and factors in w belong to q, or to q
-    before the last correction, if this was at most `reuse_limit`; the fused callback also stores w.Rate and w.Gamma.
+    The iteration ends after a correction of at most `tolerance`. On return, the rows and factors in w are those at q.
+    If the last correction was at most `reuse_limit`, they are those at q before this correction. The fused callback
+    also stores w.Rate and w.Gamma.
     """
     last_correction = np.inf
     has_converged = w.C.size == 0
@@ -449,9 +452,9 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     for _ in range(MAX_ITERATIONS):
         if is_fused:
             kinematics(f, w, t, q, v)
-            code = factor_rows(w, t, q)
+            code = factor_dependent_columns(w, t, q)
         else:
-            code = factor_dependent(f, w, t, q)
+            code = evaluate_and_factor_columns(f, w, t, q)
         if code != DONE or has_converged:
             return code
         if not is_fused:
@@ -475,7 +478,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
             # accept a correction that is due to rounding; otherwise Newton's method has left its region of convergence,
             # and could converge to another assembly of the mechanism
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            has_converged = correction <= limit or (correction <= AMPLIFICATION * limit and rows_hold(w, q))
+            has_converged = correction <= limit or (correction <= AMPLIFICATION * limit and is_on_constraints(w, q))
             if not has_converged:
                 return INNER_DIVERGED
         last_correction = correction
@@ -525,8 +528,8 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
 
 
 @compiled
-def redundant_rows_hold(f, w, t, q, v):
-    """Return DONE if an accepted state, whose C_q and A are in w.G, satisfies all rows, else ROWS_CONTRADICT."""
+def check_redundant_rows(f, w, t, q, v):
+    """Return DONE if the accepted state (q, v), with its rows in w.G, satisfies all rows, else ROWS_CONTRADICT."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))

@@ -73,26 +73,34 @@ from twoloop.kernels.evaluation.partition import (
     ROUNDING_OF_ROWS,
 )
 from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
-from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
-from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of
+from twoloop.kernels.linalg.sparse_ldl import factor, load_matrix, solve, solve_refined
+from twoloop.kernels.linalg.symbolic_factorization import (
+    N_OFF_DIAGONAL,
+    N_PIVOTS,
+    jacobian_entries_of,
+    mass_entries_of,
+    pivot_order_of,
+)
 
-# pivot, relative to the size of its row, below which a row is checked, because the pivot may be a rounding error
+# rows whose pivots are smaller than this, relative to the size of the row, are checked: such a pivot may be only a
+# rounding error
 SUSPECT_PIVOT = 1e-6
 MIN_PIVOT = 1e-10  # smallest pivot, relative to the size of its row, with which factors by 1-by-1 pivots are accurate
-MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the others is at most this
+MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows is at most this
 PROJECT_STAGES = 2.0  # value of w.notes[NEARLY_SINGULAR] near a singular position, where stages must be projected
-# solutions are refined once, or twice, if the smallest pivot, relative to the size of its row, is at most this
-REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7
+# solutions are refined once if the smallest pivot, relative to the size of its row, is at most REFINE_ONCE_BELOW, and
+# twice if it is at most REFINE_TWICE_BELOW
+REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
 
 @compiled
 def fill_mass_values(f, w, t, q):
-    """Store the entries of M(t, q) in w.mass_values, unless M is constant and dense: then they are already stored."""
+    """Store the entries of M(t, q) in w.mass_values, unless M is constant and dense, when they are already stored."""
     if f.flags[MASS_VALUES_GIVEN] == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
     elif w.M.size > 0:
-        rows, columns, _ = mass_of(f.static_program)
+        rows, columns, _ = mass_entries_of(f.static_program)
         for k in range(rows.size):
             w.M[rows[k], columns[k]] = 0.0
         f.mass(t, q, f.p, w.M)
@@ -107,7 +115,7 @@ def fill_jacobian_values(f, w, t, q):
         w.jacobian_values[:] = 0.0
         f.jacobian_values(t, q, f.p, w.jacobian_values)
         return
-    rows, columns, _ = jacobian_of(f.static_program)
+    rows, columns, _ = jacobian_entries_of(f.static_program)
     for k in range(rows.size):
         w.G[rows[k], columns[k]] = 0.0
     if not jacobian_by_program(f, w, t, q, w.G):
@@ -117,20 +125,20 @@ def fill_jacobian_values(f, w, t, q):
 
 
 @compiled
-def _factor(f, w, min_sine_square):
-    """Factor M and G from their entries in w; return the smallest squared sine, see `factor` of sparse_ldl.py."""
+def _factor_entries(f, w, min_sine_square):
+    """Factor [M G^T; G 0] from the entries in w; return the smallest squared sine, see `factor` of sparse_ldl.py."""
     w.counters[N_FACTORIZATIONS] += 1
     stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
-    load(f.static_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
-    smallest = factor(f.static_program, w.counts, w.factors, w.pivot_sizes, min_sine_square)
+    load_matrix(f.static_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
+    smallest = factor(f.static_program, w.is_independent, w.factors, w.pivot_sizes, min_sine_square)
     w.notes[SMALLEST] = smallest
     w.notes[PIVOT] = np.sqrt(max(smallest, 0.0))
     return smallest
 
 
 @compiled
-def _factor_fault(w, t, q):
-    """Return why a factorization failed: NOT_FINITE, NEEDS_DENSE if M is singular, SINGULAR if rows are dependent."""
+def _failure_of_factorization(w, t, q):
+    """Return the code of a failed factorization: NOT_FINITE, NEEDS_DENSE (singular M) or SINGULAR (dependent rows)."""
     if not finite_vector(w.mass_values):
         return not_finite(w.notes, MASS, t, q)
     if not finite_vector(w.jacobian_values):
@@ -139,23 +147,23 @@ def _factor_fault(w, t, q):
 
 
 @compiled
-def factor_at(f, w, t, q):
-    """Store the entries of M and G at (t, q), and factor them with the independent rows; return a code."""
+def factor_equations_at(f, w, t, q):
+    """Store the entries of M and G at (t, q), and factor the equations of the independent rows; return a code."""
     if f.flags[CONSTANT_MASS] == 0:
         fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
-    smallest = _factor(f, w, MIN_PIVOT)
+    smallest = _factor_entries(f, w, MIN_PIVOT)
     if not smallest > 0.0:
-        return _factor_fault(w, t, q)
-    if _count_independent(w.counts) == w.rows_v.size:
+        return _failure_of_factorization(w, t, q)
+    if _count_independent(w.is_independent) == w.rows_v.size:
         return DONE
-    w.counters[N_PARTITIONS] += 1  # independent rows have become dependent: others may replace them
+    w.counters[N_PARTITIONS] += 1  # independent rows have become dependent: other rows may replace them
     code = _choose_rows(f, w, t, q)
     return _adopt_rows(w) if code == DONE else code
 
 
 @compiled
-def solve_values(f, w, n_corrections):
+def solve_unknowns(f, w, n_corrections):
     """Replace the right-hand side in w.unknowns by the solution, corrected `n_corrections` times by refinement."""
     n = f.static_program[N_PIVOTS]
     scratch = w.solutions
@@ -163,7 +171,7 @@ def solve_values(f, w, n_corrections):
         f.static_program,
         w.mass_values,
         w.jacobian_values,
-        w.counts,
+        w.is_independent,
         w.factors,
         scratch[3 * n :],
         w.unknowns,
@@ -176,69 +184,72 @@ def solve_values(f, w, n_corrections):
 
 @compiled
 def n_refinements(w):
-    """Return how many times solutions with the factors in w must be refined."""
+    """Return how many times solutions with the factors in w must be refined: 0, 1 or 2."""
     smallest = w.notes[SMALLEST]
-    return 0 if smallest > REFINED_ONCE else 1 if smallest > REFINED_TWICE else 2
+    return 0 if smallest > REFINE_ONCE_BELOW else 1 if smallest > REFINE_TWICE_BELOW else 2
 
 
 @compiled
-def _sine_of_row(f, w, row, square):
-    """Return the sine of the angle between row g, number `row` of G, and the independent rows; `square`: g M^-1 g^T."""
+def _sine_to_independent_rows(f, w, row, square):
+    """Return the sine of the angle between row g, number `row` of G, and the independent rows, in the metric of M^-1.
+
+    `square` is g M^-1 g^T.
+    """
     x, part = w.unknowns, 0.0
     x[:] = 0.0
-    rows, columns, _ = jacobian_of(f.static_program)
+    rows, columns, _ = jacobian_entries_of(f.static_program)
     for k in range(rows.size):  # set x to [g, 0]
         if rows[k] == row:
             x[columns[k]] += w.jacobian_values[k]
-    solve_values(f, w, 2)
-    rows, columns, _ = mass_of(f.static_program)
+    solve_unknowns(f, w, 2)
+    rows, columns, _ = mass_entries_of(f.static_program)
     for k in range(rows.size):  # add up x^T M x
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
 
 
 @compiled
-def _count_independent(counts):
+def _count_independent(is_independent):
     n_independent = 0
-    for i in range(counts.size):
-        n_independent += int(counts[i])
+    for i in range(is_independent.size):
+        n_independent += int(is_independent[i])
     return n_independent
 
 
 @compiled
 def _choose_rows(f, w, t, q):
-    """Choose independent rows, store the choice (1 or 0) in w.counts, and factor with these rows; return a code.
+    """Store in w.is_independent 1 for each chosen independent row, else 0; factor their equations; return a code.
 
     Rows with small pivots are left out at first, then added one by one if they are independent of the chosen rows.
     """
-    w.counts[:] = 1.0
-    if not _factor(f, w, SUSPECT_PIVOT) > 0.0:
-        return _factor_fault(w, t, q)
-    order, n_q = order_of(f.static_program), w.Q.size
-    copy(w.counts, w.z)  # w.z is 0 for rows that must be checked
+    w.is_independent[:] = 1.0
+    if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
+        return _failure_of_factorization(w, t, q)
+    order, n_q = pivot_order_of(f.static_program), w.Q.size
+    copy(w.is_independent, w.z)  # w.z is 0 for rows that must be checked
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
             continue
-        sine = _sine_of_row(f, w, row, w.pivot_sizes[k])
+        sine = _sine_to_independent_rows(f, w, row, w.pivot_sizes[k])
         if sine <= MAX_DEPENDENT_SINE:
             continue
-        n_independent = _count_independent(w.counts)
-        w.counts[row] = 1.0
-        smallest = _factor(f, w, MIN_PIVOT) if sine * sine > MIN_PIVOT else 0.0
-        if not smallest > 0.0 or _count_independent(w.counts) != n_independent + 1:
-            return _factor_fault(w, t, q)
+        n_independent = _count_independent(w.is_independent)
+        w.is_independent[row] = 1.0
+        smallest = _factor_entries(f, w, MIN_PIVOT) if sine * sine > MIN_PIVOT else 0.0
+        if not smallest > 0.0 or _count_independent(w.is_independent) != n_independent + 1:
+            return _failure_of_factorization(w, t, q)
     return DONE
 
 
 @compiled
 def _adopt_rows(w):
-    """Store the indices of the rows with w.counts = 1 in w.rows_v; return DONE, or SINGULAR if their number differs."""
-    if _count_independent(w.counts) != w.rows_v.size:
+    """Store the indices of the independent rows in w.rows_v; return DONE, or SINGULAR if their number has changed."""
+    if _count_independent(w.is_independent) != w.rows_v.size:
         return SINGULAR
     position = 0
-    for i in range(w.counts.size):
-        if w.counts[i] != 0.0:
+    for i in range(w.is_independent.size):
+        if w.is_independent[i] != 0.0:
             w.rows_v[position] = i
             position += 1
     return DONE
@@ -246,14 +257,14 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose and store the independent rows at (t, q); return RANK_DIFFERS if w is allocated for another rank."""
+    """Choose and store the independent rows at (t, q); return a code, RANK_DIFFERS if w is made for another rank."""
     w.counters[N_PARTITIONS] += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
     code = _choose_rows(f, w, t, q)
     if code != DONE:
         return code
-    n_independent = _count_independent(w.counts)
+    n_independent = _count_independent(w.is_independent)
     if w.notes[GENERATION] == 0.0 and n_independent != w.rows_v.size:
         w.notes[RANK] = w.notes[RANK_V] = n_independent
         return RANK_DIFFERS
@@ -261,24 +272,24 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-REGULARIZATION = 1e-11  # diagonal entry of W, relative to the sum of squares of the column of G
-CONVERGED_RESIDUAL = 1e-14  # residual at which the refinement ends, relative to the largest force
-MAX_RESIDUAL = 1e-9  # largest residual, relative to the largest force, that is accepted if it no longer decreases
+REGULARIZATION = 1e-11  # diagonal entries of W (see above), relative to the sums of squares of the columns of G
+CONVERGED_RESIDUAL = 1e-14  # residual of G^T lam = b, relative to max|b|, at which the refinement ends
+MAX_RESIDUAL = 1e-9  # largest residual of G^T lam = b, relative to max|b|, that is accepted if it no longer decreases
 MAX_SOLUTIONS = 30  # largest number of linear solutions in the refinement of multipliers of least norm
 
 
 @compiled
 def _load_least_norm_matrix(program, jacobian, n_q, weights, values):
-    """Store the entries of the matrix [W G^T; G -1] in their slots in `values`; `weights` (n_q) is scratch."""
-    rows, columns, slots = jacobian_of(program)
+    """Store the entries of the matrix [W G^T; G -1] in `values`, in the slots of the program; `weights` is scratch."""
+    rows, columns, slots = jacobian_entries_of(program)
     for j in range(n_q):
         weights[j] = 0.0
     largest = 0.0
     for k in range(rows.size):
         weights[columns[k]] += jacobian[k] * jacobian[k]
         largest = max(largest, weights[columns[k]])
-    order, n = order_of(program), program[N_PIVOTS]
-    for s in range(n + program[N_OFF]):
+    order, n = pivot_order_of(program), program[N_PIVOTS]
+    for s in range(n + program[N_OFF_DIAGONAL]):
         values[s] = 0.0
     for k in range(n):
         values[k] = (
@@ -295,7 +306,7 @@ def _fill_residual(program, jacobian, force, x, r):
     copy(force, r[:n_q])
     for i in range(n_q, x.size):
         r[i] = x[i]
-    rows, columns, _ = jacobian_of(program)
+    rows, columns, _ = jacobian_entries_of(program)
     for k in range(rows.size):
         i, j = n_q + rows[k], columns[k]
         r[j] -= jacobian[k] * x[i]
@@ -310,19 +321,19 @@ def least_norm(f, w, lam):
     """Replace lam by the multipliers of least norm with the same G^T lam; return DONE, or NEEDS_DENSE if this fails."""
     program, n_q = f.static_program, w.Q.size
     n = program[N_PIVOTS]
-    n_factors = n + program[N_OFF] + 1
-    values, counts, no_stiffness = w.minimum[:n_factors], w.z, w.g
+    n_factors = n + program[N_OFF_DIAGONAL] + 1
+    values, is_independent, no_stiffness = w.minimum[:n_factors], w.z, w.g
     force, x = w.minimum[n_factors : n_factors + n_q], w.minimum[n_factors + n_q :]
     change, y, weights = w.solutions[:n], w.solutions[n : 2 * n], w.solutions[2 * n : 3 * n]
-    rows, columns, _ = jacobian_of(program)
+    rows, columns, _ = jacobian_entries_of(program)
     for j in range(n_q):
         force[j] = 0.0
     for k in range(rows.size):
         force[columns[k]] += w.jacobian_values[k] * lam[rows[k]]
     _load_least_norm_matrix(program, w.jacobian_values, n_q, weights, values)
     for i in range(lam.size):
-        counts[i], no_stiffness[i] = 1.0, 0.0
-    if not factor(program, counts, values, w.pivot_sizes, 0.0) > 0.0:
+        is_independent[i], no_stiffness[i] = 1.0, 0.0
+    if not factor(program, is_independent, values, w.pivot_sizes, 0.0) > 0.0:
         return NEEDS_DENSE
     for i in range(n):
         x[i] = 0.0
@@ -347,14 +358,14 @@ def least_norm(f, w, lam):
 @compiled
 def _add_jacobian_times(f, w, x, out):
     """Add G x to `out` in place."""
-    rows, columns, _ = jacobian_of(f.static_program)
+    rows, columns, _ = jacobian_entries_of(f.static_program)
     for k in range(rows.size):
         out[rows[k]] += w.jacobian_values[k] * x[columns[k]]
 
 
 @compiled
 def _fill_gamma(f, w, t, q, v):
-    """Store the right-hand side of G a = Gamma in w.Gamma; return DONE, or NEEDS_DENSE if this requires differences."""
+    """Store Gamma, of G a = Gamma, in w.Gamma; return DONE, or NEEDS_DENSE if only differences could compute Gamma."""
     w.Gamma[:] = 0.0
     if f.flags[GAMMA_GIVEN] == 1:
         f.gamma(t, q, v, f.p, w.Gamma)
@@ -363,8 +374,8 @@ def _fill_gamma(f, w, t, q, v):
 
 
 @compiled
-def _acceleration_fault(w, t, q):
-    """Store in w.notes which callback made an acceleration non-finite; return NOT_FINITE."""
+def _failure_of_accelerations(w, t, q):
+    """Store in w.notes the callback whose values made an acceleration non-finite; return NOT_FINITE."""
     if not finite_vector(w.Gamma):
         return not_finite(w.notes, GAMMA, t, q)
     if not finite_vector(w.Q):
@@ -373,8 +384,8 @@ def _acceleration_fault(w, t, q):
 
 
 @compiled
-def _accelerate(f, w, t, q, v, a):
-    """Store the accelerations at (q, v) in `a`, and the multipliers in w.z, by the factors in w; return a code."""
+def _compute_accelerations(f, w, t, q, v, a):
+    """Store the accelerations at (q, v) in `a`, and the multipliers in w.z, with the factors in w; return a code."""
     w.counters[N_EVALUATIONS] += 1
     code = _fill_gamma(f, w, t, q, v)
     if code != DONE:
@@ -384,26 +395,26 @@ def _accelerate(f, w, t, q, v, a):
     n = a.size
     copy(w.Q, w.unknowns[:n])
     copy(w.Gamma, w.unknowns[n:])
-    solve_values(f, w, n_refinements(w))
+    solve_unknowns(f, w, n_refinements(w))
     copy(w.unknowns[:n], a)
     copy(w.unknowns[n:], w.z)
-    return DONE if finite_vector(a) else _acceleration_fault(w, t, q)
+    return DONE if finite_vector(a) else _failure_of_accelerations(w, t, q)
 
 
 @compiled
-def _equilibrate(f, w, lam):
-    """Copy the multipliers in w.z to lam; if rows are redundant, replace them by those of least norm; return a code."""
+def _compute_multipliers(f, w, lam):
+    """Store in lam the multipliers w.z or, if rows are redundant, the multipliers of least norm; return a code."""
     copy(w.z, lam)
     return least_norm(f, w, lam) if w.rows_v.size < lam.size else DONE
 
 
 @compiled
 def _add_least_correction(f, w, x):
-    """Add to x the least correction in the metric of M that changes G x by w.g; return its largest entry."""
+    """Add to x the least correction, in the metric of M, that changes G x by w.g; return max|correction|."""
     n = x.size
     w.unknowns[:n] = 0.0
     copy(w.g, w.unknowns[n:])
-    solve_values(f, w, 0)
+    solve_unknowns(f, w, 0)
     largest = 0.0
     for j in range(n):
         if not np.isfinite(w.unknowns[j]):
@@ -414,9 +425,9 @@ def _add_least_correction(f, w, x):
 
 
 @compiled
-def _rows_hold(f, w, q):
+def _is_on_constraints(f, w, q):
     """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
-    rows, columns, _ = jacobian_of(f.static_program)
+    rows, columns, _ = jacobian_entries_of(f.static_program)
     largest_terms = w.solutions[: w.g.size]
     largest_terms[:] = 0.0
     for k in range(rows.size):
@@ -429,11 +440,14 @@ def _rows_hold(f, w, q):
 
 @compiled
 def _project(f, w, t, q, v, theta):
-    """Project (q, v) onto the constraints in place; return a code. The final factors precede the last correction."""
+    """Project (q, v) onto the constraints in place; return a code.
+
+    On return, the factors in w are those at q before the last correction.
+    """
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):
-        code = factor_at(f, w, t, q)
+        code = factor_equations_at(f, w, t, q)
         if code != DONE:
             return code
         w.C[:] = 0.0
@@ -460,7 +474,7 @@ def _project(f, w, t, q, v, theta):
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
             return (
                 DONE
-                if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _rows_hold(f, w, q))
+                if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))
                 else INNER_DIVERGED
             )
         last_correction = max(correction_q, theta)
@@ -468,20 +482,20 @@ def _project(f, w, t, q, v, theta):
 
 
 @compiled
-def _mass_pattern_holds(w):
-    """Return whether w.M is empty, or has nonzero entries only where the program expects them."""
+def _has_expected_mass_pattern(w):
+    """Return whether w.M is empty, or nonzero only at the entries for which the program was written."""
     return w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern)
 
 
 @compiled
 def _check_redundant_rows(f, w, t, q, v):
-    """Return DONE if an accepted state, with its entries of G in w, satisfies all rows, else ROWS_CONTRADICT."""
+    """Return DONE if the accepted state (q, v) satisfies all rows, else ROWS_CONTRADICT; uses the entries of G in w."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
     copy(w.Rate, w.g)
     _add_jacobian_times(f, w, v, w.g)
-    rows, _, _ = jacobian_of(f.static_program)
+    rows, _, _ = jacobian_entries_of(f.static_program)
     largest = w.solutions[: w.g.size]
     largest[:] = 0.0
     for k in range(rows.size):
@@ -495,11 +509,11 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _solve_system(f, w, r, c, a, lam):
-    """Store in `a` and lam the accelerations and multipliers for the right-hand side (r, c); return DONE."""
+    """Store in `a` and lam the solution of M a + G^T lam = r and G a = c, with the factors in w; return DONE."""
     n = r.size
     copy(r, w.unknowns[:n])
     copy(c, w.unknowns[n:])
-    solve_values(f, w, n_refinements(w))
+    solve_unknowns(f, w, n_refinements(w))
     copy(w.unknowns[:n], a)
     copy(w.unknowns[n:], lam)
     return DONE
@@ -508,7 +522,7 @@ def _solve_system(f, w, r, c, a, lam):
 @compiled
 def _do_other_task(f, w, task, t, q, v, a, lam):
     if task == tasks.FIND_NULL_SPACE:
-        return factor_at(f, w, t, q)
+        return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:
         return choose_rows(f, w, t, q)
     if task == tasks.PREPARE_MASS:
@@ -529,10 +543,10 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
         if code == DONE and task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
             code = _project(f, w, t, q, v, tolerance)
         if code == DONE:
-            code = factor_at(f, w, t, q)
-        return _accelerate(f, w, t, q, v, a) if code == DONE else code
+            code = factor_equations_at(f, w, t, q)
+        return _compute_accelerations(f, w, t, q, v, a) if code == DONE else code
     if task == tasks.MULTIPLIERS:
-        return _equilibrate(f, w, lam)
+        return _compute_multipliers(f, w, lam)
     if task >= tasks.FIND_NULL_SPACE:
         return _do_other_task(f, w, task, t, q, v, a, lam)
     code = DONE
@@ -540,8 +554,8 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
         code = _project(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)
         if code != DONE or task == tasks.RESTORE:
             return code
-    code = _accelerate(f, w, t, q, v, a)
+    code = _compute_accelerations(f, w, t, q, v, a)
     if code != DONE:
         return code
-    code = _equilibrate(f, w, lam)
-    return code if _mass_pattern_holds(w) else NEEDS_DENSE
+    code = _compute_multipliers(f, w, lam)
+    return code if _has_expected_mass_pattern(w) else NEEDS_DENSE

@@ -1,4 +1,4 @@
-"""Number the tasks of an inner loop; inner_loop.py has a function for each task, whose docstring explains the task."""
+"""Number the tasks of an inner loop. In inner_loop.py, each task has a function, whose docstring explains the task."""
 
 (
     EVALUATE,

@@ -72,22 +72,23 @@ def call_lapack(typing_context, address, arguments):
 # smallest number of coordinates for which Newton steps by banded algebra count as faster than by dense algebra: the
 # measured limit is 36 to 75, on chains of bandwidth 1 to 11 and on beams. Single evaluations, as in a fixed-point
 # iteration, are faster only above about 150 coordinates; with 56 coordinates they take a third longer
-BANDED_FROM = 56
+MIN_BANDED_SIZE = 56
 
 
 def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
     """Return whether banded algebra is faster than dense algebra, and its arrays fit in those of dense algebra."""
-    return n_q >= max(BANDED_FROM, 3 * bandwidth + 2 + 2 * n_c)
+    return n_q >= max(MIN_BANDED_SIZE, 3 * bandwidth + 2 + 2 * n_c)
 
 
 @merged
-def banded_mass(f):
+def has_banded_mass(f):
     """Return whether M is factored as a banded matrix; False if M is diagonal, because divisions are faster."""
     return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
 
 
 @inlined
 def _mass_band(w, b):
+    """Return a view of w.L for the upper triangle of M and, after a factorization, its Cholesky factor."""
     n = w.Q.size
     return w.L.reshape(n * n)[: n * (b + 1)].reshape((n, b + 1))
 
@@ -147,7 +148,7 @@ def add_banded_mass_times(f, w, x, y):
 
 @inlined
 def lu_band(numbers, n, b):
-    """Return the view of `numbers` for B and, after a factorization, its LU: entry (i, j) is at [j, 2 b + i - j]."""
+    """Return the view of `numbers` for B and, after a factorization, for its LU; entry (i, j) is [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 
@@ -171,7 +172,10 @@ def _scratch(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the bordered system in `numbers` by xGBTRF (`factorize`) and xGBTRS (`substitute`); return a code."""
+    """Factor the bordered system in `numbers`; return a code.
+
+    `factorize` and `substitute` are the indices of the LAPACK routines, such as DGBTRF and DGBTRS.
+    """
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     exchanges = pivots[: n - n_c].view(np.int32)

@@ -15,7 +15,7 @@ def copy(source, target):
 
 @merged
 def copy_matrix(source, target):
-    """Copy the first rows of the matrix `source` to `target`, as many rows as both matrices have."""
+    """Copy the matrix `source` to `target` row by row, as many rows as the smaller of both matrices has."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -41,7 +41,7 @@ def contains(numbers, number):
 
 @merged
 def _magnitude(x):
-    """Return |x|, or |Re x| + |Im x| of a complex number, which needs no square root (as in LAPACK)."""
+    """Return |x| of a real number, or |Re x| + |Im x| of a complex one, which needs no square root (as in LAPACK)."""
     return abs(x.real) + abs(x.imag)
 
 
@@ -201,7 +201,7 @@ def has_new_entries(G, pattern):
 
 @compiled
 def note_pattern(G, pattern):
-    """Set `pattern` to 1 where G is not zero; return whether this changes `pattern`."""
+    """Set `pattern` to 1 where G is not zero; return whether an entry of `pattern` changes."""
     if not has_new_entries(G, pattern):
         return False
     has_new = False

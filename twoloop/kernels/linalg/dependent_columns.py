@@ -15,7 +15,7 @@ ROWS_SEARCHED = 4  # pivot blocks are sought only in this number of rows, those 
 # for 34 %. The last tier is well above MIN_PIVOT_SQUARE of generate/null_space.py: a choice stays valid for some motion
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 MIN_CONSTANT_PIVOT = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
-CANCELLATION = 1e-12  # largest difference of two constants that counts as zero, relative to the subtracted constant
+CANCELLATION = 1e-12  # largest |a - b| of two constants that counts as zero, relative to |b|
 
 
 def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
@@ -68,7 +68,7 @@ def _is_pivot_block(R, column_active, squared_norms, i, k, j, l, max_squares, mi
 
 @compiled
 def _find_varying_pivots(R, K, row_active, column_active, squared_norms, rows, column_sizes, block):
-    """Store a pivot block of varying entries in `block`, two rows and two columns; return False if there is none.
+    """Store the two rows and two columns of a pivot block of varying entries in `block`; return False if none is found.
 
     A single pivot has its row and its column twice. `rows` and `column_sizes` are scratch.
     """
@@ -123,7 +123,7 @@ def _find_varying_pivots(R, K, row_active, column_active, squared_norms, rows, c
 
 @compiled
 def _subtract_multiple(R, K, column_active, row_sizes, column_sizes, r, j, i):
-    """Subtract from row r the multiple of row i that removes entry (r, j); row i is already solved for column j."""
+    """Subtract from row r the multiple of row i that removes entry (r, j); entry (i, j) is 1."""
     factor, kind = R[r, j], K[r, j]
     R[r, j], K[r, j] = 0.0, NONE
     if kind == NONE:
@@ -145,8 +145,8 @@ def _subtract_multiple(R, K, column_active, row_sizes, column_sizes, r, j, i):
 def _eliminate(R, K, row_active, column_active, row_sizes, column_sizes, i, k, j, l):
     """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate these columns.
 
-    `row_sizes` and `column_sizes` are the numbers of entries left in each row and column. They stay correct only while
-    single rows are eliminated (i == k), not after a block of two rows.
+    `row_sizes` and `column_sizes`, the numbers of entries left in each row and column, are updated correctly only if
+    i == k.
     """
     m, n = R.shape
     row_active[i] = row_active[k] = column_active[j] = column_active[l] = 0

@@ -18,46 +18,46 @@ solution to column columns_of(index)[k].
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
-THRESHOLD = 0.1  # smallest pivot, relative to the largest entry in its column
-DENSE_ABOVE = 0.5  # factors are dense if the number of subtractions, relative to a dense factorization, exceeds this
+MIN_PIVOT_RATIO = 0.1  # smallest pivot, relative to the largest entry in its column
+MAX_SPARSE_RATIO = 0.5  # largest number of subtractions of sparse factors, relative to that of dense factors
 MAX_SPARSE_ROWS = 3  # with at most this number of rows, factors are sparse whatever the number of subtractions
 ZERO_PIVOT = 1e-11  # largest pivot that counts as zero, relative to the largest pivot so far
-# memory of a program: it has room for at most MIN_SUBTRACTIONS + PER_ROW r subtractions for r rows; with more, factors
-# are dense
-MIN_SUBTRACTIONS, PER_ROW = 2000, 100
-MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or a column of the sparse factors; with more, dense
+# a program of r rows has at most MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r subtractions, for which memory is
+# allocated; if more are needed, factors are dense
+MIN_SUBTRACTIONS, SUBTRACTIONS_PER_ROW = 2000, 100
+MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or column of sparse factors; with more, they are dense
 
-ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # results of `order`; TOO_MANY: too many entries for sparse factors
+ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last: use dense factors
 
 # indices in `index`. SIZE: number of rows r. DENSE: 1 if the factors are dense. SIGN: sign of the permutations (1, -1).
 # N_SLOTS: number of entries of the factors. FIRST_LOWER: first entry of L. WIDTH: number of columns of the Jacobian.
-# Arrays follow: rows (r), columns (r), row exchanges of dense factors (r), first entries (r) and ends (r) of the rows
-# of U, first entries of the rows of L (r + 1); row, column and source of each entry, where the source is the index of a
-# number in the matrix; the targets of the subtractions; and the lists for choosing an order. The entries are sorted:
-# first the diagonal, then U from its last row up, then L from its first row down
+# After these numbers, `index` contains arrays: rows (r), columns (r), row exchanges of dense factors (r), first entries
+# (r) and ends (r) of the rows of U, first entries of the rows of L (r + 1); row, column and source of each entry, where
+# the source is the index of a number in the matrix; the targets of the subtractions; and the lists for choosing an
+# order. The entries are sorted: first the diagonal, then U from its last row up, then L from its first row down
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
-# indices of arrays with one number per row or column. ROW_SIZE: entries in the list of a row. COLUMN_SIZE: entries in
-# the list of a column, without eliminated rows. ROW_LEFT: entries of a row in columns that are not eliminated.
-# ROW_POSITION, COLUMN_POSITION: positions in the order so far. WHERE: scratch, for 1 + the index of a row in the list
-# of a column, or for the slot of the entry in a column
-ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_POSITION, COLUMN_POSITION, WHERE, N_COUNTS = range(7)
+# indices of arrays with one number per row or column. ROW_SIZE: number of entries in the list of a row. COLUMN_SIZE:
+# number of entries in the list of a column, without eliminated rows. ACTIVE_ROW_SIZE: number of entries of a row in
+# columns that are not eliminated. ROW_POSITION, COLUMN_POSITION: positions in the order so far. LOOKUP: scratch, for
+# 1 + the index of a row in the list of a column, or for the slot of the entry in a column
+ROW_SIZE, COLUMN_SIZE, ACTIVE_ROW_SIZE, ROW_POSITION, COLUMN_POSITION, LOOKUP, N_COUNTS = range(7)
 # indices of lists. COLUMNS, SOURCES: columns and sources of a row's entries. ROWS: rows of a column's entries
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
 def index_size(r: int) -> int:
-    """Return the length of `index` for r rows."""
+    """Return the length of `index`, the program, for r rows."""
     return N_HEAD + 6 * r + 1 + (3 + N_LISTS) * r * min(r, MAX_ENTRIES_PER_LINE) + max_subtractions(r) + N_COUNTS * r
 
 
 def values_size(r: int, may_be_dense: bool = True) -> int:
-    """Return the length of `values` for r rows."""
+    """Return the length of `values`, the factors, for r rows."""
     return r * (r if may_be_dense else min(r, MAX_ENTRIES_PER_LINE)) + r
 
 
 def max_subtractions(r: int) -> int:
     """Return the largest number of subtractions in a program of r rows, for which memory is allocated."""
-    return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + PER_ROW * r)
+    return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r)
 
 
 @inlined
@@ -103,8 +103,11 @@ def begin_entries(r):
 
 
 @inlined
-def lists_of(index, values):
-    """Return views of both arrays for `order`: counts (N_COUNTS, r), lists (N_LISTS, r, width), numbers (r, width)."""
+def views_of_lists(index, values):
+    """Return views of both arrays for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
+
+    w is the largest number of entries in a row or column.
+    """
     r = index[SIZE]
     width = min(r, MAX_ENTRIES_PER_LINE)
     counts = index[index.size - N_COUNTS * r :].reshape((N_COUNTS, r))
@@ -132,7 +135,7 @@ def put_entry(matrix, i, j, number, source):
     lists[ROWS, j, m], numbers[j, m] = i, number
     counts[ROW_SIZE, i] += 1
     counts[COLUMN_SIZE, j] += 1
-    counts[ROW_LEFT, i] += 1
+    counts[ACTIVE_ROW_SIZE, i] += 1
     return True
 
 
@@ -140,14 +143,14 @@ def put_entry(matrix, i, j, number, source):
 def _choose_pivot(matrix, rows, columns, k):
     """Return row and column of pivot k; (-1, -1) if no entry is large enough.
 
-    The pivot is the entry that causes the least fill-in among those large enough, see THRESHOLD. Of entries with equal
-    fill-in, the largest is chosen; of equally large ones, the first in the order so far.
+    Among the entries that are large enough, see MIN_PIVOT_RATIO, the pivot causes the least fill-in. Of entries with
+    equal fill-in, the largest is chosen; of equally large entries, the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
     min_entries = r
     for p in range(k, r):
-        min_entries = min(min_entries, counts[ROW_LEFT, rows[p]])
+        min_entries = min(min_entries, counts[ACTIVE_ROW_SIZE, rows[p]])
     best_cost, best_size, best_position, row, column = r * r + 1, 0.0, r * r, -1, -1
     for p in range(k, r):
         j = columns[p]
@@ -159,8 +162,8 @@ def _choose_pivot(matrix, rows, columns, k):
             largest = max(largest, abs(numbers[j, m]))
         for m in range(n_others + 1):
             i, size = lists[ROWS, j, m], abs(numbers[j, m])
-            if size > 0.0 and size >= THRESHOLD * largest:
-                cost = (counts[ROW_LEFT, i] - 1) * n_others
+            if size > 0.0 and size >= MIN_PIVOT_RATIO * largest:
+                cost = (counts[ACTIVE_ROW_SIZE, i] - 1) * n_others
                 position = counts[ROW_POSITION, i] * r + p
                 is_better = cost < best_cost or (cost == best_cost and size > best_size)
                 if is_better or (cost == best_cost and size == best_size and position < best_position):
@@ -169,8 +172,8 @@ def _choose_pivot(matrix, rows, columns, k):
 
 
 @merged
-def _exchange(order, position, k, chosen):
-    """Exchange two indices so that `chosen` is at position k of `order`; return the sign of this permutation."""
+def _exchange_indices(order, position, k, chosen):
+    """Exchange two indices so that `chosen` gets to position k of `order`; return the sign of the permutation."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -179,39 +182,41 @@ def _exchange(order, position, k, chosen):
 
 @compiled
 def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
-    """Subtract the multiple of column `column` from column j that removes its entry in `row`, the pivot row.
+    """Subtract from column j the multiple of the pivot column that removes entry (row, j).
 
-    `pivot` is the entry (row, column). Returns False if there is no space for a fill-in entry (source `zero_source`).
+    `row` and `column` are the pivot row and the pivot column, `pivot` is the entry there. Fill-in entries get the
+    source `zero_source`. Returns False if there is no space for a fill-in entry.
     """
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
-        counts[WHERE, lists[ROWS, j, m]] = m + 1
-    position = counts[WHERE, row] - 1
+        counts[LOOKUP, lists[ROWS, j, m]] = m + 1
+    position = counts[LOOKUP, row] - 1
     number = numbers[j, position]
     has_space = True
     for m in range(counts[COLUMN_SIZE, column]):
         i = lists[ROWS, column, m]
         if i == row:
             continue
-        change, entry = numbers[column, m] / pivot * number, counts[WHERE, i]
+        change, entry = numbers[column, m] / pivot * number, counts[LOOKUP, i]
         if entry > 0:
             numbers[j, entry - 1] -= change
         else:
             has_space = has_space and put_entry(matrix, i, j, -change, zero_source)
     last = counts[COLUMN_SIZE, j] - 1
     for m in range(last + 1):
-        counts[WHERE, lists[ROWS, j, m]] = 0
+        counts[LOOKUP, lists[ROWS, j, m]] = 0
     lists[ROWS, j, position], numbers[j, position] = lists[ROWS, j, last], numbers[j, last]
     counts[COLUMN_SIZE, j] = last
     return has_space
 
 
 @compiled
-def order(index, matrix, zero_source, zero_ratio):
+def choose_order(index, matrix, zero_source, zero_ratio):
     """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a code.
 
     Fill-in entries get the source `zero_source`, the index of a zero. A pivot of at most `zero_ratio` times the largest
-    one so far counts as zero. The code is ORDERED, SINGULAR_MATRIX or TOO_MANY; `index` is complete only if ORDERED.
+    one so far counts as zero. The code is ORDER_CHOSEN, SINGULAR_MATRIX or TOO_MANY_ENTRIES; only with ORDER_CHOSEN,
+    `index` is complete.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
@@ -224,10 +229,12 @@ def order(index, matrix, zero_source, zero_ratio):
         i, j = _choose_pivot(matrix, rows, columns, k)
         if i < 0:
             return SINGULAR_MATRIX
-        index[SIGN] *= _exchange(rows, counts[ROW_POSITION], k, i) * _exchange(columns, counts[COLUMN_POSITION], k, j)
+        index[SIGN] *= _exchange_indices(rows, counts[ROW_POSITION], k, i) * _exchange_indices(
+            columns, counts[COLUMN_POSITION], k, j
+        )
         pivot = 0.0
         for m in range(counts[COLUMN_SIZE, j]):
-            counts[ROW_LEFT, lists[ROWS, j, m]] -= 1
+            counts[ACTIVE_ROW_SIZE, lists[ROWS, j, m]] -= 1
             if lists[ROWS, j, m] == i:
                 pivot = numbers[j, m]
         largest = max(largest, abs(pivot))
@@ -236,8 +243,8 @@ def order(index, matrix, zero_source, zero_ratio):
         for n in range(counts[ROW_SIZE, i]):
             column = lists[COLUMNS, i, n]
             if counts[COLUMN_POSITION, column] > k and not _eliminate_entry(matrix, i, j, pivot, column, zero_source):
-                return TOO_MANY
-    return ORDERED if _store_program(index, counts, lists) else TOO_MANY
+                return TOO_MANY_ENTRIES
+    return ORDER_CHOSEN if _store_program(index, counts, lists) else TOO_MANY_ENTRIES
 
 
 @compiled
@@ -255,7 +262,7 @@ def _sort_row(columns, sources, size, position):
 def _sort_and_count(rows, counts, lists):
     """Sort the lists of the rows by the order of elimination; return the numbers of entries and of subtractions.
 
-    Stores the number of entries of each row of U, in the order of elimination, in counts[ROW_LEFT].
+    In counts[ACTIVE_ROW_SIZE], stores the number of entries of each row of U, in the order of elimination.
     """
     position = counts[COLUMN_POSITION]
     entries, subtractions = 0, 0
@@ -265,9 +272,9 @@ def _sort_and_count(rows, counts, lists):
         entries += counts[ROW_SIZE, i]
         n_lower = 0
         while position[lists[COLUMNS, i, n_lower]] < k:
-            subtractions += counts[ROW_LEFT, position[lists[COLUMNS, i, n_lower]]]
+            subtractions += counts[ACTIVE_ROW_SIZE, position[lists[COLUMNS, i, n_lower]]]
             n_lower += 1
-        counts[ROW_LEFT, k] = counts[ROW_SIZE, i] - n_lower - 1
+        counts[ACTIVE_ROW_SIZE, k] = counts[ROW_SIZE, i] - n_lower - 1
     return entries, subtractions
 
 
@@ -278,14 +285,16 @@ def _store_program(index, counts, lists):
     rows = rows_of(index)
     n_slots, subtractions = _sort_and_count(rows, counts, lists)
     n_dense = (r * (r - 1) * (2 * r - 1)) / 6.0
-    if subtractions > MIN_SUBTRACTIONS + PER_ROW * r or (r > MAX_SPARSE_ROWS and subtractions > DENSE_ABOVE * n_dense):
+    if subtractions > MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r or (
+        r > MAX_SPARSE_ROWS and subtractions > MAX_SPARSE_RATIO * n_dense
+    ):
         return False
-    in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
-    source, target = in_column + n_slots, in_column + 2 * n_slots
+    row_list, column_list = begin_entries(r), begin_entries(r) + n_slots
+    source, target = column_list + n_slots, column_list + 2 * n_slots
     slot = r
     for k in range(r - 1, -1, -1):
         index[begin_upper(r) + k] = slot
-        slot += counts[ROW_LEFT, k]
+        slot += counts[ACTIVE_ROW_SIZE, k]
         index[end_upper(r) + k] = slot
     index[N_SLOTS], index[FIRST_LOWER] = n_slots, slot
     for k in range(r):
@@ -301,18 +310,18 @@ def _store_program(index, counts, lists):
             elif j > k:
                 entry = next_upper
                 next_upper += 1
-            counts[WHERE, j] = entry
-            index[in_row + entry], index[in_column + entry], index[source + entry] = k, j, lists[SOURCES, i, n]
+            counts[LOOKUP, j] = entry
+            index[row_list + entry], index[column_list + entry], index[source + entry] = k, j, lists[SOURCES, i, n]
         for entry in range(index[begin_lower(r) + k], slot):
-            j = index[in_column + entry]
+            j = index[column_list + entry]
             for u in range(index[begin_upper(r) + j], index[end_upper(r) + j]):
-                index[target] = counts[WHERE, index[in_column + u]]
+                index[target] = counts[LOOKUP, index[column_list + u]]
                 target += 1
     index[begin_lower(r) + r] = slot
     return True
 
 
-# largest multiplier of an elimination with accurate results; above it, the order of elimination is chosen again
+# largest |multiplier| of an elimination with accurate results; if one is larger, another order of elimination is chosen
 MAX_MULTIPLIER = 1e3
 
 
@@ -324,21 +333,21 @@ def make_program(G, pattern, rows, columns, index, values):
     """
     r, width = rows.size, G.shape[1]
     clear_lists(index, r)
-    matrix = lists_of(index, values)
+    matrix = views_of_lists(index, values)
     index[WIDTH] = width
-    code = ORDERED
+    code = ORDER_CHOSEN
     for i in range(r):
         for k in range(r):
             if pattern[rows[i], columns[k]] != 0.0:
                 number, source = G[rows[i], columns[k]], rows[i] * width + columns[k]
-                if code == ORDERED and not put_entry(matrix, i, k, number, source):
-                    code = TOO_MANY
-    if code == ORDERED:
-        code = order(index, matrix, pattern.size, ZERO_PIVOT)
-    if code == ORDERED:
+                if code == ORDER_CHOSEN and not put_entry(matrix, i, k, number, source):
+                    code = TOO_MANY_ENTRIES
+    if code == ORDER_CHOSEN:
+        code = choose_order(index, matrix, pattern.size, ZERO_PIVOT)
+    if code == ORDER_CHOSEN:
         for k in range(r):
             rows_of(index)[k], columns_of(index)[k] = rows[rows_of(index)[k]], columns[columns_of(index)[k]]
-    elif code == TOO_MANY:
+    elif code == TOO_MANY_ENTRIES:
         index[DENSE] = 1
         index[SIGN] = 1
         copy(rows, rows_of(index))
@@ -369,15 +378,18 @@ def factor(entries, index, values):
 
 @merged
 def run_program(index, values):
-    """Replace the entries in `values` by the factors, by the program in `index`; return the result of `factor`."""
+    """Replace the matrix in `values` by its factors, by the program in `index`; return min|pivot| / max|pivot|.
+
+    The result is negative in the cases that `factor` describes.
+    """
     r, n_slots = index[SIZE], index[N_SLOTS]
-    in_column = begin_entries(r) + n_slots
-    target = in_column + 2 * n_slots
+    column_list = begin_entries(r) + n_slots
+    target = column_list + 2 * n_slots
     upper, end, lower = begin_upper(r), end_upper(r), begin_lower(r)
     smallest, largest, largest_multiplier = 1e300, 0.0, 0.0
     for i in range(r):
         for s in range(index[lower + i], index[lower + i + 1]):
-            k = index[in_column + s]
+            k = index[column_list + s]
             multiplier = values[s] * values[k]
             values[s] = multiplier
             largest_multiplier = max(largest_multiplier, abs(multiplier))
@@ -392,9 +404,9 @@ def run_program(index, values):
         values[i] = 1.0 / values[i]
     if not largest_multiplier <= MAX_MULTIPLIER:
         return -1.0
-    in_row = begin_entries(r)
+    row_list = begin_entries(r)
     for u in range(r, index[FIRST_LOWER]):  # divide the rows of U by the diagonal, which makes solutions faster
-        values[u] *= values[index[in_row + u]]
+        values[u] *= values[index[row_list + u]]
     return smallest / largest if r > 0 else 1.0
 
 
@@ -418,18 +430,18 @@ def solve(index, values, x):
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), pivots_of(index), x)
         return
-    in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
+    row_list, column_list = begin_entries(r), begin_entries(r) + n_slots
     for s in range(first_lower, n_slots):
-        x[index[in_row + s]] -= values[s] * x[index[in_column + s]]
+        x[index[row_list + s]] -= values[s] * x[index[column_list + s]]
     for i in range(r):
         x[i] *= values[i]
     for s in range(r, first_lower):
-        x[index[in_row + s]] -= values[s] * x[index[in_column + s]]
+        x[index[row_list + s]] -= values[s] * x[index[column_list + s]]
 
 
 @merged
 def solve_rows(index, values, X, n):
-    """Replace the first n rows of X, each a right-hand side, by the solutions, see `solve`."""
+    """Replace the first n rows of X, each a right-hand side, by the solutions; for their order see `solve`."""
     for j in range(n):
         solve(index, values, X[j])
 
@@ -453,10 +465,10 @@ def solve_transposed(index, values, x):
                 x[k], x[pivot_row] = x[pivot_row], x[k]
         return
     n_slots, first_lower = index[N_SLOTS], index[FIRST_LOWER]
-    in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
+    row_list, column_list = begin_entries(r), begin_entries(r) + n_slots
     for s in range(first_lower - 1, r - 1, -1):
-        x[index[in_column + s]] -= values[s] * x[index[in_row + s]]
+        x[index[column_list + s]] -= values[s] * x[index[row_list + s]]
     for i in range(r):
         x[i] *= values[i]
     for s in range(n_slots - 1, first_lower - 1, -1):
-        x[index[in_column + s]] -= values[s] * x[index[in_row + s]]
+        x[index[column_list + s]] -= values[s] * x[index[row_list + s]]

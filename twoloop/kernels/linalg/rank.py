@@ -1,4 +1,4 @@
-"""Choose independent rows of G, and rows g for which M + sum s g g^T is invertible; bound the pivots and solutions."""
+"""Choose independent rows of G, and rows g for which M + sum s g g^T is invertible; find bounds of pivots."""
 
 import math
 
@@ -9,8 +9,9 @@ from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl
 
 # rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# orthogonalisation is repeated if the squared norm of the orthogonal part of a row, relative to the row, is below this
-REPEAT_BELOW = 0.5
+# orthogonalisation is repeated if the squared norm of the orthogonal part of a row, relative to that of the row, is
+# below this
+REORTHOGONALISE_BELOW = 0.5
 
 
 @compiled
@@ -23,7 +24,10 @@ def _dot(x, y):
 
 @compiled
 def _orthogonalise(basis, n, remainder, components):
-    """Subtract from `remainder` its parts along n orthonormal rows, add these to `components`; return |remainder|^2."""
+    """Subtract from `remainder` its components along the first n rows of `basis`; return |remainder|^2.
+
+    The rows of `basis` are orthonormal. Adds the components to `components`.
+    """
     for i in range(n):
         component = _dot(basis[i], remainder)
         if component != 0.0:
@@ -53,7 +57,7 @@ def select_rows(G, min_sine, basis, factors, kept):
             components[i] = 0.0
         row_square = _dot(G[k], G[k])
         remainder_square = _orthogonalise(basis, n_kept, remainder, components)
-        if remainder_square < REPEAT_BELOW * row_square:
+        if remainder_square < REORTHOGONALISE_BELOW * row_square:
             remainder_square = _orthogonalise(basis, n_kept, remainder, components)
         if remainder_square > min_sine**2 * row_square:
             components[n_kept] = math.sqrt(remainder_square)
@@ -100,11 +104,11 @@ def norm_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept, coefficients, norms):
-    """Return whether the first n rows in `order` are independent; if so, express the other rows as their combinations.
+    """Return whether the rows order[:n] are independent; if they are, express the other rows as their combinations.
 
-    n is the number of rows of `chosen_rows`, in which the first n rows are stored. Row i of `coefficients` receives the
-    coefficients, by least squares, with which row order[n + i] is a combination of the first n rows; `norms` receives
-    the norms of all `rows`. For the other arguments see `select_rows`.
+    n is the number of rows of `chosen_rows`, which receives the rows order[:n]. Row i of `coefficients` receives the
+    coefficients, by least squares, of row order[n + i] in terms of these rows; `norms` receives the norms of `rows`.
+    For the other arguments see `select_rows`.
     """
     n = len(chosen_rows)
     for i in range(len(rows)):
@@ -120,7 +124,7 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
 
 
 @kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def least_solution(rows, values, min_sine, basis, factors, kept, coefficients, gram, parts, x):
+def least_norm_solution(rows, values, min_sine, basis, factors, kept, coefficients, gram, parts, x):
     """Store in `x` the vector of least norm for which rows @ x is nearest to `values`; return the rank of `rows`.
 
     `x` must be zero on entry; `values` is overwritten with the residuals. If y and b are the values of independent and
@@ -173,12 +177,12 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # largest rounding error, relative to a bound, by which pivots may be below this bound
+BOUND_ROUNDING = 1e-12  # largest amount, relative to a bound of pivots, by which a pivot may be below the bound
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
-# if the smallest eigenvalue of M exceeds this multiple of the largest one, pivots above a bound show that all rows are
-# independent and that no row must be added to M: as bounds are at least 1e-5, the part of a row that is orthogonal to
-# the other rows is then at least 1e-6 of the row, whereas 1e-9 suffices
+# smallest ratio of the smallest to the largest eigenvalue of M at which pivots above a bound show that all rows are
+# independent and that no row must be added to M. Bounds are at least 1e-5, so that the part of a row that is orthogonal
+# to the other rows is then at least 1e-6 of the row; 1e-9 is enough
 SIMILAR_EIGENVALUES = 1e-7
 # largest coefficient of an independent row in a redundant one, both scaled to norm 1: above it the two rows are
 # exchanged. If the coefficient passes through zero during the motion, the independent rows become dependent, as at each
@@ -195,7 +199,7 @@ def workspace_size(n_rows: int, n: int) -> int:
 
 @merged
 def _factor_and_count_negative(A):
-    """Replace a symmetric A, definite or not, by the factors of `ldl_factor`; return the number of eigenvalues < 0."""
+    """Replace a symmetric A by its factors, as `ldl_factor` does; return the number of negative eigenvalues of A."""
     n, count = len(A), 0
     for k in range(n):
         if not A[k, k] > 0.0:
@@ -256,7 +260,7 @@ def _scale_of_added_rows(mass, G):
 
 @merged
 def _sort_rows_by_entries(G, order, counts):
-    """Sort the rows of G by their numbers of entries: store their indices in `order`, the numbers in `counts`."""
+    """Store in `order` the indices of the rows of G, sorted by number of entries, and in `counts` these numbers."""
     for k in range(len(G)):
         count, i = 0.0, k
         for j in range(G.shape[1]):
@@ -287,7 +291,8 @@ def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
     """Add scale g g^T to M in place, for rows g of G, until all eigenvalues of M are large enough.
 
     An eigenvalue is too small if it is less than `weak_ratio` times the largest one. Rows are tried in the sequence
-    `order`. Stores the indices of added rows in `added`; returns their number, or STAYS_SINGULAR.
+    `order`; the index of an added row is replaced by -1. Stores the indices of the added rows in `added`; returns their
+    number, or STAYS_SINGULAR.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
@@ -310,7 +315,7 @@ def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
 
 @compiled
 def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_kept):
-    """Replace independent rows by redundant rows in which their coefficients exceed MAX_COEFFICIENT.
+    """Exchange independent rows with redundant rows in which their coefficients exceed MAX_COEFFICIENT.
 
     Each exchange multiplies the volume that the independent rows span by the coefficient. Updates `basis`, `factors`
     and `kept`, results of `select_rows`; `order`, `coefficients` (n_rows) and `rows_kept` (n, n) are scratch.
@@ -346,7 +351,7 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_ke
 
 @merged
 def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scratch, S_scratch, sizes):
-    """Return the index of the first of `bounds` that is below all pivots of the rows `kept`; bounds.size if none is.
+    """Return the index of the first entry of `bounds` below all pivots of the rows `kept`; bounds.size if none is.
 
     Pivots are relative to the diagonal entries of S = G M^-1 G^T. No pivot is below the smallest eigenvalue of S scaled
     to a diagonal of 1, and this eigenvalue exceeds a bound b if the scaled S - b I is positive definite. Returns
@@ -385,7 +390,7 @@ def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scr
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
-    """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; return an index or a code.
+    """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; bound the pivots.
 
     Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Rows are added to
     M if it has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: no rows are added. `chosen`, of

@@ -27,7 +27,7 @@ from twoloop.kernels.data.indices import (
     SINGULAR,
 )
 from twoloop.kernels.linalg import markowitz_lu as at
-from twoloop.kernels.linalg.band import banded_mass, factor_banded_mass, solve_banded_mass
+from twoloop.kernels.linalg.band import factor_banded_mass, has_banded_mass, solve_banded_mass
 from twoloop.kernels.linalg.dense import (
     contains,
     copy,
@@ -39,23 +39,23 @@ from twoloop.kernels.linalg.dense import (
 )
 from twoloop.kernels.linalg.markowitz_lu import (
     begin_entries,
+    choose_order,
     clear_lists,
     columns_of,
     determinant_sign,
-    lists_of,
-    order,
     put_entry,
     rows_of,
     run_program,
     solve_rows,
     solve_transposed,
+    views_of_lists,
 )
 from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 
 @compiled
 def find_null_space(w):
-    """Store the null space of G in w.D, except the last row of w.D (see Work), from the rows and factors in w."""
+    """Store the null space of G in w.D, from the rows and factors in w; leave the last row of w.D, see Work."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -64,7 +64,7 @@ def find_null_space(w):
 
 
 @merged
-def _reduce_diagonal(columns, independent, M, D, A, m):
+def _reduce_diagonal_mass(columns, independent, M, D, A, m):
     """Store the upper triangle of T^T M T in A (n_dof, n_dof) for a diagonal M; m is scratch."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
@@ -78,7 +78,7 @@ def _reduce_diagonal(columns, independent, M, D, A, m):
 
 
 @merged
-def _reduce_dense(columns, independent, M, D, A, MT):
+def _reduce_dense_mass(columns, independent, M, D, A, MT):
     """Store the upper triangle of T^T M T in A (n_dof, n_dof) for any M; MT (n_q, n_dof) is scratch."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
@@ -100,13 +100,13 @@ def _reduce_dense(columns, independent, M, D, A, MT):
 
 
 @merged
-def factor_reduced(f, w):
-    """Store the LDL factors of T^T M T, from w.M and w.D, in w.A; return DONE, MASS_NOT_DEFINITE or NOT_FINITE."""
+def factor_reduced_mass(f, w):
+    """Store in w.A the LDL factors of T^T M T, computed from w.M and w.D; return a code."""
     columns = columns_of(w.index_v)
     if f.flags[DIAGONAL_MASS] == 1:
-        _reduce_diagonal(columns, w.independent_v, w.M, w.D, w.A, w.x)
+        _reduce_diagonal_mass(columns, w.independent_v, w.M, w.D, w.A, w.x)
     else:
-        _reduce_dense(columns, w.independent_v, w.M, w.D, w.A, w.MT)
+        _reduce_dense_mass(columns, w.independent_v, w.M, w.D, w.A, w.MT)
     w.counters[N_FACTORIZATIONS] += 1
     if ldl_factor(w.A):
         return DONE
@@ -114,7 +114,7 @@ def factor_reduced(f, w):
 
 
 @merged
-def solve_reduced(f, w, r, c, a):
+def solve_by_reduced_mass(f, w, r, c, a):
     """Store in `a` the accelerations with M a + G^T lam = r and G a = c, by the factors of T^T M T."""
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
     n_dof, z, x, D, M = independent.size, w.z, w.x, w.D, w.M
@@ -146,7 +146,7 @@ def solve_reduced(f, w, r, c, a):
 
 
 @merged
-def reduced_multipliers(f, w, r, a, lam):
+def multipliers_by_elimination(f, w, r, a, lam):
     """Store the multipliers of the independent rows in lam, from G^T lam = r - M a in the dependent columns."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
@@ -165,8 +165,11 @@ def reduced_multipliers(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Store in w.L the factors of w.M, or its inverse, faster to apply, if M is constant and dense; return a code."""
-    if banded_mass(f):
+    """Store in w.L the factors of w.M; if M is constant and dense, store its inverse, which is faster to apply.
+
+    Returns DONE, MASS_NOT_DEFINITE or NOT_FINITE.
+    """
+    if has_banded_mass(f):
         is_definite = factor_banded_mass(f, w) == DONE
     else:
         copy_matrix(w.M, w.L)
@@ -178,12 +181,12 @@ def factor_mass(f, w):
 
 @merged
 def _apply_inverse_mass(f, w, x, y):
-    """Store M^-1 x in y, by w.L; x and y may be one array unless M is constant, dense and not diagonal."""
+    """Store M^-1 x in y, by w.L; x and y may be the same array unless M is constant, dense and not diagonal."""
     n = x.size
     if f.flags[DIAGONAL_MASS] == 1:
         for i in range(n):
             y[i] = x[i] * w.L[i, i]
-    elif f.flags[CONSTANT_MASS] == 1 and not banded_mass(f):
+    elif f.flags[CONSTANT_MASS] == 1 and not has_banded_mass(f):
         for i in range(n):
             total = 0.0
             for j in range(n):
@@ -191,7 +194,7 @@ def _apply_inverse_mass(f, w, x, y):
             y[i] = total
     else:
         copy(x, y)
-        if banded_mass(f):
+        if has_banded_mass(f):
             solve_banded_mass(f, w, y)
         else:
             ldl_solve(w.L, y)
@@ -207,20 +210,20 @@ def _is_equal(A, B):
 
 
 @merged
-def factor_schur(f, w):
-    """Store in w.S the factors of S = G M^-1 G^T, for the independent rows, if G or M has changed; return a code."""
+def factor_schur_complement(f, w):
+    """Store in w.S the factors of S = G M^-1 G^T (G: independent rows), unless G and M are unchanged; return a code."""
     is_constant = f.flags[CONSTANT_MASS] == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
     rows = w.rows_v
-    S, solved = w.S, w.W
+    S, M_inverse_G = w.S, w.W
     for i in range(rows.size):
-        _apply_inverse_mass(f, w, w.G[rows[i]], solved[i])
+        _apply_inverse_mass(f, w, w.G[rows[i]], M_inverse_G[i])
     for i in range(rows.size):
         for k in range(i, rows.size):
             total = 0.0
             for j in range(w.Q.size):
-                total += w.G[rows[i], j] * solved[k, j]
+                total += w.G[rows[i], j] * M_inverse_G[k, j]
             S[i, k] = total
     w.counters[N_FACTORIZATIONS] += 1
     if rows.size > 0:
@@ -233,9 +236,9 @@ def factor_schur(f, w):
 
 
 @merged
-def solve_schur(f, w, r, c, a):
+def solve_by_schur_complement(f, w, r, c, a):
     """Store the accelerations in `a` and the multipliers of the independent rows in w.z, by the factors of S."""
-    rows, solved = w.rows_v, w.W
+    rows, M_inverse_G = w.rows_v, w.W
     _apply_inverse_mass(f, w, r, a)
     for i in range(rows.size):
         total = -c[rows[i]]
@@ -245,10 +248,10 @@ def solve_schur(f, w, r, c, a):
     ldl_solve(w.S, w.z)
     for i in range(rows.size):
         for j in range(a.size):
-            a[j] -= solved[i, j] * w.z[i]
+            a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-# smallest number of rows, and of degrees of freedom, with which the augmented form is the fastest (on chains: 7)
+# smallest number of rows, and of degrees of freedom, with which the augmented form is the fastest (measured: 7)
 MIN_ROWS = 8
 # smallest number of coordinates with which the augmented form is the fastest even with fewer degrees of freedom, unless
 # M is diagonal (measured: about 30)
@@ -271,30 +274,30 @@ def _largest_entry(A):
 
 @compiled
 def _write_augmented_program(w):
-    """Store in w.index_a the program that factors the augmented matrix of w.M and w.G; return the result of `order`."""
+    """Store in w.index_a the program that factors the augmented matrix [M G^T; G 0]; return choose_order's code."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     note_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
-    matrix = lists_of(index, values)
+    matrix = views_of_lists(index, values)
     scale = 2.0 ** np.round(np.log2(_largest_entry(w.G) / _largest_entry(w.M))) if rows.size > 0 else 1.0
     w.notes[MASS_SCALE] = scale
     for i in range(n):
         for j in range(n):
             source = w.entries.size + i * n + j
             if w.mass_pattern[i, j] != 0.0 and not put_entry(matrix, i, j, scale * w.M[i, j], source):
-                return at.TOO_MANY
+                return at.TOO_MANY_ENTRIES
     for k in range(rows.size):
         for j in range(n):
             if w.pattern[rows[k], j] != 0.0:
                 number, source = w.G[rows[k], j], rows[k] * n + j
                 if not (put_entry(matrix, n + k, j, number, source) and put_entry(matrix, j, n + k, number, source)):
-                    return at.TOO_MANY
-    return order(index, matrix, w.pattern.size, 0.0)
+                    return at.TOO_MANY_ENTRIES
+    return choose_order(index, matrix, w.pattern.size, 0.0)
 
 
 @compiled
 def _run_augmented_program(w):
-    """Store the factors of the augmented matrix in w.values_a; return False if another program must be written."""
+    """Store the factors of the augmented matrix in w.values_a; return False if the program does not suit it."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
     source = begin_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
@@ -304,18 +307,18 @@ def _run_augmented_program(w):
 
 
 @compiled
-def factor_sparse(f, w):
-    """Factor the augmented matrix, or set f.flags[FORM] to a dense form if factors are not sparse; return a code."""
+def factor_augmented(f, w):
+    """Factor the augmented matrix; if its factors are not sparse, set f.flags[FORM] to a dense form; return a code."""
     w.counters[N_FACTORIZATIONS] += 1
     has_new_entry = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or has_new_entry or not _run_augmented_program(w):
         if not finite(w.M):
             return NOT_FINITE
-        code = _write_augmented_program(w)
-        if code == at.TOO_MANY:
+        ordering_code = _write_augmented_program(w)
+        if ordering_code == at.TOO_MANY_ENTRIES:
             f.flags[FORM] = f.flags[DENSE_FORM]
             return DONE
-        if code != at.ORDERED or not _run_augmented_program(w):
+        if ordering_code != at.ORDER_CHOSEN or not _run_augmented_program(w):
             w.index_a[at.SIZE] = 0
             return MASS_NOT_DEFINITE
     if determinant_sign(w.index_a, w.values_a) != (1.0 if w.rows_v.size % 2 == 0 else -1.0):
@@ -324,7 +327,7 @@ def factor_sparse(f, w):
 
 
 @compiled
-def solve_sparse(w, r, c, a):
+def solve_augmented(w, r, c, a):
     """Store the accelerations in `a` and the multipliers of the independent rows in w.z, by the sparse factors."""
     n, size, scale = r.size, w.index_a[at.SIZE], w.notes[MASS_SCALE]
     x, y = w.right[:size], w.right[size:]
@@ -345,9 +348,9 @@ def solve_sparse(w, r, c, a):
 
 
 @compiled
-def _factor_sparse_or_dense(f, w):
-    """Factor the augmented matrix, or store w.D or the factors of M if a dense form replaces it; return a code."""
-    code = factor_sparse(f, w)
+def _factor_augmented_or_dense(f, w):
+    """Factor the augmented matrix; if a dense form replaces this form, store w.D or the factors of M; return a code."""
+    code = factor_augmented(f, w)
     if code == DONE and f.flags[FORM] == NULL_SPACE:
         find_null_space(w)
     elif code == DONE and f.flags[FORM] == MULTIPLIERS and f.flags[CONSTANT_MASS] == 1:
@@ -357,18 +360,18 @@ def _factor_sparse_or_dense(f, w):
 
 @merged
 def factor(f, w):
-    """Factor the equations of accelerations, from w.M, the rows, their factors and w.D in w; return a code."""
+    """Factor the equations of the accelerations, from w.M, w.D, the rows of G and their factors; return a code."""
     if w.notes[FACTORED] == 1.0:
         return DONE
-    code = _factor_sparse_or_dense(f, w) if f.flags[FORM] == AUGMENTED else DONE
+    code = _factor_augmented_or_dense(f, w) if f.flags[FORM] == AUGMENTED else DONE
     if code == DONE and f.flags[FORM] == NULL_SPACE:
-        code = factor_reduced(f, w)
+        code = factor_reduced_mass(f, w)
     elif code == DONE and f.flags[FORM] == MULTIPLIERS:
         if f.flags[CONSTANT_MASS] == 0:
             w.counters[N_FACTORIZATIONS] += 1
             code = factor_mass(f, w)
         if code == DONE:
-            code = factor_schur(f, w)
+            code = factor_schur_complement(f, w)
     if code == DONE:
         w.notes[FACTORED] = 1.0
     return code
@@ -376,28 +379,28 @@ def factor(f, w):
 
 @merged
 def solve(f, w, r, c, a):
-    """Store in `a` the accelerations for the right-hand side (r, c) of the equations; the arrays must be different."""
+    """Store in `a` the accelerations with M a + G^T lam = r and G a = c; r, c and `a` must be different arrays."""
     if f.flags[FORM] == NULL_SPACE:
-        solve_reduced(f, w, r, c, a)
+        solve_by_reduced_mass(f, w, r, c, a)
     elif f.flags[FORM] == MULTIPLIERS:
-        solve_schur(f, w, r, c, a)
+        solve_by_schur_complement(f, w, r, c, a)
     else:
-        solve_sparse(w, r, c, a)
+        solve_augmented(w, r, c, a)
 
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Store in lam the multipliers of the independent rows for the last solution `a`; keep those of other rows."""
+    """Store in lam the multipliers of the independent rows for the last solution `a`; leave the other entries."""
     if f.flags[FORM] == NULL_SPACE:
-        reduced_multipliers(f, w, r, a, lam)
+        multipliers_by_elimination(f, w, r, a, lam)
     else:
         for i in range(w.rows_v.size):
             lam[w.rows_v[i]] = w.z[i]
 
 
 @merged
-def solve_both(f, w, r, c, a, lam):
-    """Store in `a` and lam the accelerations and multipliers for the right-hand side (r, c)."""
+def solve_with_multipliers(f, w, r, c, a, lam):
+    """Store in `a` and lam the accelerations and multipliers with M a + G^T lam = r and G a = c."""
     solve(f, w, r, c, a)
     multipliers(f, w, r, a, lam)
 

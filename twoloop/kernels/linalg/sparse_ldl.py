@@ -16,12 +16,12 @@ from twoloop.kernels.data.common import compiled, merged
 from twoloop.kernels.linalg.symbolic_factorization import (
     N_COORDINATES,
     N_PIVOTS,
-    columns_of,
-    jacobian_of,
-    mass_of,
-    order_of,
-    runs_of,
-    stiffened_of,
+    factor_columns_of,
+    jacobian_entries_of,
+    mass_entries_of,
+    pivot_order_of,
+    stiffening_products_of,
+    update_runs_of,
 )
 
 NOT_DEFINITE = -1.0  # value that `factor` returns instead of the smallest squared sine if a pivot of M is not positive
@@ -29,16 +29,16 @@ NOT_DEFINITE = -1.0  # value that `factor` returns instead of the smallest squar
 
 @compiled
 def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Store in `stiffness`, for each row g that stiffens M, s = largest diagonal entry of M in columns of g / |g|^2."""
+    """Store in `stiffness`, for each row g that stiffens M, s = m / |g|^2; m: largest M_jj of the columns j of g."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
-    rows, columns, _ = mass_of(program)
+    rows, columns, _ = mass_entries_of(program)
     for k in range(rows.size):
         if rows[k] == columns[k]:
             scratch[rows[k]] += mass[k]
-    _, columns, _ = jacobian_of(program)
-    product_rows, first, second, _ = stiffened_of(program)
+    _, columns, _ = jacobian_entries_of(program)
+    product_rows, first, second, _ = stiffening_products_of(program)
     for u in range(product_rows.size):
         stiffness[product_rows[u]] = 0.0
     for u in range(product_rows.size):
@@ -54,17 +54,17 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 
 @merged
-def load(program, mass, jacobian, values, stiffness, scratch):
-    """Store the entries of G and the stiffened M in their slots in `values`; `scratch` has one number per pivot."""
+def load_matrix(program, mass, jacobian, values, stiffness, scratch):
+    """Store the entries of G and the stiffened M in the slots in `values`; `scratch` has one number per pivot."""
     for s in range(values.size):
         values[s] = 0.0
-    _, _, slots = mass_of(program)
+    _, _, slots = mass_entries_of(program)
     for k in range(slots.size):
         values[slots[k]] += mass[k]
-    _, _, slots = jacobian_of(program)
+    _, _, slots = jacobian_entries_of(program)
     for k in range(slots.size):
         values[slots[k]] += jacobian[k]
-    product_rows, first, second, slots = stiffened_of(program)
+    product_rows, first, second, slots = stiffening_products_of(program)
     if product_rows.size > 0:
         _fill_stiffness(program, mass, jacobian, stiffness, scratch)
         for u in range(product_rows.size):
@@ -72,16 +72,16 @@ def load(program, mass, jacobian, values, stiffness, scratch):
 
 
 @compiled
-def factor(program, counts, values, sizes, min_sine_square):
-    """Replace `values` by the factors, with 1/pivot on the diagonal; return the smallest squared sine of a row.
+def factor(program, is_independent, values, sizes, min_sine_square):
+    """Replace the matrix in `values` by its factors, with 1/pivot on the diagonal; return the smallest squared sine.
 
-    The squared sine of a row is minus its pivot over its squared norm, which is stored in `sizes`. `counts` is 0 for
-    redundant rows, and is set to 0 for rows with a squared sine up to `min_sine_square`; these rows do not affect the
-    result. Returns NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
+    The squared sine of a row is minus its pivot over its squared norm, stored in `sizes`. `is_independent` is 0
+    for redundant rows, and is set to 0 for rows with a squared sine up to `min_sine_square`; these rows do not affect
+    the result. Returns NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
-    order, runs = order_of(program), runs_of(program)
-    begin, row_of = columns_of(program)
+    order, runs = pivot_order_of(program), update_runs_of(program)
+    begin, row_of = factor_columns_of(program)
     for k in range(n):
         sizes[k] = 0.0
     smallest, u = 1.0, 0
@@ -90,9 +90,9 @@ def factor(program, counts, values, sizes, min_sine_square):
         pivot, is_row = values[k], order[k] >= n_q
         if is_row:
             row = order[k] - n_q
-            if counts[row] != 0.0 and not -pivot > min_sine_square * sizes[k]:  # also true for NaN
-                counts[row] = 0.0
-            if counts[row] == 0.0:
+            if is_independent[row] != 0.0 and not -pivot > min_sine_square * sizes[k]:  # also true for NaN
+                is_independent[row] = 0.0
+            if is_independent[row] == 0.0:
                 values[k] = 0.0
                 for s in range(first, last):
                     values[s] = 0.0
@@ -115,9 +115,9 @@ def factor(program, counts, values, sizes, min_sine_square):
             while slot < last:
                 size = runs[u]
                 if multiplier != 0.0:  # two thirds of the multipliers are 0 if a planar mechanism is modelled in space
-                    into, own = values[runs[u + 1] : runs[u + 1] + size], values[slot : slot + size]
+                    target_run, source_run = values[runs[u + 1] : runs[u + 1] + size], values[slot : slot + size]
                     for i in range(size):
-                        into[i] -= multiplier * own[i]
+                        target_run[i] -= multiplier * source_run[i]
                 slot += size
                 u += 2
             values[s] = multiplier
@@ -127,10 +127,10 @@ def factor(program, counts, values, sizes, min_sine_square):
 @compiled
 def solve(program, values, stiffness, x, y):
     """Replace the right-hand side x = [r, c] by the solution [a, lam], with the factors `values`; y is scratch."""
-    n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
+    n, order, n_q = program[N_PIVOTS], pivot_order_of(program), program[N_COORDINATES]
     # with M + s g g^T in place of M, the right-hand side should be r + s g c. With r alone, accelerations are the same,
     # because g a = c, but the multiplier of g is smaller by s c; the last loop adds s c
-    begin, row_of = columns_of(program)
+    begin, row_of = factor_columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
     for k in range(n):
@@ -148,36 +148,36 @@ def solve(program, values, stiffness, x, y):
 
 
 @compiled
-def add_redundant_stiffness(program, jacobian, counts, stiffness, c, right):
+def add_redundant_stiffness(program, jacobian, is_independent, stiffness, c, right):
     """Add s g^T c_g to `right` in place for each redundant row g that stiffens M; c_g: entry of g in c = [r, c]."""
     n_q = program[N_COORDINATES]
-    _, columns, _ = jacobian_of(program)
-    product_rows, first, second, _ = stiffened_of(program)
+    _, columns, _ = jacobian_entries_of(program)
+    product_rows, first, second, _ = stiffening_products_of(program)
     for u in range(product_rows.size):
         row, entry = product_rows[u], first[u]
-        if entry == second[u] and counts[row] == 0.0:
+        if entry == second[u] and is_independent[row] == 0.0:
             right[columns[entry]] += stiffness[row] * jacobian[entry] * c[n_q + row]
 
 
 @compiled
-def subtract_product(program, mass, jacobian, counts, x, b):
-    """Subtract [M x_q + G^T x_c, G x_q] from b in place, for x = [x_q, x_c]; set entries of redundant rows to zero."""
+def subtract_product(program, mass, jacobian, is_independent, x, b):
+    """Subtract [M x_q + G^T x_c, G x_q], for x = [x_q, x_c], from b in place; set b to zero in redundant rows."""
     n_q = program[N_COORDINATES]
-    rows, columns, _ = mass_of(program)
+    rows, columns, _ = mass_entries_of(program)
     for k in range(rows.size):
         b[rows[k]] -= mass[k] * x[columns[k]]
-    rows, columns, _ = jacobian_of(program)
+    rows, columns, _ = jacobian_entries_of(program)
     for k in range(rows.size):
         i, j = rows[k], columns[k]
         b[j] -= jacobian[k] * x[n_q + i]
         b[n_q + i] -= jacobian[k] * x[j]
-    for i in range(counts.size):
-        if counts[i] == 0.0:
+    for i in range(is_independent.size):
+        if is_independent[i] == 0.0:
             b[n_q + i] = 0.0
 
 
 @compiled
-def solve_refined(program, mass, jacobian, counts, values, stiffness, x, n_corrections, right, residual, y):
+def solve_refined(program, mass, jacobian, is_independent, values, stiffness, x, n_corrections, right, residual, y):
     """Replace the right-hand side x = [r, c] by the solution [a, lam], corrected `n_corrections` times by refinement.
 
     Returns max|a| of the last correction over max|a|; 0 without corrections. The last three arguments are scratch.
@@ -185,15 +185,15 @@ def solve_refined(program, mass, jacobian, counts, values, stiffness, x, n_corre
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):
         right[k] = x[k]
-    add_redundant_stiffness(program, jacobian, counts, stiffness, right, x)
-    for i in range(counts.size):
-        if counts[i] == 0.0:
+    add_redundant_stiffness(program, jacobian, is_independent, stiffness, right, x)
+    for i in range(is_independent.size):
+        if is_independent[i] == 0.0:
             x[n_q + i] = right[n_q + i] = 0.0
     solve(program, values, stiffness, x, y)
     for _ in range(n_corrections):
         for k in range(x.size):
             residual[k] = right[k]
-        subtract_product(program, mass, jacobian, counts, x, residual)
+        subtract_product(program, mass, jacobian, is_independent, x, residual)
         solve(program, values, stiffness, residual, y)
         largest = change = 0.0
         for k in range(n_q):

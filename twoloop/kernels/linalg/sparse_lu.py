@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 from twoloop.kernels.data.common import compiled, inlined
 from twoloop.kernels.linalg.symbolic_factorization import (
     N_COORDINATES,
-    N_OFF,
+    N_OFF_DIAGONAL,
     N_PIVOTS,
     Entries,
     Integers,
-    columns_of,
     elimination_order,
     end_of_sections,
-    jacobian_of,
-    mass_of,
-    order_of,
+    factor_columns_of,
+    jacobian_entries_of,
+    mass_entries_of,
+    pivot_order_of,
     program_in_order,
-    runs_of,
-    stiffened_of,
+    stiffening_products_of,
+    update_runs_of,
 )
 
-MIN_PIVOT = 1e-11  # smallest pivot, relative to the sum of its |terms|, that cannot be a rounding error
+MIN_PIVOT = 1e-11  # smaller pivots, relative to the sum of their |terms|, may be rounding errors of zero
 
 
 def newton_program(
@@ -41,7 +41,7 @@ def newton_program(
     mass: Entries,
     jacobian: Entries,
     tangents: Entries,
-    together: Iterable[Sequence[int]],
+    body_groups: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
     """Return the program that factors Newton's matrix; None if the program would have too many updates.
@@ -50,7 +50,7 @@ def newton_program(
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
     begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
-    order = elimination_order(n_q, n_rows, mass, jacobian, together, stiff_rows, tangents)
+    order = elimination_order(n_q, n_rows, mass, jacobian, body_groups, stiff_rows, tangents)
     entries = np.concatenate([mass[0], tangents[0]]), np.concatenate([mass[1], tangents[1]])
     program = program_in_order(order, n_q, entries, jacobian, stiff_rows, unsymmetric=True)
     return None if program is None else np.concatenate([program, begins]).astype(np.int32)
@@ -68,67 +68,72 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
     for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
     groups = np.zeros(n_q, dtype=np.int64)
-    by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of the columns with an entry in the row
+    groups_by_row: list[set[int]] = [
+        set() for _ in range(n_q)
+    ]  # for each row: groups of the columns with an entry in the row
     for j, rows in enumerate(rows_of):
-        groups_in_rows = set().union(*(by_row[i] for i in rows))
+        groups_in_rows = set().union(*(groups_by_row[i] for i in rows))
         groups[j] = group = next(k for k in range(n_q) if k not in groups_in_rows)
         for i in rows:
-            by_row[i].add(group)
+            groups_by_row[i].add(group)
     return groups
 
 
 @inlined
-def tangents_of(program):
-    """Return rows and columns of the entries of K and D, the indices at which groups of entries begin, and the end."""
+def tangent_entries_of(program):
+    """Return the rows and the columns of the entries of K and D, and the index of the first entry of each group.
+
+    The last index is the number of entries.
+    """
     begins = program[end_of_sections(program) :]
-    rows, columns, _ = mass_of(program)
+    rows, columns, _ = mass_entries_of(program)
     n_mass = rows.size - begins[begins.size - 1]
     return rows[n_mass:], columns[n_mass:], begins
 
 
 @compiled
-def load(program, mass, jacobian, K, D, z, stiffness, values):
-    """Store the entries of Newton's matrix, for z (real or complex), in their slots in `values`."""
+def load_matrix(program, mass, jacobian, K, D, z, stiffness, values):
+    """Store Newton's matrix for z (real or complex) in the slots in `values`, from the entries of M, G, K and D."""
     for s in range(values.size):
         values[s] = 0.0
-    n_off = program[N_OFF]
-    _, _, slots = mass_of(program)
+    n_off_diagonal = program[N_OFF_DIAGONAL]
+    _, _, slots = mass_entries_of(program)
     for k in range(mass.size):
         values[slots[k]] += mass[k]
     for k in range(K.size):
         values[slots[mass.size + k]] -= z * (z * K[k] + D[k])
-    _, _, slots = jacobian_of(program)
+    _, _, slots = jacobian_entries_of(program)
     for k in range(slots.size):
         values[slots[k]] += jacobian[k]
-        values[slots[k] + n_off] += jacobian[k]
-    product_rows, first, second, slots = stiffened_of(program)
+        values[slots[k] + n_off_diagonal] += jacobian[k]
+    product_rows, first, second, slots = stiffening_products_of(program)
     for u in range(product_rows.size):
         product = stiffness[product_rows[u]] * jacobian[first[u]] * jacobian[second[u]]
         values[slots[u]] += product
         if slots[u] >= program[N_PIVOTS]:
-            values[slots[u] + n_off] += product
+            values[slots[u] + n_off_diagonal] += product
 
 
 @compiled
-def factor(program, counts, values, sizes):
-    """Replace `values` by the factors, with 1/pivot on the diagonal; return whether all pivots are large enough.
+def factor(program, is_independent, values, sizes):
+    """Replace the matrix in `values` by its factors, 1/pivot on the diagonal; return False if a pivot is too small.
 
-    For redundant rows (0 in `counts`), the factors become zeros, which removes the rows from solutions. `sizes` is
-    scratch.
+    For redundant rows (0 in `is_independent`), the factors become zeros, which removes the rows from solutions. `sizes`
+    is scratch.
     """
-    n_q, n, off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF]
-    order, runs = order_of(program), runs_of(program)
-    begin, row_of = columns_of(program)
+    n_q, n, n_off_diagonal = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF_DIAGONAL]
+    order, runs = pivot_order_of(program), update_runs_of(program)
+    begin, row_of = factor_columns_of(program)
     for k in range(n):
         sizes[k] = abs(values[k])
     u = 0
     for k in range(n):
         first, last = n + begin[k], n + begin[k + 1]
-        if order[k] >= n_q and counts[order[k] - n_q] == 0.0:
+        if order[k] >= n_q and is_independent[order[k] - n_q] == 0.0:
             values[k] = 0.0
             for s in range(first, last):
                 values[s] = 0.0
-                values[s + off] = 0.0
+                values[s + n_off_diagonal] = 0.0
                 slot = s + 1
                 while slot < last:
                     slot += runs[u]
@@ -139,22 +144,25 @@ def factor(program, counts, values, sizes):
         inverse = 1.0 / values[k]
         values[k] = inverse
         for s in range(first, last):
-            lower, upper = values[s] * inverse, values[s + off] * inverse
+            lower, upper = values[s] * inverse, values[s + n_off_diagonal] * inverse
             target = row_of[s - n]
-            change = lower * values[s + off]
+            change = lower * values[s + n_off_diagonal]
             values[target] -= change
             sizes[target] += abs(change)
             slot = s + 1
             while slot < last:
                 size, target = runs[u], runs[u + 1]
                 if upper != 0.0:
-                    into, own = values[target : target + size], values[slot : slot + size]
+                    target_run, source_run = values[target : target + size], values[slot : slot + size]
                     for i in range(size):
-                        into[i] -= own[i] * upper
+                        target_run[i] -= source_run[i] * upper
                 if lower != 0.0:
-                    into, own = values[target + off : target + off + size], values[slot + off : slot + off + size]
+                    target_run, source_run = (
+                        values[target + n_off_diagonal : target + n_off_diagonal + size],
+                        values[slot + n_off_diagonal : slot + n_off_diagonal + size],
+                    )
                     for i in range(size):
-                        into[i] -= lower * own[i]
+                        target_run[i] -= lower * source_run[i]
                 slot += size
                 u += 2
             values[s] = lower
@@ -164,8 +172,8 @@ def factor(program, counts, values, sizes):
 @compiled
 def solve(program, values, x, y):
     """Replace the right-hand side x = [r, c] by the solution, with the factors `values`; y is scratch."""
-    n, n_off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
-    begin, row_of = columns_of(program)
+    n, n_off_diagonal, order = program[N_PIVOTS], program[N_OFF_DIAGONAL], pivot_order_of(program)
+    begin, row_of = factor_columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
     for k in range(n):
@@ -175,7 +183,7 @@ def solve(program, values, x, y):
     for k in range(n - 1, -1, -1):
         total = y[k]
         for s in range(begin[k], begin[k + 1]):
-            total -= values[n + n_off + s] * y[row_of[s]]
+            total -= values[n + n_off_diagonal + s] * y[row_of[s]]
         y[k] = total * values[k]
     for k in range(n):
         x[order[k]] = y[k]

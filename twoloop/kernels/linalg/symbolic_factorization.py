@@ -47,53 +47,63 @@ class _DisjointSets:
         return min(i, j)
 
 
-class _Supports:
-    """Supports of parts, the ground or remaining hubs; a part is a set of bodies that eliminated joints connect."""
+class _PartSupports:
+    """Supports of each part: the ground, and hubs not eliminated yet. A part: bodies connected by eliminated joints."""
 
-    def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
+    def __init__(
+        self,
+        joints: Sequence[frozenset[int]],
+        n_bodies: int,
+        hubs: set[int],
+        single_coordinate_bodies: AbstractSet[int],
+    ):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        self.lone = lone  # bodies with a single coordinate: a joint with one of these may fix a part to the ground
+        # bodies with a single coordinate: a joint with one of these may fix a part to the ground
+        self.single_coordinate_bodies = single_coordinate_bodies
         self.parts = _DisjointSets(n_bodies)
         self.grounded = [False] * n_bodies
-        self.hubs_of: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support each part
+        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support each part
         # for each hub: one body of each part that the hub supports or has supported
-        self.supported: dict[int, list[int]] = {hub: [] for hub in hubs}
+        self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}
 
-    def may_eliminate(self, joint: int) -> bool:
+    def can_eliminate(self, joint: int) -> bool:
         """Return whether a joint may be eliminated next: its rows must be independent, see the module's docstring."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
-        if not bodies & self.lone and any(not self.grounded[part] and not self.hubs_of[part] for part in parts):
+        if not bodies & self.single_coordinate_bodies and any(
+            not self.grounded[part] and not self.hubs_by_part[part] for part in parts
+        ):
             return True
-        return not bodies & self.hubs and not any(self.hubs_of[part] for part in parts)
+        return not bodies & self.hubs and not any(self.hubs_by_part[part] for part in parts)
 
-    def eliminate(self, joint: int) -> None:
+    def eliminate_joint(self, joint: int) -> None:
         """Merge the parts that an eliminated joint connects, and update their supports."""
         bodies = self.joints[joint]
-        grounded = len(bodies) == 1 or bool(bodies & self.lone)
-        self._join((body for body in bodies if body not in self.hubs), grounded, bodies & self.hubs)
+        grounded = len(bodies) == 1 or bool(bodies & self.single_coordinate_bodies)
+        self._merge_parts((body for body in bodies if body not in self.hubs), grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
         """Merge an eliminated hub and the parts that it supports, and update their supports."""
         self.hubs.discard(hub)
-        supported = self.supported.pop(hub)
-        for body in supported:
-            self.hubs_of[body].discard(hub)
-        self._join([hub, *supported], False, frozenset())
+        supported_bodies = self.supported_bodies.pop(hub)
+        for body in supported_bodies:
+            self.hubs_by_part[body].discard(hub)
+        self._merge_parts([hub, *supported_bodies], False, frozenset())
 
-    def _join(self, bodies: Iterable[int], grounded: bool, hubs: AbstractSet[int]) -> None:
+    def _merge_parts(self, bodies: Iterable[int], grounded: bool, hubs: AbstractSet[int]) -> None:
+        """Merge the parts that contain `bodies`; `grounded` and `hubs`: further supports of the merged part."""
         first, *others = bodies
         part = self.parts.find(first)
         for body in others:
             other_part = self.parts.find(body)
             if other_part != part:
                 grounded = grounded or self.grounded[other_part] or self.grounded[part]
-                hubs = {*hubs, *self.hubs_of[other_part], *self.hubs_of[part]}
+                hubs = {*hubs, *self.hubs_by_part[other_part], *self.hubs_by_part[part]}
                 part = self.parts.join(part, other_part)
         self.grounded[part] = self.grounded[part] or grounded
-        for hub in hubs - self.hubs_of[part]:
-            self.hubs_of[part].add(hub)
-            self.supported[hub].append(part)
+        for hub in hubs - self.hubs_by_part[part]:
+            self.hubs_by_part[part].add(hub)
+            self.supported_bodies[hub].append(part)
 
 
 def elimination_order(
@@ -101,8 +111,8 @@ def elimination_order(
     n_rows: int,
     mass_entries: tuple[Integers, Integers],
     jacobian_entries: tuple[Integers, Integers],
-    together: Iterable[Sequence[int]] = (),
-    first: Sequence[int] = (),
+    body_groups: Iterable[Sequence[int]] = (),
+    early_rows: Sequence[int] = (),
     couplings: tuple[Integers, Integers] | None = None,
 ) -> Integers:
     """Return the order of elimination (n_q + n_rows): j for coordinate j, n_q + i for row i of G.
@@ -112,23 +122,24 @@ def elimination_order(
     n_q, n_rows : int
     mass_entries, jacobian_entries : (rows, columns)
         Entries of M and of G.
-    together : iterable of sequence of int
+    body_groups : iterable of sequence of int
         Groups of coordinates that form one body each, even if M does not couple them.
-    first : sequence of int
-        Rows of single bodies; they are eliminated before all joints, and so are independent, unless the body is a hub.
+    early_rows : sequence of int
+        Rows of single bodies. Unless the body is a hub, they are eliminated before all joints, so that no dependence on
+        other rows makes their pivots small.
     couplings : (rows, columns), optional
-        Entries of K and D, which couple bodies as springs do. All bodies are then hubs, each with its rows in `first`.
+        Entries of K and D, which couple bodies as springs do. All bodies are then hubs, each with its `early_rows`.
     """
-    body_of = bodies_of(n_q, mass_entries, together)
+    body_of = bodies_of(n_q, mass_entries, body_groups)
     bodies_in_row: list[set[int]] = [set() for _ in range(n_rows)]
     for i, j in zip(*(indices.tolist() for indices in jacobian_entries), strict=True):
         bodies_in_row[i].add(body_of[j])
-    first_rows = set(first)
-    rows_of: dict[frozenset[int], list[int]] = {}
+    early_row_set = set(early_rows)
+    rows_by_joint: dict[frozenset[int], list[int]] = {}
     for i, bodies in enumerate(bodies_in_row):
-        if i not in first_rows:
-            rows_of.setdefault(frozenset(bodies), []).append(i)
-    joints = list(rows_of)
+        if i not in early_row_set:
+            rows_by_joint.setdefault(frozenset(bodies), []).append(i)
+    joints = list(rows_by_joint)
     joints_of: list[list[int]] = [[] for _ in range(n_q)]  # for each body: indices of its joints
     for k, joint in enumerate(joints):
         for body in joint:
@@ -140,28 +151,30 @@ def elimination_order(
     for j, body in enumerate(body_of):
         coordinates.setdefault(body, []).append(j)
     order = [j for j in range(n_q) if body_of[j] not in hubs]
-    order += [n_q + i for i in first if not bodies_in_row[i] & hubs]
-    late_rows = [n_q + i for i in first if bodies_in_row[i] & hubs]
+    order += [n_q + i for i in early_rows if not bodies_in_row[i] & hubs]
+    rows_of_hubs = [n_q + i for i in early_rows if bodies_in_row[i] & hubs]
     if couplings is not None:
-        for i in first:
+        for i in early_rows:
             coordinates[next(iter(bodies_in_row[i]))].append(n_q + i)
-        late_rows = []
-    nodes = [[n_q + i for i in rows_of[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
+        rows_of_hubs = []
+    nodes = [[n_q + i for i in rows_by_joint[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
     pairs: set[tuple[int, int]] = set()
-    lone: set[int] = set()
+    single_coordinate_bodies: set[int] = set()
     if couplings is not None:
         pairs = {(body_of[i], body_of[j]) for i, j in zip(*couplings, strict=True)}
-        lone = {hub for hub in hubs if len(coordinates[hub]) == 1}
+        single_coordinate_bodies = {hub for hub in hubs if len(coordinates[hub]) == 1}
     sizes = [len(node) for node in nodes]
-    for node in _minimum_degree(joints, joints_of, sorted(hubs), sizes, n_q, pairs, lone):
+    for node in _minimum_degree(joints, joints_of, sorted(hubs), sizes, n_q, pairs, single_coordinate_bodies):
         order += nodes[node]
-    order += late_rows
+    order += rows_of_hubs
     return np.array(order, dtype=np.int64)
 
 
-def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
+def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], body_groups: Iterable[Sequence[int]]) -> list[int]:
     """Return, for each coordinate, the index of the first coordinate of the same body."""
-    pairs = np.array([(first, other) for first, *others in together for other in others], dtype=np.int64).reshape(-1, 2)
+    pairs = np.array([(first, other) for first, *others in body_groups for other in others], dtype=np.int64).reshape(
+        -1, 2
+    )
     rows, columns = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
     representatives, previous = np.arange(n_q), np.full(n_q, -1)
     while (representatives != previous).any():
@@ -180,12 +193,12 @@ def _minimum_degree(
     sizes: Sequence[int],
     n_bodies: int,
     pairs: Iterable[tuple[int, int]],
-    lone: AbstractSet[int],
+    single_coordinate_bodies: AbstractSet[int],
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    The next joint or hub is the one, among those allowed, whose neighbours have the fewest rows and coordinates.
-    `pairs`: pairs of hubs that are coupled other than by joints. `lone`: see `_Supports`.
+    Among the joints and hubs that may be eliminated, the next one has neighbours with the fewest rows and coordinates.
+    `pairs`: pairs of hubs that are coupled other than by joints. `single_coordinate_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -203,7 +216,7 @@ def _minimum_degree(
         neighbours[node_of[hub_b]].add(node_of[hub_a])
     for node, adjacent in enumerate(neighbours):
         adjacent.discard(node)
-    supports = _Supports(joints, n_bodies, set(hubs), lone)
+    supports = _PartSupports(joints, n_bodies, set(hubs), single_coordinate_bodies)
 
     def degree(node: int) -> int:
         return sum(sizes[neighbour] for neighbour in neighbours[node])
@@ -215,8 +228,8 @@ def _minimum_degree(
         degree_on_heap, node = heapq.heappop(heap)
         if is_eliminated[node] or degree_on_heap != degree(node):
             continue  # a newer entry of the heap replaces this one
-        if node < n_joints and not supports.may_eliminate(node):
-            continue  # a hub that supports its parts is a neighbour: the elimination of this hub pushes the joint again
+        if node < n_joints and not supports.can_eliminate(node):
+            continue  # a hub that supports its parts is a neighbour, and pushes the joint again when it is eliminated
         is_eliminated[node] = True
         order.append(node)
         affected = neighbours[node]
@@ -224,7 +237,7 @@ def _minimum_degree(
             neighbours[neighbour] |= affected
             neighbours[neighbour] -= {node, neighbour}
         if node < n_joints:
-            supports.eliminate(node)
+            supports.eliminate_joint(node)
         else:
             supports.eliminate_hub(hubs[node - n_joints])
         for neighbour in affected:
@@ -235,7 +248,7 @@ def _minimum_degree(
 Entries = tuple[Integers, Integers]  # row indices and column indices of the nonzero entries of a matrix
 
 # indices of the sizes with which a program begins; the functions below return the sections that follow
-N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
+N_COORDINATES, N_PIVOTS, N_OFF_DIAGONAL, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # largest number of updates (multiplications) with which a program is always written
 # largest number of updates of a longer program, relative to n^3 for n pivots: with more, dense factors are faster
 MAX_UPDATE_RATIO = 1e-3
@@ -247,7 +260,7 @@ def factorization_program(
     n_rows: int,
     mass: Entries,
     jacobian: Entries,
-    together: Iterable[Sequence[int]] = (),
+    body_groups: Iterable[Sequence[int]] = (),
     stiff_rows: Sequence[int] = (),
 ) -> NDArray[np.int32] | None:
     """Return the program that factors M and G; None if the program would have too many updates.
@@ -257,12 +270,12 @@ def factorization_program(
     n_q, n_rows : int
     mass, jacobian : (rows, columns)
         Entries of M, both triangles, and of G. If an entry occurs more than once, its numbers are added.
-    together : iterable of sequence of int
+    body_groups : iterable of sequence of int
         Groups of coordinates that form one body each, even if M does not couple them.
     stiff_rows : sequence of int
         Rows g along which M is to be stiffened by a multiple of g g^T; M must have the entries of g g^T.
     """
-    order = elimination_order(n_q, n_rows, mass, jacobian, together, stiff_rows)
+    order = elimination_order(n_q, n_rows, mass, jacobian, body_groups, stiff_rows)
     return program_in_order(order, n_q, mass, jacobian, stiff_rows)
 
 
@@ -271,7 +284,8 @@ def program_in_order(
 ) -> NDArray[np.int32] | None:
     """Return the program for an order of elimination; None if the program would have too many updates.
 
-    With `unsymmetric`, factors have entries of U, too: program[N_OFF] slots after those of L.
+    With `unsymmetric`, the factors also contain U: the slot of entry (i, j) of U is that of (j, i) of L, plus
+    program[N_OFF_DIAGONAL].
     """
     n = len(order)
     position = np.empty(n, dtype=np.int64)
@@ -286,10 +300,10 @@ def program_in_order(
     begin = np.concatenate([[0], np.cumsum(sizes)])
     row_of = np.concatenate([np.zeros(0, np.int64), *rows_below])
     column_of = np.repeat(np.arange(n), sizes)
-    keys = column_of * n + row_of  # the keys are ascending
+    entry_keys = column_of * n + row_of  # one ascending number for each entry of L
 
     def slots(column: Integers, row: Integers) -> Integers:
-        off_diagonal_slots = n + np.searchsorted(keys, column * n + row)
+        off_diagonal_slots = n + np.searchsorted(entry_keys, column * n + row)
         return np.where(column == row, column, off_diagonal_slots)
 
     firsts, seconds = [row_of[:0]], [row_of[:0]]
@@ -298,22 +312,25 @@ def program_in_order(
         firsts.append(rows_in_column[i])
         seconds.append(rows_in_column[j])
     first_of, second_of = np.concatenate(firsts), np.concatenate(seconds)
-    runs = _runs(slots(first_of, second_of), first_of == second_of)
+    runs = _update_runs(slots(first_of, second_of), first_of == second_of)
     entry_slots = slots(low, high)
     n_mass = len(mass[0])
     # entries of M above the diagonal get slots of U, or, with symmetric factors, a slot that is never read
     is_above = rows[:n_mass] < columns[:n_mass]
-    entry_slots[:n_mass][is_above] = entry_slots[:n_mass][is_above] + len(keys) if unsymmetric else n + len(keys)
+    n_off_diagonal = len(entry_keys)
+    entry_slots[:n_mass][is_above] = (
+        entry_slots[:n_mass][is_above] + n_off_diagonal if unsymmetric else n + n_off_diagonal
+    )
     product_rows, first, second = _products_of_entries(jacobian[0], stiff_rows)
     pivot_a, pivot_b = (position[jacobian[1][indices]] for indices in (first, second))
     stiffened = [product_rows, first, second, slots(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b))]
-    head = [n_q, n, len(keys), len(first_of), len(runs), n_mass, len(jacobian[0]), len(product_rows)]
+    head = [n_q, n, n_off_diagonal, len(first_of), len(runs), n_mass, len(jacobian[0]), len(product_rows)]
     parts = [order, begin, row_of, runs, *mass, entry_slots[:n_mass], *jacobian, entry_slots[n_mass:], *stiffened]
     return np.concatenate([np.array(head), *parts]).astype(np.int32)
 
 
-def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Return [length, first target] of each run, a sequence of off-diagonal updates with consecutive targets.
+def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
+    """Return [length, first target] of each run: off-diagonal updates whose target slots follow one another.
 
     The rows of a joint are adjacent in all columns, so that runs are long: the numbers of a run are read and written as
     vectors, and the program is a tenth as long as a list of all targets.
@@ -325,7 +342,7 @@ def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return the row and the indices of both entries, for each product of two entries in one of the rows `chosen`."""
+    """Return, for each product of two entries of one of the rows `chosen`, the row and the indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     ordered = rows[sequence]
@@ -369,52 +386,55 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 @inlined
 def end_of_sections(program):
     """Return the index at which the sections of a program end."""
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     return first + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 
 
 @inlined
-def order_of(program):
+def pivot_order_of(program):
     """Return the indices of the pivots in the order of elimination: j for coordinate j, n_q + i for row i of G."""
     return program[N_HEAD : N_HEAD + program[N_PIVOTS]]
 
 
 @inlined
-def columns_of(program):
-    """Return where the entries of each column of L begin, then the end, and the row, a pivot's index, of each entry."""
+def factor_columns_of(program):
+    """Return the index of the first entry of each column of L, with the end as last index, and the row of each entry.
+
+    Rows are numbered in the order of elimination.
+    """
     first = N_HEAD + program[N_PIVOTS]
     middle = first + program[N_PIVOTS] + 1
-    return program[first:middle], program[middle : middle + program[N_OFF]]
+    return program[first:middle], program[middle : middle + program[N_OFF_DIAGONAL]]
 
 
 @inlined
-def runs_of(program):
+def update_runs_of(program):
     """Return [length, first slot] of the runs of off-diagonal updates, in the order in which `factor` uses them."""
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
     return program[first : first + program[N_RUNS]]
 
 
 @inlined
-def mass_of(program):
+def mass_entries_of(program):
     """Return the rows, columns and slots of the entries of M."""
     n = program[N_OF_MASS]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
 
 
 @inlined
-def jacobian_of(program):
+def jacobian_entries_of(program):
     """Return the rows, columns and slots of the entries of G."""
     n = program[N_OF_JACOBIAN]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS] + 3 * program[N_OF_MASS]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS] + 3 * program[N_OF_MASS]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
 
 
 @inlined
-def stiffened_of(program):
-    """Return the row, the indices of both entries, and the slot of each product that stiffens M."""
+def stiffening_products_of(program):
+    """Return, for each product of two entries of G that stiffens M: row, indices of both entries, and slot."""
     n = program[N_STIFFENED]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     first += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
     middle = first + 2 * n
     slots = program[middle + n : middle + 2 * n]

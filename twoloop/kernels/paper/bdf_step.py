@@ -23,16 +23,16 @@ N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
 SAFETY = 0.9  # factor on the step size after a rejected step; smallest ratio of step sizes after an accepted step
-LEAST_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or a step that ends far from its prediction
+MIN_STEP_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or a step that ends far from its prediction
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
 STEP_SIZE_FACTOR = 6.0  # second factor on the error estimate, for the next step size only, as in VODE: fewer rejections
 ORDER_FACTOR = 1.4  # factor on the error estimates of other orders, so that the order rarely changes to and fro
-KEEP_BELOW = 1.2  # smallest factor by which the step size is increased; with a smaller factor, the step size is kept
-GROWTH = 2.0  # largest ratio of successive step sizes
+MIN_INCREASE = 1.2  # smallest factor by which the step size is increased; with a smaller factor, the step size is kept
+MAX_INCREASE = 2.0  # largest ratio of successive step sizes
 
 # indices in `options` of the scalars; the options of the Gauss steps follow
-HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
-# indices in `memory` of the scalars; the arrays of _coefficients and _blocks follow
+HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
+# indices in `memory` of the scalars; the arrays of _coefficient_row and _history_views follow
 (
     HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
     ORDER,
@@ -59,14 +59,14 @@ def memory_size(n_q: int) -> int:
 
 
 @inlined
-def _coefficients(memory, row):
+def _coefficient_row(memory, row):
     """Return a view (N_DIFFERENCES) of row `row`, such as SPANS, of the coefficients in `memory`."""
     start = N_MEMORY_SCALARS + row * N_DIFFERENCES
     return memory[start : start + N_DIFFERENCES]
 
 
 @inlined
-def _blocks(memory, n):
+def _history_views(memory, n):
     """Return views of `memory`: differences, trial differences, prediction, rate, and scratch.
 
     The differences have shapes (N_DIFFERENCES, 2 n); the prediction of (q, v) and `rate`, the derivative of the
@@ -83,7 +83,7 @@ def _blocks(memory, n):
 @kernel(SETTLE)
 def settle_bdf(f, w, options, memory, tolerances, accepted):
     """Set ORDER to the order chosen; if the attempt was accepted, also replace the history by the trial differences."""
-    differences, trial, _, _, _ = _blocks(memory, w.Q.size)
+    differences, trial, _, _, _ = _history_views(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
     if has_trial == 0.0:
@@ -94,7 +94,7 @@ def settle_bdf(f, w, options, memory, tolerances, accepted):
         return
     for j in range(int(memory[NEXT_DEPTH]) + 1):
         copy(trial[j], differences[j])
-    copy(_coefficients(memory, NEW_SPANS), _coefficients(memory, SPANS))
+    copy(_coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, SPANS))
     memory[AGE] = memory[AGE] + 1.0 if memory[ORDER] == memory[NEXT_ORDER] else 0.0
     memory[ORDER] = memory[NEXT_ORDER]
     memory[DEPTH] = memory[NEXT_DEPTH]
@@ -107,21 +107,21 @@ def _begin_history(memory, differences, state, h, order):
     for m in range(size):
         differences[0, m] = state[m]
         differences[1, m] = h * state[size // 2 + m]
-    _coefficients(memory, SPANS)[0] = h
+    _coefficient_row(memory, SPANS)[0] = h
     memory[ORDER] = order
     memory[DEPTH] = order
 
 
 @compiled
-def _predict(memory, differences, trial, h, prediction, rate):
+def _predict_state(memory, differences, trial, h, prediction, rate):
     """Store the differences, scaled to a step of size h, in `trial`; also store `prediction` and its `rate`.
 
     The prediction is the value, and `rate` the derivative, of the polynomial of degree ORDER at the end of the step.
     Also stores NEW_SPANS and ERROR_CONSTANTS.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
-    spans, new_spans = _coefficients(memory, SPANS), _coefficients(memory, NEW_SPANS)
-    constants = _coefficients(memory, ERROR_CONSTANTS)
+    spans, new_spans = _coefficient_row(memory, SPANS), _coefficient_row(memory, NEW_SPANS)
+    constants = _coefficient_row(memory, ERROR_CONSTANTS)
     new_spans[0] = h
     for j in range(depth):
         new_spans[j + 1] = spans[j] + h
@@ -154,7 +154,7 @@ def _corrector_coefficient(h, k):
 
 
 @compiled
-def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
+def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
     """Solve y = prediction + c (y' - rate) at time t for y = (q_i, v_i); return a code.
 
     The fixed-point iteration is on the independent accelerations. On return, all of `new_state` satisfies the
@@ -192,7 +192,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
 
 
 @compiled
-def _norm(tolerances, y, y1, d, sign, difference):
+def _difference_norm(tolerances, y, y1, d, sign, difference):
     """Return the largest component of |d + sign * difference| / (atol + rtol max(|y|, |y1|))."""
     n_q = d.size // 2
     largest = 0.0
@@ -206,8 +206,8 @@ def _norm(tolerances, y, y1, d, sign, difference):
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
     """Store NEXT_ORDER; return the error, in tolerances, and next step size / this step size; d: y1 - prediction."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
-    spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
-    norm = ERROR_FACTOR * _norm(tolerances, y, y1, d, 0.0, d)
+    spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
+    norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
     # with unequal steps, the interpolation of the history has an error, too; as in DASSL, the larger error counts
     interpolation = spans[0] / spans[k]
     for j in range(k):
@@ -216,14 +216,16 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
     here = norm * constants[k]
     below, above = np.inf, np.inf
     if k > 1:
-        below = ERROR_FACTOR * ORDER_FACTOR * constants[k - 1] * _norm(tolerances, y, y1, d, 1.0, trial[k])
+        below = ERROR_FACTOR * ORDER_FACTOR * constants[k - 1] * _difference_norm(tolerances, y, y1, d, 1.0, trial[k])
     if k < options[HIGHEST] and depth > k:
-        above = ERROR_FACTOR * ORDER_FACTOR * constants[k + 1] * _norm(tolerances, y, y1, d, -1.0, trial[k + 1])
+        above = (
+            ERROR_FACTOR * ORDER_FACTOR * constants[k + 1] * _difference_norm(tolerances, y, y1, d, -1.0, trial[k + 1])
+        )
     memory[NEXT_ORDER] = k
     if not error <= 1.0:
         if below < here:
             memory[NEXT_ORDER] = k - 1
-        return error, max(SAFETY * error ** (-1.0 / (k + 1)), LEAST_FACTOR)
+        return error, max(SAFETY * error ** (-1.0 / (k + 1)), MIN_STEP_FACTOR)
     factor = (STEP_SIZE_FACTOR * here) ** (-1.0 / (k + 1))
     if memory[AGE] >= k:  # estimates for other orders require k + 1 steps at this order
         lower, higher = (STEP_SIZE_FACTOR * below) ** (-1.0 / k), (STEP_SIZE_FACTOR * above) ** (-1.0 / (k + 2))
@@ -232,11 +234,11 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
         elif higher > factor:
             memory[NEXT_ORDER] = k + 1
         factor = max(factor, lower, higher)
-        if 1.0 < factor < KEEP_BELOW:
+        if 1.0 < factor < MIN_INCREASE:
             factor = 1.0
     else:
         factor = min(factor, 1.0)
-    return error, min(max(factor, SAFETY), GROWTH)
+    return error, min(max(factor, SAFETY), MAX_INCREASE)
 
 
 @compiled
@@ -268,7 +270,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     code, _ = iterate_accelerations(
         f,
         w,
-        options[N_SCALARS:],
+        options[N_OPTION_SCALARS:],
         tolerances,
         t,
         h,
@@ -293,16 +295,18 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     Steps of fixed size have the order HIGHEST; before them, HIGHEST Gauss steps fill the history.
     """
     n = w.Q.size
-    differences, trial, prediction, rate, scratch = _blocks(memory, n)
+    differences, trial, prediction, rate, scratch = _history_views(memory, n)
     has_fixed_step = tolerances[ESTIMATE] == 0.0
     if memory[DEPTH] == 0.0:
         _begin_history(memory, differences, state, h, 0.0 if has_fixed_step else 1.0)
-    _predict(memory, differences, trial, h, prediction, rate)
+    _predict_state(memory, differences, trial, h, prediction, rate)
     k = int(memory[ORDER])
     if has_fixed_step and k < options[HIGHEST]:
         code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
     else:
-        code = _correct(f, w, options, t + h, _corrector_coefficient(h, k), prediction, rate, new_state, scratch[:n])
+        code = _correct_state(
+            f, w, options, t + h, _corrector_coefficient(h, k), prediction, rate, new_state, scratch[:n]
+        )
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     y, y1, d = state[: 2 * n], new_state[: 2 * n], prediction
@@ -315,7 +319,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error, factor = _choose_order(options, memory, tolerances, trial, y, y1, d)
         distance = departure(w, tolerances, h, y[:n], y[n:], y1[:n])
         if distance > 0.0:
-            factor = min(factor, max(SAFETY / distance, LEAST_FACTOR))
+            factor = min(factor, max(SAFETY / distance, MIN_STEP_FACTOR))
         error = max(error, distance)
     memory[HAS_TRIAL] = 1.0
     _update_differences(memory, trial, y1, d)

@@ -9,13 +9,13 @@ from twoloop.kernels.evaluation.inner_loop import accelerations
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.paper import iterations as at
 from twoloop.kernels.paper.iterations import (
-    block,
     estimate_and_extrapolate,
     iterate_accelerations,
     iterate_first_order,
+    memory_block,
+    memory_vector,
     rounding_errors_of,
     store_rounding_errors,
-    vector,
 )
 from twoloop.kernels.steps.stages import (
     END_ERROR_WEIGHT,
@@ -34,7 +34,7 @@ def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
     """Store the stage accelerations of an accepted step, to predict the next ones, and its rounding errors."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
-        previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)
+        previous, trial = memory_block(memory, s, n, at.A_PREVIOUS), memory_block(memory, s, n, at.A_TRIAL)
         for j in range(s):
             copy(trial[j], previous[j])
         memory[at.H_PREVIOUS] = memory[at.H_TRIAL]
@@ -56,13 +56,13 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    previous = block(memory, s, n, at.PREVIOUS)
-    trial = block(memory, s, n, at.TRIAL)
-    half = block(memory, s, n, at.HALF)
-    Q_stage = block(memory, s, n, at.Q_STAGE)
-    V_stage = block(memory, s, n, at.V_STAGE)
-    q_full, v_full = vector(memory, s, n, at.Q_FULL), vector(memory, s, n, at.V_FULL)
-    q_mid, v_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID)
+    previous = memory_block(memory, s, n, at.A_PREVIOUS)
+    trial = memory_block(memory, s, n, at.A_TRIAL)
+    half = memory_block(memory, s, n, at.A_HALF)
+    Q_stage = memory_block(memory, s, n, at.Q_STAGE)
+    V_stage = memory_block(memory, s, n, at.V_STAGE)
+    q_full, v_full = memory_vector(memory, s, n, at.Q_FULL), memory_vector(memory, s, n, at.V_FULL)
+    q_mid, v_mid = memory_vector(memory, s, n, at.Q_MID), memory_vector(memory, s, n, at.V_MID)
     weights = memory[memory.size - s :]
     rounding = rounding_errors_of(memory, s, n, tolerances)
     ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
@@ -124,13 +124,17 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    A_stage = block(memory, s, n, at.TRIAL)
-    A_full = block(memory, s, n, at.HALF)
-    Q_stage = block(memory, s, n, at.Q_STAGE)
-    V_stage = block(memory, s, n, at.V_STAGE)
-    q_full, v_full = vector(memory, s, n, at.Q_FULL), vector(memory, s, n, at.V_FULL)
-    q_mid, v_mid, a_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID), vector(memory, s, n, at.A_MID)
-    q_old, v_old = vector(memory, s, n, at.Q_OLD), vector(memory, s, n, at.V_OLD)
+    A_stage = memory_block(memory, s, n, at.A_TRIAL)
+    A_full = memory_block(memory, s, n, at.A_HALF)
+    Q_stage = memory_block(memory, s, n, at.Q_STAGE)
+    V_stage = memory_block(memory, s, n, at.V_STAGE)
+    q_full, v_full = memory_vector(memory, s, n, at.Q_FULL), memory_vector(memory, s, n, at.V_FULL)
+    q_mid, v_mid, a_mid = (
+        memory_vector(memory, s, n, at.Q_MID),
+        memory_vector(memory, s, n, at.V_MID),
+        memory_vector(memory, s, n, at.A_MID),
+    )
+    q_old, v_old = memory_vector(memory, s, n, at.Q_OLD), memory_vector(memory, s, n, at.V_OLD)
     code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

@@ -22,7 +22,7 @@ N_ROUNDING = 4
 
 # indices in `memory`: of the scalars, then of the stage blocks (s, n_q), then of the vectors (n_q)
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
-PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
 
 
@@ -32,15 +32,15 @@ def memory_size(s: int, n_q: int) -> int:
 
 
 @inlined
-def block(memory, s, n, which):
-    """Return a view (s, n) of the block with the index `which`, such as PREVIOUS, in `memory`."""
+def memory_block(memory, s, n, which):
+    """Return a view (s, n) of the memory_block with the index `which`, such as A_PREVIOUS, in `memory`."""
     start = N_MEMORY_SCALARS + which * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
-def vector(memory, s, n, which):
-    """Return a view (n) of the vector with the index `which`, such as Q_FULL, in `memory`."""
+def memory_vector(memory, s, n, which):
+    """Return a view (n) of the memory_vector with the index `which`, such as Q_FULL, in `memory`."""
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
     return memory[start : start + n]
 

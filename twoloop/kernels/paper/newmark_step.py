@@ -23,11 +23,11 @@ BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
 @merged
-def _largest_abs(x, at_least):
-    """Return the largest absolute value in x, or `at_least` if this is larger."""
+def _largest_abs(x, lower_bound):
+    """Return the largest absolute value in x, or `lower_bound` if this is larger."""
     for m in range(x.size):
-        at_least = max(at_least, abs(x[m]))
-    return at_least
+        lower_bound = max(lower_bound, abs(x[m]))
+    return lower_bound
 
 
 @compiled
@@ -49,7 +49,7 @@ def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
 
 
 @compiled
-def _error(options, tolerances, rate, h, q, v, a, a1):
+def _estimated_error(options, tolerances, rate, h, q, v, a, a1):
     """Return the estimated error of a step, in units of the tolerances.
 
     The leading local error of q for gamma = 1/2 is e = |beta - 1/6| h^2 |a1 - a|. The result is the largest component
@@ -96,7 +96,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             error = 0.0
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
-                error = _error(options, tolerances, rate, h, q, v, a, a1)
+                error = _estimated_error(options, tolerances, rate, h, q, v, a, a1)
                 if options[ERROR_TOL] == 0.0:  # the paper does not have the estimate `departure`
                     for k in range(w.dependent.size):
                         m = w.dependent[k]

@@ -63,9 +63,15 @@ from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solv
 from twoloop.kernels.linalg.markowitz_lu import columns_of
 from twoloop.kernels.linalg.sparse_ldl import add_redundant_stiffness
 from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
-from twoloop.kernels.linalg.sparse_lu import load, tangents_of
+from twoloop.kernels.linalg.sparse_lu import load_matrix, tangent_entries_of
 from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
-from twoloop.kernels.linalg.symbolic_factorization import N_OF_MASS, N_OFF, N_PIVOTS, jacobian_of, mass_of
+from twoloop.kernels.linalg.symbolic_factorization import (
+    N_OF_MASS,
+    N_OFF_DIAGONAL,
+    N_PIVOTS,
+    jacobian_entries_of,
+    mass_entries_of,
+)
 from twoloop.kernels.steps.stages import (
     A_NEW,
     DERIVATIVE_Q,
@@ -554,16 +560,16 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
     """Return the length of w.matrices for sparse storage, whose parts are described at the next three functions."""
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
-    n_factors = n + 2 * int(program[N_OFF])
+    n_factors = n + 2 * int(program[N_OFF_DIAGONAL])
     return n_mass + n_jacobian + 2 * n_tangents + (N_SPARSE_VECTORS + 7) * n + (1 + 2 * n_systems) * n_factors
 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, of G, of K and of D, a copy of w.counts, stiffness (n_c) of rows."""
-    n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
+    """Return views of w.matrices: entries of M, of G, of K and of D, a copy of w.is_independent, stiffness (n_c) of rows."""
+    n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
-    begin_D = begin_K + mass_of(f.newton_program)[0].size - n_mass
+    begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass
     begin_counts = begin_D + begin_D - begin_K
     numbers = w.matrices
     return (
@@ -583,7 +589,7 @@ def _sparse_scratch(f, w):
     The views are three vectors (n_q), pivot sizes (N), and two complex vectors (N).
     """
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
-    begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
+    begin += 2 * (mass_entries_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices
     begin_sizes = begin + N_SPARSE_VECTORS * n
     return (
@@ -600,9 +606,9 @@ def _sparse_scratch(f, w):
 def _sparse_factor_view(f, w, k):
     """Return a view of w.matrices, as real numbers: the factors for gamma0 (k = 0), or for the eigenvalue k - 1."""
     n = f.newton_program[N_PIVOTS]
-    n_factors = n + 2 * f.newton_program[N_OFF]
+    n_factors = n + 2 * f.newton_program[N_OFF_DIAGONAL]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
-    begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size)
+    begin += 2 * (mass_entries_of(f.newton_program)[0].size - w.mass_values.size)
     if k == 0:
         return w.matrices[begin : begin + n_factors]
     return w.matrices[begin + (2 * k - 1) * n_factors : begin + (2 * k + 1) * n_factors]
@@ -622,7 +628,7 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
     largest = 0.0
     for j in range(out.size):
         largest = max(largest, abs(out[j]))
-    rows, columns, _ = jacobian_of(f.newton_program)
+    rows, columns, _ = jacobian_entries_of(f.newton_program)
     for k in range(rows.size):
         term = w.jacobian_values[k] * w.lam[rows[k]]
         largest = max(largest, abs(term))
@@ -637,7 +643,7 @@ def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, mo
     All columns of a group are computed at once. `base` (n_q) is the residual at (q, v); `residual` and `moved` (n_q)
     are scratch.
     """
-    rows, columns, begins = tangents_of(f.newton_program)
+    rows, columns, begins = tangent_entries_of(f.newton_program)
     base_point = v if by_v else q
     for group in range(begins.size - 1):
         copy(base_point, moved)
@@ -662,7 +668,7 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
     `base` is the residual at `base_point` (q or v), `residual` that at `moved`; `largest` is the largest term of
     a residual. `residual` and `predicted` (n_q) are overwritten.
     """
-    rows, columns, _ = tangents_of(f.newton_program)
+    rows, columns, _ = tangent_entries_of(f.newton_program)
     predicted[:] = 0.0
     for k in range(rows.size):
         i, j = rows[k], columns[k]
@@ -684,12 +690,12 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
     if f.newton_program.size == 0:
         return NEEDS_DENSE
     w.counters[N_JACOBIANS] += 1
-    mass, jacobian, K, D, counts, stiffness = _sparse_derivative_views(f, w)
+    mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     base, residual, moved, pivot_sizes, _, _ = _sparse_scratch(f, w)
     copy(w.mass_values, mass)
     copy(w.jacobian_values, jacobian)
-    copy(w.counts, counts)
-    copy(w.solutions[w.solutions.size - counts.size :], stiffness)
+    copy(w.is_independent, is_independent)
+    copy(w.solutions[w.solutions.size - is_independent.size :], stiffness)
     largest = _fill_sparse_residual(f, w, t, q, v, False, base)
     code = _fill_tangent_entries_by_differences(f, w, t, q, v, False, base, residual, moved, K)
     if code != DONE:
@@ -722,24 +728,24 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
 @compiled
 def _factor_sparse_matrix(f, w, z, factors):
     """Store the factors of the bordered matrix for z in `factors`, real or complex as z is; return a code."""
-    mass, jacobian, K, D, counts, stiffness = _sparse_derivative_views(f, w)
+    mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
-    load(f.newton_program, mass, jacobian, K, D, z, stiffness, factors)
-    return DONE if factor_lu(f.newton_program, counts, factors, pivot_sizes) else SINGULAR
+    load_matrix(f.newton_program, mass, jacobian, K, D, z, stiffness, factors)
+    return DONE if factor_lu(f.newton_program, is_independent, factors, pivot_sizes) else SINGULAR
 
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
     """Store the right-hand side [M r; G r] of the bordered system in `right`, with M stiffened by redundant rows."""
-    mass, jacobian, _, _, counts, stiffness = _sparse_derivative_views(f, w)
+    mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
-    rows, columns, _ = mass_of(f.newton_program)
+    rows, columns, _ = mass_entries_of(f.newton_program)
     for k in range(mass.size):
         right[rows[k]] += mass[k] * r[columns[k]]
-    rows, columns, _ = jacobian_of(f.newton_program)
+    rows, columns, _ = jacobian_entries_of(f.newton_program)
     for k in range(rows.size):
         right[w.Q.size + rows[k]] += jacobian[k] * r[columns[k]]
-    add_redundant_stiffness(f.newton_program, jacobian, counts, stiffness, right, right)
+    add_redundant_stiffness(f.newton_program, jacobian, is_independent, stiffness, right, right)
 
 
 @compiled
@@ -750,7 +756,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
     z, n = h * options[newton_options_index(s) + GAMMA0], y.size
     x = right.view(np.float64)[:n]
     _fill_sparse_right_side(f, w, e_v, x)
-    rows, columns, _ = tangents_of(f.newton_program)
+    rows, columns, _ = tangent_entries_of(f.newton_program)
     for k in range(rows.size):
         x[rows[k]] += z * K[k] * e_q[columns[k]]
     solve_lu(f.newton_program, _sparse_factor_view(f, w, 0), x, y.view(np.float64)[:n])

@@ -53,7 +53,7 @@ from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_AS_GIVEN, SOLVE
 from twoloop.kernels.linalg.dense import copy
-from twoloop.kernels.linalg.saddle_point import solve_both
+from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 
 # indices of the scalars in `options`. ORDER: order of the series of q; THETA: largest last correction of a projection;
 # N_NODES: number of quantities of the program; EARLY_WIDTH, LATE_WIDTH: numbers of early and late operations, padded;
@@ -357,7 +357,7 @@ def expand(f, w, options, memory, t, state, unit):
         if f.flags[FORM] == STATIC:
             f.inner(f, w, SOLVE, t, r, c, 0.0, a, lam)
         else:
-            solve_both(f, w, r, c, a, lam)
+            solve_with_multipliers(f, w, r, c, a, lam)
         integrate_coefficients(K, unit, N, series, a)
         _fill_second_factors(options, EARLY, N[K], Y1[K])
         _fill_second_factors(options, LATE, N[k], Y2[k])
