@@ -73,7 +73,7 @@ MAX_IDLE = 4  # largest number of idle integrators with equal options: one for e
 N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # number of calls that do not use an integrator after a callback raised an exception in it
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
-OTHER_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
+NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
 SHORT_RUN = 1e-3  # CPU time of the last run, s, below which elapsed time is recorded, as reading CPU time takes long
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
@@ -87,8 +87,8 @@ class Output(NamedTuple):
     time_limit: float | None  # limit of elapsed time, s
 
     @property
-    def inner_times(self) -> Array | None:
-        """Output times if they require interpolation, else None."""
+    def interpolated_times(self) -> Array | None:
+        """Output times if states must be interpolated, else None."""
         return None if self.at_ends else self.times
 
     def as_request(self, run: Run) -> OutputRequest:
@@ -137,7 +137,7 @@ class CachedIntegrator:
         self.parametric = None if shared is None else ParametricRun(shared, run)
         self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
-        run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (n_attempts := first_chunk(run))
+        run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (n_attempts := first_chunk_size(run))
         checked = system if self.parametric is None else self.parametric.system
         # skips: number of next calls that do not use the integrator, because a callback raised an exception
         self.evaluation, self.loops, self.skips = StartEvaluation(checked), cached_run(), 0
@@ -153,8 +153,8 @@ class CachedIntegrator:
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.interpolation = OutputInterpolation(run)
         self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether generated code is called
-        self.independent = self.arrays.start_rows.tobytes()  # bytes of the indices of independent rows
-        self.redundancy = {self.independent: (run.redundant, run.rows_warning)}
+        self.independent_rows = self.arrays.start_rows.tobytes()  # bytes of the indices of independent rows
+        self.redundancy = {self.independent_rows: (run.redundant, run.rows_warning)}
 
     @staticmethod
     def can_start(run: Run) -> bool:
@@ -165,9 +165,11 @@ class CachedIntegrator:
     def can_provide(run: Run, output: Output, shared: SharedSetup | None) -> bool:
         """Return whether a cached integrator, which reuses its arrays, can provide the requested `output`."""
         # `sol` and interpolated output must agree; `sol` must not use arrays that are filled for other parameters
-        if output.dense and (output.inner_times is not None or shared is not None):
+        if output.dense and (output.interpolated_times is not None or shared is not None):
             return False
-        return output.inner_times is None or not (run.ends_at_outputs or run.kit.flags[FORM] == indices.AUGMENTED)
+        return output.interpolated_times is None or not (
+            run.ends_at_outputs or run.kit.flags[FORM] == indices.AUGMENTED
+        )
 
     def integrate(
         self,
@@ -211,7 +213,7 @@ class CachedIntegrator:
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
         n_rows, timed_states = n, None  # one row for each step, unless `_finish` is called
-        rows_differ = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent
+        rows_differ = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent_rows
         all_steps = output.times is None and not output.dense
         if n < 0 or rows_differ or due or not all_steps or parametric is not None:
             if n in (loops.IN_DOUBT, loops.REFUSED):
@@ -267,10 +269,10 @@ class CachedIntegrator:
                 return MissedChanges(gap_for_repetition(run), record.stats.cpu_time)
             return fields_of(record, self.options, system, self.run_fields[-1], t1)
         timed_states = None
-        kinds = interval_kinds(run, steps) if output.dense or output.inner_times is not None else NO_KINDS
-        if output.inner_times is not None:
+        kinds = interval_kinds(run, steps) if output.dense or output.interpolated_times is not None else NO_KINDS
+        if output.interpolated_times is not None:
             began = time.process_time()
-            self.interpolation.interpolate(output.inner_times, t, rows, kinds, self.evaluation.pattern)
+            self.interpolation.interpolate(output.interpolated_times, t, rows, kinds, self.evaluation.pattern)
             self.cpu_time += time.process_time() - began
         if not self._compare_callbacks(t, rows, t1, bool(report[loops.IN_CHECKED_REGION]), due):
             arrays.last_start[loops.N_EQUAL] = loops.NEVER
@@ -297,7 +299,7 @@ class CachedIntegrator:
                     return False
                 self.redundancy[independent] = new_run.redundant, new_run.rows_warning
             run.redundant, run.rows_warning = self.redundancy[independent]
-            self.run_fields, self.independent = (run.rank, run.redundant, self.run_fields[-1]), independent
+            self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), independent
         mass, derivatives = self.evaluation.mass, self.check_derivatives
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
@@ -319,15 +321,15 @@ class CachedIntegrator:
             return False
         if run.compared_until[0] >= t1 and not due:
             return True
-        everywhere = due or (parameters is not None and not region.contains_parameters(parameters))
-        if everywhere or not inside:
+        all_states = due or (parameters is not None and not region.contains_parameters(parameters))
+        if all_states or not inside:
             n, status = 2 * run.system.n_q, Status.REACHED_END
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
             states = sample.states()
-            if not everywhere:  # with the extreme states of this run, the region contains all states of an equal run
+            if not all_states:  # with the extreme states of this run, the region contains all states of an equal run
                 states = np.concatenate([extreme_states(t, rows[:, :n]), states])
-            if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
+            if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", all_states)[0] != status:
                 return False
             if parameters is not None:
                 region.add_parameters(parameters)
@@ -373,14 +375,14 @@ def _deferred_field(
     fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
     fields |= {"widest_gap": float(data[loops.LONGEST_GAP]), "system": system, "atol": options.atol.copy(), "t_end": t1}
     t, rows = (data[loops.N_HEAD : begin], data[end:].reshape(n_states, -1)) if timed_states is None else timed_states
-    return OTHER_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
+    return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
 # ratio of the smallest pivot at a start to that at the first start, below which `set_up` checks the start
 RECHECK_PIVOT = 0.1
 
 
-def first_chunk(run: Run) -> int:
+def first_chunk_size(run: Run) -> int:
     """Return the largest number of attempted steps, which is the largest number of states, in the first chunk."""
     return max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
 
@@ -471,7 +473,7 @@ class CacheEntry(NamedTuple):
 
 
 # cached data of a system: its last start, its entries by options, and the id of code that the last run generated
-NO_RUNS: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
+EMPTY_CACHE: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 
 def cached_result(
@@ -489,7 +491,7 @@ def cached_result(
     Return the fields of the result and a warning about redundant rows (or ""); or a request to repeat the run; or, if
     the run cannot be cached, a `Run` at its start; or None, if `set_up` must check the start.
     """
-    entries = system.derived.get("runs", NO_RUNS)[1].get(options.key, ())
+    entries = system.derived.get("runs", EMPTY_CACHE)[1].get(options.key, ())
     if not entries and (shared := system.shared.get("runs")):
         entry = shared.get((options.key, _trace_cache(system)))
         entries = (entry,) if isinstance(entry, CacheEntry) else ()
@@ -534,7 +536,7 @@ def set_up(
     if system.called_in_python:  # functions called in Python may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, key = (t0, q0.tobytes(), v0.tobytes()), options.key
-    last_start, runs, last_code = system.derived.get("runs", NO_RUNS)
+    last_start, runs, last_code = system.derived.get("runs", EMPTY_CACHE)
     entries = runs.get(key, ())
     run, entry = None, next((each for each in entries if each.start == start), None)
     if entry is not None:
@@ -549,14 +551,14 @@ def set_up(
         if run.system is system:
             _share_setup(system, run, code, t1, options)
     new, added = not entries or last_code == id(code) if entry is None else last_start == start != entry.start, None
-    if new and (added := _entry_of(run, code, t1, options)) is not None:
+    if new and (added := _new_entry(run, code, t1, options)) is not None:
         runs = {} if len(runs) == MAX_OPTIONS else dict(runs)  # a copy, because another thread may read the dict
         runs[key] = added, *[each for each in entries if each is not entry][: MAX_ENTRIES - 1]
     system.derived["runs"] = start, runs, id(code) if entry is None else None
     return run, added
 
 
-def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options) -> CacheEntry | None:
+def _new_entry(run: Run, code: GeneratedCode | None, t1: float, options: Options) -> CacheEntry | None:
     """Return the cache entry of a run at its start, or None if the run cannot be cached."""
     system, n = run.system, run.system.n_q
     trusted = identity(options.method) is not None and all(traced.trusted for traced in run.traced)
@@ -586,7 +588,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
     if key not in cached:
         system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {key: functions}
     elif type(cached[key]) is type(functions) and cached[key] is not functions:
-        entry = _entry_of(run, code, t1, options)
+        entry = _new_entry(run, code, t1, options)
         if entry is not None and entry.idle is not None:
             fixed = options.step_size is not None
             with suppress(ValueError):
@@ -631,7 +633,7 @@ def _new_run(
             beside, other = _run_from(system, t0, branch.q, branch.v, options, derived, check)
             if beside.rank == branch.rank and beside.static_form is None:
                 run, code = beside, other
-                run.move_to_singular_start(t0, q0, v0, branch.a, branch.length)
+                run.move_to_singular_start(t0, q0, v0, branch.a, branch.first_size)
     if new:
         share_checked_bounds(original)
     if system.called_in_python and not fixed:

@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
 
-MAX_DIVIDED = 512  # largest number of intervals whose interior states are cached
-MAX_ACCURATE = 65536  # largest number of intervals that are cached as accurate without interior states
+MAX_DIVIDED_INTERVALS = 512  # largest number of intervals with cached interior states
+MAX_ACCURATE_INTERVALS = 65536  # largest number of intervals cached as accurate without interior states
 # largest accepted residual of a polynomial in the constraints and the equations of motion, relative to the tolerances;
 # MAX_ERROR_ACROSS in steps across singular positions, where errors of velocities were ten times the residual
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
-N_REPAIR = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
+N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
 
 
 class StateTable(NamedTuple):
@@ -95,8 +95,8 @@ class Interpolator:
         self.system, self.rtol, self.ranks = system, rtol, ranks
         self.tolerances = np.concatenate([np.zeros(ATOL), atol])
         self.tolerances[RTOL] = rtol
-        self.parts = max((plan.parts for plan in self.plans.values()), default=N_REPAIR)
-        self.parts = max(self.parts, N_REPAIR)
+        self.parts = max((plan.parts for plan in self.plans.values()), default=N_REPAIR_STEPS)
+        self.parts = max(self.parts, N_REPAIR_STEPS)
         self.static_form = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()
@@ -183,8 +183,8 @@ class Interpolator:
         self._record_failures(failures, len(times))
         return out
 
-    def within(self, table: StateTable, t: float) -> Callable[[float], Array]:
-        """Return a function of one time that returns [q, v], for times in the interval of the table that contains t."""
+    def row_function(self, table: StateTable, t: float) -> Callable[[float], Array]:
+        """Return a function that returns the row [q, v] at any time in that interval of `table` which contains t."""
         groups = _interval_groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, indices.END_TIME] = 1
         self._divide_where_needed(table, groups)
@@ -202,7 +202,7 @@ class Interpolator:
     def _record_failures(self, failures: int, n_times: int) -> None:
         self.failures = failures
         if failures > 0 and self.warns:
-            _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
+            _warn_of_lost_rank(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
     def _interpolate(self, table: StateTable, groups: Groups, times: Array, out: Array) -> int:
         """Store rows [q, v] at the times of the groups in `out` (n, 2 n_q); return the number of failed projections."""
@@ -220,10 +220,10 @@ class Interpolator:
         is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in begins])
         if not self.may_divide or not is_new.any():
             return
-        if len(self.interior_states) > MAX_DIVIDED:
+        if len(self.interior_states) > MAX_DIVIDED_INTERVALS:
             self.interior_states.clear()
             is_new = np.array([t not in self.accurate_intervals for t in begins])
-        if len(self.accurate_intervals) > MAX_ACCURATE:
+        if len(self.accurate_intervals) > MAX_ACCURATE_INTERVALS:
             self.accurate_intervals.clear()
         groups = groups[is_new & (groups[:, indices.KIND] != indices.JUMP)]
         for kind, plan in self.plans.items():
@@ -255,8 +255,8 @@ class Interpolator:
     def _repair_interval(self, table: StateTable, group: Groups, smallest: float) -> None:
         """Cache other states for the polynomial of an interval if they reduce its residual, `smallest` on entry.
 
-        Three sets are tried: the states of a step across a singular position, the states of N_REPAIR steps, and only
-        the two ends of the interval.
+        Three sets are tried: states of a step across a singular position, states of N_REPAIR_STEPS steps, and the two ends
+        of the interval alone.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
@@ -307,7 +307,7 @@ class Interpolator:
         return times, states
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
-        """Return plan and kit of N_REPAIR steps that divide an interval of this kind with an inaccurate polynomial."""
+        """Return plan and kit of N_REPAIR_STEPS steps that divide an interval of a kind with inaccurate polynomials."""
         is_stiff = kind == indices.VELOCITIES
         if is_stiff not in self.repair_plans:
             from twoloop.methods.dop853 import DOP853
@@ -316,7 +316,7 @@ class Interpolator:
 
             method = RungeKutta(radau_iia(3), outer="newton") if is_stiff else DOP853()
             atol = float(self.tolerances[ATOL:].min())
-            plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=N_REPAIR)
+            plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=N_REPAIR_STEPS)
             q0 = self.arguments[2][: self.system.n_q]
             if plan.matrices > self.matrices:
                 self.matrices = plan.matrices
@@ -399,12 +399,14 @@ class Interpolator:
             failures = complete(self.kit, self.work, times, states, out)
         self.failures = failures
         if failures > 0 and self.warns:
-            _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
+            _warn_of_lost_rank(
+                f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN"
+            )
 
 
 def _blocks(groups: Groups) -> list[Groups]:
-    """Return the groups in blocks of at most MAX_DIVIDED, whose interior states the cache can contain."""
-    return [groups[begin : begin + MAX_DIVIDED] for begin in range(0, len(groups), MAX_DIVIDED)]
+    """Return the groups in blocks of at most MAX_DIVIDED_INTERVALS, whose interior states the cache can contain."""
+    return [groups[begin : begin + MAX_DIVIDED_INTERVALS] for begin in range(0, len(groups), MAX_DIVIDED_INTERVALS)]
 
 
 def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
@@ -428,7 +430,7 @@ def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
     return groups
 
 
-def _warn(consequence: str, stacklevel: int = 4) -> None:
+def _warn_of_lost_rank(consequence: str, stacklevel: int = 4) -> None:
     warnings.warn(f"the constraint Jacobian has lost rank: {consequence}", ConstraintWarning, stacklevel)
 
 
@@ -499,9 +501,9 @@ class DenseState:
         self._interpolator, self._order, self._rows = interpolator, order, rows
         n = interpolator.system.n_q
         self.t: Any = t if t.ndim else float(t)
-        self.q, self.v = self._unsorted(rows[:, :n]), self._unsorted(rows[:, n:])
+        self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
-    def _unsorted(self, rows: Array) -> Array:
+    def _columns_by_time(self, rows: Array) -> Array:
         """Return rows, in the order of time, as columns in the order of `t`; for a single time, as a vector."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
@@ -518,12 +520,12 @@ class DenseState:
     @property
     def a(self) -> Array:
         """Accelerations."""
-        return self._unsorted(self._a_and_lam[:, : self._interpolator.system.n_q])
+        return self._columns_by_time(self._a_and_lam[:, : self._interpolator.system.n_q])
 
     @property
     def lam(self) -> Array:
         """Multipliers."""
-        return self._unsorted(self._a_and_lam[:, self._interpolator.system.n_q :])
+        return self._columns_by_time(self._a_and_lam[:, self._interpolator.system.n_q :])
 
 
 class DenseSolution:

@@ -176,16 +176,16 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     base, run.mirrored_size = None, 0.0
     if not fixed:
         base, run.mirrored_size = _find_base(run, [place for place in past if place[0] >= earliest])
-    # try several origins: earlier accelerations may precede a jump of a force; there may be too few of them near the
-    # start, or too few later ones near the end; from an old base the polynomial may be too long
-    longest, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
-    near_start = compiled and clock[a.T] - clock[a.T_START] < longest
-    near_end = compiled and clock[a.T] + LARGER_RATIOS[-1] * longest > run.t1
-    starts = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
-    run.origins = [*[Origin(*start) for start in starts], Origin(np.inf, None)]
+    # try several origins: earlier nodes may be before a jump of a force; near the start or the end of the run there may
+    # be too few nodes; the polynomial from an old base may be too long
+    h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
+    near_start = compiled and clock[a.T] - clock[a.T_START] < h_long
+    near_end = compiled and clock[a.T] + LARGER_RATIOS[-1] * h_long > run.t1
+    origins = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
+    run.origins = [*[Origin(*start) for start in origins], Origin(np.inf, None)]
     if not fixed:
         variants = [(limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]]
-        run.origins += [Origin(*start, *variant) for variant in variants[1:] for start in starts]
+        run.origins += [Origin(*start, *variant) for variant in variants[1:] for start in origins]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
@@ -215,17 +215,17 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
         run.crossing_tolerances[indices.ATOL :] *= TOLERANCE_FACTOR
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.crossing_tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
-    longest, allowed, time_left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
+    h_long, max_size, time_left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
     min_size = time_left if beyond else 0.0
     if not beyond and control[a.FIXED_STEP] == 0.0:
-        allowed = min(allowed, time_left)
-    first_size = max(longest, min(run.mirrored_size, LARGER_RATIOS[-1] * longest))
-    run.sizes_to_try = [size for size in sizes_across(first_size, allowed) if size > min_size]
+        max_size = min(max_size, time_left)
+    first_size = max(h_long, min(run.mirrored_size, LARGER_RATIOS[-1] * h_long))
+    run.sizes_to_try = [size for size in sizes_across(first_size, max_size) if size > min_size]
     run.larger_sizes = [
-        longest * part for part in LARGER_RATIOS if max(first_size, min_size) < longest * part <= allowed
+        h_long * part for part in LARGER_RATIOS if max(first_size, min_size) < h_long * part <= max_size
     ]
     if not run.sizes_to_try:
-        run.sizes_to_try, run.larger_sizes = run.larger_sizes or [min(first_size, allowed)], []
+        run.sizes_to_try, run.larger_sizes = run.larger_sizes or [min(first_size, max_size)], []
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
     run.crossing_size = float(clock[a.H_NEXT])
 

@@ -120,14 +120,14 @@ class Interrupts:
 
 
 def describe_interrupt(t: float, table: Array) -> str:
-    """Return the message of a run that Ctrl-C ended at t; `table`: its rows [q, v, a, lam]."""
+    """Return the message of a run that Ctrl-C ended at t; `table`: the rows [q, v, a, lam] of the result."""
     n_missing = int(np.isnan(table[:, -1:]).sum())  # [a, lam] of a row is either complete or NaN
     nan_note = f" Accelerations and multipliers are NaN at {n_missing} of its times." if n_missing else ""
     return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{nan_note}"
 
 
 def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Record:
-    """Return the record, without states, of a run that Ctrl-C ended before the accelerations at its start."""
+    """Return the record, without states, of a run that Ctrl-C ended before its first step."""
     n_q, empty = system.n_q, np.zeros(0)
     columns = np.zeros((n_q, 0))
     occurrences = None if events is None else [empty for _ in events]
@@ -155,7 +155,7 @@ BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
 CHUNK_TO_EVENT = 16  # number of attempts in a chunk if an event may end the run: steps beyond the event are wasted
 CHUNK_TIME = 0.05  # CPU time of a chunk, s, from which on the next chunk is not larger, so that Ctrl-C is noticed soon
 # statuses whose message may say that stability limited the steps
-EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
+STATUSES_OF_LONG_RUNS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 MAX_BASE_CANDIDATES = 16  # largest number of last states that may be the base of a step across a singular position
 # attempts across a singular position need not end at t1, but at t1 + CROSSING_OVERSHOOT times the run's duration
 CROSSING_OVERSHOOT = 100.0
@@ -211,19 +211,19 @@ class IntegrationLoop:
             self.outputs = np.append(request.times[(request.times > run.t0) & (request.times < t1)], t1)
         run.control[run.a.STORE_ALL] = request.every_step
         self.largest_chunk = BUFFER_STEPS
-        has_terminal = request.events is not None and any(event.terminal < np.inf for event in request.events)
-        if has_terminal:
+        has_terminal_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
+        if has_terminal_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
         # number of attempts from one check of progress to the next, and total number of attempts at the next check
         self.check_interval = self.next_check = run.chunk
-        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # others while steps cross a singularity
+        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
         self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet
         if self.request.store.append_only:
             self._store_step_fields()
         self.n_filled = np.zeros(2, dtype=np.int64)
-        may_end_before_t1 = has_terminal or time_limit is not None  # users of such runs may choose a very late t1
+        may_end_before_t1 = has_terminal_event or time_limit is not None  # users of such runs may choose a very late t1
         self.stall_detector = StallDetector(run.t0, np.inf if may_end_before_t1 else MAX_STEPS_LEFT)
         self.stiffness_monitor = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
@@ -418,7 +418,7 @@ class IntegrationLoop:
             self.latest_chunks[-1][1][-1, : len(row)] = row
 
     def _is_stalled(self, across: bool) -> bool:
-        """Return whether a method with a substitute plan cannot take a step, and no singular position is near."""
+        """Return whether steps became too small, away from singular positions, for a method that has a substitute."""
         run, a = self.run, self.run.a
         is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return is_too_small and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
@@ -458,7 +458,7 @@ class IntegrationLoop:
                 message += warn_of_missed_changes(run) + warn_of_passage_by_ordinary_steps(run)
             if status >= 0 and run.start_warning:
                 message += warn_user(run.start_warning)
-            if status in EXPLAINED_BY_STIFFNESS:
+            if status in STATUSES_OF_LONG_RUNS:
                 message += describe_stiffness(self.stiffness_monitor, run.kit, run.work)
         except KeyboardInterrupt:
             code = INTERRUPTED

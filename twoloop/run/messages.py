@@ -20,7 +20,7 @@ from twoloop.kernels.control.loop_state import DISPLACEMENT, INNER_TOL, initial_
 from twoloop.kernels.control.singular_positions import EPS
 from twoloop.kernels.data import indices
 from twoloop.methods.plan import Plan
-from twoloop.run.record import Deferred, Status
+from twoloop.run.record import LaterFields, Status
 from twoloop.run.singular_positions import (
     WEAK_RATIO,
     TimedState,
@@ -92,7 +92,7 @@ MIN_STABILITY_RATIO = 0.45
 
 
 class StiffnessSample(NamedTuple):
-    """Sampled state of a run, with step size and stability limits of the method."""
+    """Sampled state of a run, with the step size, and the stability limits of the method there."""
 
     t: float
     q: Array
@@ -208,7 +208,7 @@ MAX_RATIO_AT_END = 1e-6
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
-CROSSINGS = "\0"  # placeholder in a message, to be replaced by the description of singular positions that were crossed
+CROSSINGS_MARK = "\0"  # stands in a message for the description of the singular positions that were crossed
 # time left, relative to the duration of the run, up to which a message mentions that the end is near
 NEAR_END = 1e-3
 
@@ -223,41 +223,41 @@ _FAILURE_REASONS = {
 
 
 def _describe_jumps_and_crossings(run: "Run") -> str:
-    """Return a sentence about the jumps of a run, and CROSSINGS if steps crossed singular positions; else ""."""
+    """Return a sentence about jumps of C_t or b, if any, and CROSSINGS_MARK if steps crossed singular positions."""
     text = f" At t = {_format_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(
         run.jumps
     )
-    return text + (CROSSINGS if run.crossings else "")
+    return text + (CROSSINGS_MARK if run.crossings else "")
 
 
-def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Deferred | None = None) -> dict[str, Any]:
-    """Return the field `message` as a dict, or the field `later` with a function that computes the message when read.
+def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: LaterFields | None = None) -> dict[str, Any]:
+    """Return {"message": text}, or {"later": function} with a function that computes the text when it is read.
 
-    The message is deferred if it describes crossings, because that takes longer than many runs. Until then `system`
-    must not change; the arrays of the run may. `later`: function that computes other deferred fields, by name.
+    The text is computed later if it describes crossings, because that takes longer than many runs. Until then `system`
+    must not change; the arrays of the run may. `later`: function that computes other deferred fields by their names.
     """
-    if CROSSINGS not in words:
+    if CROSSINGS_MARK not in words:
         return {"message": words}
-    crossings, now, rank = run.crossings, (float(run.clock[run.a.T]), run.state.copy()), run.rank
+    crossings, end_state, rank = run.crossings, (float(run.clock[run.a.T]), run.state.copy()), run.rank
 
     def fields_of(name: str) -> dict[str, Any]:
         if name != "message" and later is not None:
             return later(name)
-        return {"message": words.replace(CROSSINGS, describe_crossings(system, crossings, now, rank))}
+        return {"message": words.replace(CROSSINGS_MARK, describe_crossings(system, crossings, end_state, rank))}
 
     # functions called in Python may depend on variables that change: compute the message now
     return fields_of("message") if system.called_in_python else {"later": fields_of}
 
 
 def reject_turned_velocities(
-    run: "Run", last_step: list[TimedState], landed: list[TimedState], end: float, status: Status, message: str
+    run: "Run", last_step: list[TimedState], output_states: list[TimedState], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
     """Return `status` and `message`, or RANK_LOST and a reason if rounding or a change of branch changed velocities.
 
-    `last_step`: the state before the last step if velocities turned in it. `landed`: states at which steps had to end.
+    `last_step`: [state before the last step] if velocities turned in that step. `output_states`: states at output times.
     """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
-    reason = describe_rounding(run, [*(place for each in crossings for place in each), *landed], end)
+    reason = describe_rounding(run, [*(place for each in crossings for place in each), *output_states], end)
     if last_step:
         crossings.append(last_step)
     if crossings and not reason:

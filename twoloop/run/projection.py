@@ -29,7 +29,7 @@ from twoloop.run.workspace import kit_of, static_form, workspace
 
 Array = NDArray[np.float64]
 
-MIN_SINE = 1e-5  # sine of the angle of a row to the other rows below which a position may be near a dead centre
+MIN_SINE = 1e-5  # sine of the angle of a row of C_q to the other rows, below which a dead centre may be near
 # largest number of Newton iterations by sparse factors; correction that ends them, relative to the largest coordinate
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
 # largest distance between projection and prediction by C_q on the same assembly, relative to the guess's displacement
@@ -97,9 +97,9 @@ class Dependence(NamedTuple):
     """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    coefficients: dict[int, Array]  # by index of a dependent row: its coefficients (n_c,) in terms of the others
+    coefficients: dict[int, Array]  # keys: dependent rows; values (n_c,): row = values @ independent rows
     allowed_move: Array  # displacement (n_q,) that C_q allows; its largest entry is 1 in units of coordinates
-    project_nearby: Callable[[Array], Array | None]  # returns a projected nearby position, or None on failure
+    project_nearby: Callable[[Array], Array | None]  # projects a position near q; returns None on failure
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
@@ -434,7 +434,7 @@ def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = LSTSQ_CUTOFF
 ) -> tuple[Array | None, float, int]:
     """Return the projected q (None: diverged), its violation over the allowed violation, and the iteration count."""
-    best, nearest, guess = np.inf, q, q
+    least_excess, best_q, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
             jacobian, values = system.jacobian(t, q), system.constraint(t, q)
@@ -445,14 +445,15 @@ def _gauss_newton(
         step = _least_change(jacobian, free, -values, cutoff)
         scales = scales_of(system, t, q, jacobian)
         excess = Violation.of_position(system, t, q, jacobian, scales).excess
-        if excess == 0.0 or (excess <= CONVERGED_VIOLATION and excess >= 0.5 * best):
+        if excess == 0.0 or (excess <= CONVERGED_VIOLATION and excess >= 0.5 * least_excess):
             return q, excess, iteration  # as close as rounding allows
-        if excess < best:
-            best, nearest = excess, q
+        if excess < least_excess:
+            least_excess, best_q = excess, q
         q = q + step
         if not (np.abs(q - guess) <= MAX_CHANGE * scales.columns).all():  # also true for NaN
             return None, np.inf, iteration
-    return nearest if best <= 1.0 else q, best, MAX_ITERATIONS  # rounding may keep it above CONVERGED_VIOLATION
+    # rounding may keep the excess above CONVERGED_VIOLATION
+    return best_q if least_excess <= 1.0 else q, least_excess, MAX_ITERATIONS
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff: float = LSTSQ_CUTOFF) -> Array:
@@ -500,9 +501,9 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
     ratios = [float(each.min()) / max(float(each.max()), 1e-300) for each in values]
     if max(ratios) > DEAD_CENTRE_RATIO:
         return ""
-    without = f" without the columns of keep={kept}" if kept else ""
+    columns = f" without the columns of keep={kept}" if kept else ""
     return (
-        f". There C_q{without} nearly loses rank, as at a dead centre: its smallest singular value is {ratios[0]:.2g} "
+        f". There C_q{columns} nearly loses rank, as at a dead centre: its smallest singular value is {ratios[0]:.2g} "
         "of the largest"
     )
 
@@ -511,11 +512,11 @@ def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
-    rows = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
+    name = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:
-        return f"{rows} of {system.name!r} has {ranks} at t = {t!r}, and {why}: give a guess away from this position"
+        return f"{name} of {system.name!r} has {ranks} at t = {t!r}, and {why}: give a guess away from this position"
     return (
-        f"keep leaves too little freedom: without the columns {kept} {rows} of {system.name!r} has {ranks} at "
+        f"keep leaves too little freedom: without the columns {kept} {name} of {system.name!r} has {ranks} at "
         f"t = {t!r}, and {why}. Keep fewer coordinates, or give a guess away from a dead centre"
     )
 

@@ -37,7 +37,7 @@ class MemoryStore:
     Attributes
     ----------
     append_only : bool
-        Whether added rows must be complete, because they cannot be changed later.
+        Whether rows cannot be changed after they were added, so that they must be complete.
     """
 
     append_only = False
@@ -135,7 +135,7 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING = 1024  # largest number of states that wait for the search for events, and for interpolation
+MAX_PENDING_STATES = 1024  # largest number of states that wait for the search for events, and for interpolation
 
 
 @dataclass(frozen=True)
@@ -183,14 +183,14 @@ class _TableInterpolation(NamedTuple):
         return self.interpolator.states(self.table, times)
 
     def within(self, t: float) -> Callable[[float], Array]:
-        return self.interpolator.within(self.table, t)
+        return self.interpolator.row_function(self.table, t)
 
 
 class Recorder:
     """Recorder of the states of accepted steps, chunk by chunk.
 
     The interval of a step is searched for events when all states through which its polynomials go are known, so that
-    the output does not depend on the chunks. Event functions are evaluated at least every `every` seconds.
+    the output does not depend on the chunks. Event functions are evaluated at least every `max_gap` seconds.
 
     Attributes
     ----------
@@ -204,7 +204,13 @@ class Recorder:
     """
 
     def __init__(
-        self, request: OutputRequest, interpolator: Interpolator | None, n_q: int, t0: float, state: Array, every: float
+        self,
+        request: OutputRequest,
+        interpolator: Interpolator | None,
+        n_q: int,
+        t0: float,
+        state: Array,
+        max_gap: float,
     ):
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps, self.last_step_size = 0, 0.0
@@ -215,11 +221,11 @@ class Recorder:
         self._next_interval = 0  # index of the first interval between these states that has not been searched
         self._n_outputs = 0
         may_end_run = request.events is not None and any(event.terminal < np.inf for event in request.events)
-        self._max_pending = 0 if may_end_run or request.store.append_only else MAX_PENDING
-        self.search = None if request.events is None else EventSearch(request.events, t0, state[: 2 * n_q], every)
+        self._max_pending = 0 if may_end_run or request.store.append_only else MAX_PENDING_STATES
+        self.search = None if request.events is None else EventSearch(request.events, t0, state[: 2 * n_q], max_gap)
         self._store_output(self._t, self._rows, self._kinds)
         if request.times is not None and not request.ends_at_outputs:
-            self._store(self._t[:0], self._rows[:0, : 2 * self._n_q])
+            self._store_states(self._t[:0], self._rows[:0, : 2 * self._n_q])
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         """Record times and states [q, v, a, lam] at which steps ended, and the kind of interval of each step.
@@ -249,17 +255,17 @@ class Recorder:
     def _store_output(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         request, store = self.request, self.request.store
         if request.times is None:
-            self._store(t, rows)
+            self._store_states(t, rows)
         elif request.ends_at_outputs:  # steps also end at the ends of the run, which may not be output times
             is_output = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
-            self._store(t[is_output], rows[is_output])
+            self._store_states(t[is_output], rows[is_output])
         if request.dense:
             store.add("sol_t", t)
             store.add("sol_states", rows[:, : 3 * self._n_q])
             store.add("sol_kinds", kinds)
 
-    def _store(self, t: Array, rows: Array) -> None:
-        """Store times and rows [q, v, a, lam], or rows [q, v]; [a, lam] are then computed now or at the end."""
+    def _store_states(self, t: Array, rows: Array) -> None:
+        """Store times and rows: [q, v, a, lam], or [q, v], to which [a, lam] are added now or at the end of the run."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._with_accelerations(t, rows) if self.request.store.append_only else rows)
 
@@ -310,7 +316,7 @@ class Recorder:
             times = self.request.times[self._n_outputs :]
             times = times[times <= node_times[-1]]
             try:
-                self._store(times, interpolator.states(table, times))
+                self._store_states(times, interpolator.states(table, times))
                 self._n_outputs += len(times)
             except KeyboardInterrupt:
                 self.interrupted = True
@@ -328,7 +334,7 @@ class Recorder:
         t = store.array("t")
         if self.request.times is None and self.end_state is not None and t[-1] < self.end_state[0]:
             end_time = np.array([self.end_state[0]])
-            self._store(end_time, self._with_accelerations(end_time, self.end_state[1][None, :]))
+            self._store_states(end_time, self._with_accelerations(end_time, self.end_state[1][None, :]))
             t = store.array("t")
         return t, self._with_accelerations(t, store.array("states"))
 
@@ -363,7 +369,7 @@ class Recorder:
 
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
-Deferred = Callable[[str], dict[str, Any]]  # computes a deferred field by its name, with related fields
+LaterFields = Callable[[str], dict[str, Any]]  # computes a deferred field by its name, with related fields
 
 
 class Status(IntEnum):
@@ -563,12 +569,12 @@ class Record:
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
     """Return a record with the attributes `fields`; the constructor, of a large frozen dataclass, would be slow."""
-    instance = _new(kind)
+    instance = _new_object(kind)
     _set_fields(instance, fields)
     return instance
 
 
-_new, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
+_new_object, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:
@@ -593,7 +599,7 @@ for _field in fields(Record):  # after the decorator, which would treat a descri
 Integers = NDArray[np.int64]
 
 COUNT_NAMES = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
-COUNTERS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
+GET_COUNTS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
 # numbers of rejections by error, of rejections by convergence, and of partitions before the first step
 INITIAL_COUNTS = np.array([0, 0, 1])
 
@@ -608,7 +614,7 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
 
 def statistics(counters: Integers, cpu: float) -> Statistics:
     """Return the Statistics of a run, given the array of counters of its workspace, and its CPU time, s."""
-    return Statistics(**dict(zip(COUNT_NAMES, COUNTERS(counters.tolist()), strict=True)), cpu_time=cpu)
+    return Statistics(**dict(zip(COUNT_NAMES, GET_COUNTS(counters.tolist()), strict=True)), cpu_time=cpu)
 
 
 def fields_of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:

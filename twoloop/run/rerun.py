@@ -42,13 +42,13 @@ def compare_callbacks(
         return Status.WRONG_TRACE, f"{changed} {message}"
     region = checked_region_of(run, check_derivatives)
     parameters = run.varied_parameters
-    everywhere = region.is_comparison_due() or run.system.called_in_python
-    everywhere = everywhere or (parameters is not None and not region.contains_parameters(parameters))
+    all_states = region.is_comparison_due() or run.system.called_in_python
+    all_states = all_states or (parameters is not None and not region.contains_parameters(parameters))
     region.count()
-    if not everywhere and end <= run.compared_until[0]:
+    if not all_states and end <= run.compared_until[0]:
         return status, message
     old_status = status
-    status, message = compare_callbacks_at(run, region, sample.states(), check_derivatives, status, message, everywhere)
+    status, message = compare_callbacks_at(run, region, sample.states(), check_derivatives, status, message, all_states)
     if status == old_status:
         run.compared_until[0] = end
         if parameters is not None:
@@ -71,14 +71,14 @@ def compare_callbacks_at(
     check_derivatives: bool,
     status: Status,
     message: str,
-    everywhere: bool = False,
+    all_states: bool = False,
 ) -> tuple[Status, str]:
     """Compare callbacks at states [t, q, v], latest first; return status and message, changed if a callback is wrong.
 
-    `everywhere`: compare at all states, not only at those outside `region`. If callbacks agree, extend the region.
+    `all_states`: compare at all states, not only at those outside `region`. If callbacks agree, extend the region.
     """
     first_state = states[-1]
-    if not everywhere:
+    if not all_states:
         states = region.states_outside(states)
     old_status = status
     if len(states) > 0:
@@ -101,11 +101,11 @@ def _check_derivatives(run: Run, states: Array, first_state: Array, status: Stat
     """
     n = run.system.n_q
     chosen_states = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
-    compared = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen_states]
+    checked_states = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen_states]
     exact = exact_derivatives(run.system)
-    agrees = exact is not None and exact.difference(run.system, generic_states(compared)) is None
-    difference = run_inconsistency(run.system, compared, float(first_state[0]), first_state[1 : 1 + n])
-    for t, q, v in () if agrees or difference is not None else compared:
+    derivatives_agree = exact is not None and exact.difference(run.system, generic_states(checked_states)) is None
+    difference = run_inconsistency(run.system, checked_states, float(first_state[0]), first_state[1 : 1 + n])
+    for t, q, v in () if derivatives_agree or difference is not None else checked_states:
         mistake = wrong_derivative(run.system, t, q, v)
         if mistake is not None:
             difference = t, mistake
@@ -165,16 +165,15 @@ def describe_changed_force(run: Run) -> str | None:
         warnings.simplefilter("ignore")
         for arguments, value in samples:
             try:
-                later = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
+                new_value = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
             except Exception:  # the state is outside the domain of the force
                 continue
-            comparable = np.isfinite(value) & np.isfinite(later)
-            differences = np.abs(np.subtract(value, later, out=np.zeros(len(value)), where=comparable))
+            comparable = np.isfinite(value) & np.isfinite(new_value)
+            differences = np.abs(np.subtract(value, new_value, out=np.zeros(len(value)), where=comparable))
             if differences.max(initial=0.0) > CLEAR_DIFFERENCE * np.abs(value[comparable]).max(initial=0.0):
                 entry = int(differences.argmax())
-                return (
-                    f"In the run {_change_text(system.name, float(arguments[0]), entry, value[entry], later[entry])}."
-                )
+                t = float(arguments[0])
+                return f"In the run {_change_text(system.name, t, entry, value[entry], new_value[entry])}."
     return None
 
 
@@ -255,9 +254,9 @@ class IndependentRerun:
         atol: Array,
         max_step: float,
     ):
-        chosen, nodes = method
+        method_object, nodes = method
         self.spacing = float(np.diff(np.unique(np.concatenate([[0.0], nodes, [1.0]]))).max())
-        plan = chosen.plan(system.n_q, rtol, float(atol.min()), False)
+        plan = method_object.plan(system.n_q, rtol, float(atol.min()), False)
         self.run = Run(system, plan, t, q, v, rtol, atol, None)
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0

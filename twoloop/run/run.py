@@ -44,7 +44,7 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of attempts in the first chunk if callbacks are slow Python functions
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
-TRIAL_STEPS = 10  # number of first steps: a short step size among these replaces a method that needs long steps
+TRIAL_STEPS = 10  # number of first steps; if one of them is short, a method that needs long steps is replaced
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
 CONTRADICTION = 1e-6  # smallest residual of a row of C_q a = gamma, relative to its terms, that contradicts other rows
 
@@ -131,7 +131,7 @@ class Run:
         self.compared_until = [-np.inf]  # time up to which callbacks were compared; copies of the run share the list
         self.region: CheckedRegion | None = None  # region in which callbacks were compared; integrators share it
         self.varied_parameters: Array | None = None  # array of parameters, if the run is used for several systems
-        self._compute_start()
+        self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
         self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings about redundant rows, by these rows
         self.redundant, self.rows_warning = self.find_redundant_rows()
@@ -169,13 +169,13 @@ class Run:
         code: int = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         return code
 
-    def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, length: float) -> None:
-        """Move the start of a run from beside a singular position into the position; `length`: first step size, s."""
+    def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, first_size: float) -> None:
+        """Move the start of a run from beside a singular position into it; `first_size`: first step size, s."""
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
         self._reset_clock(t)
-        clock[self.a.H_LONG], clock[self.a.LARGEST_PIVOT] = length, self.work.notes[indices.PIVOT]
+        clock[self.a.H_LONG], clock[self.a.LARGEST_PIVOT] = first_size, self.work.notes[indices.PIVOT]
         self.start_warning = (
             "the run begins in a singular position, where the constraints lose rank: it follows the branch of the "
             "motion to which v0 belongs; multipliers are not determined there, and are NaN at the start"
@@ -284,7 +284,7 @@ class Run:
         The new form is the static form with Newton's matrices, if these are missing, else a form of saddle_point.py.
         """
         n = self.system.n_q
-        old_work, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
+        old_work, largest_pivot = self.work, float(self.clock[self.a.LARGEST_PIVOT])
         rank = len(old_work.rows_v)
         t, q = float(self.clock[self.a.T]), self.state[:n].copy()
         static, self.static_form = self.static_form, None
@@ -308,11 +308,11 @@ class Run:
         if code == indices.RANK_DIFFERS:  # the rank may be higher than at a start with dependent rows
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if old_work.notes[indices.PIVOT] > 0.0 and largest > 0.0:  # convert the largest pivot to the scale of this form
+        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # convert largest_pivot to the new form
             pivot = self.work.notes[indices.PIVOT]
-            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / old_work.notes[indices.PIVOT])
+            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
-    def _compute_start(self) -> None:
+    def _compute_start_accelerations(self) -> None:
         """Compute the accelerations at the start, if necessary with other ranks or another form of linear algebra."""
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
@@ -358,7 +358,7 @@ class Run:
         )
 
     def find_redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
-        """Return the indices of dependent rows of [C_q; A] at the start, and a warning; `rows`: [C_q; A] or None."""
+        """Return the indices of dependent rows of [C_q; A] at the start, and a warning; `rows`: [C_q; A] there."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -369,13 +369,13 @@ class Run:
         if violated:
             raise ValueError(
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
-                f"{self._in_words(rows, violated)}, but not so their accelerations. Correct or leave out one of these "
-                "rows"
+                f"{self._describe_rows(rows, violated)}, but not so their accelerations. Correct or leave out one of "
+                "these rows"
             )
         if (redundant_rows := tuple(redundant)) not in self.descriptions:
             self.descriptions[redundant_rows] = (
                 f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows}, first at t = {self.t0:g}: "
-                f"{self._in_words(rows, redundant)}. They are left out of the solution and checked at every "
+                f"{self._describe_rows(rows, redundant)}. They are left out of the solution and checked at every "
                 "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
             )
         return np.array(redundant), self.descriptions[redundant_rows]
@@ -403,17 +403,17 @@ class Run:
             return system.sparse_rows(self.t0, q)
         return mass_and_rows(system, self.t0, q)[1]
 
-    def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
+    def _describe_rows(self, all_rows: Rows, rows: list[int]) -> str:
         """Describe in words how the rows of `all_rows` with the indices `rows` depend on the other rows."""
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
-        q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
-        if self.static_form is None or set(rows) & set(counted):
+        q, independent_rows = self.state[: self.system.n_q], self.work.rows_v.tolist()
+        if self.static_form is None or set(rows) & set(independent_rows):
             return in_words(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
         for row, factor in zip(rows, factors, strict=False):  # row = factor @ independent rows
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
-        return equations_in_words(rows, counted, factors[:, counted], norms(all_rows))
+        return equations_in_words(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
 
     def set_step_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first step size and the limits of step sizes, s; `first_step` None: take an estimate."""
@@ -429,15 +429,15 @@ class Run:
 
         If forces may be steep, the step size is at most a hundredth, too: a single stage may not reveal a steep force.
         """
-        unseen = 1.0 if self.may_be_steep else self.plan.unseen
-        max_size = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
-        self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), unseen
+        gap = 1.0 if self.may_be_steep else self.plan.unseen
+        max_size = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / gap
+        self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
         """Return the first step size, s, from a state; if `longest` (max_step) > 0, also limit the later step sizes."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
-        first: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
-        return first
+        size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
+        return size
 
     def defect(self) -> float | None:
         """Return the largest defect of the steps, or None if the defect was not evaluated in all steps."""

@@ -32,7 +32,7 @@ from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
-MAX_STEPS = 1024  # largest number of attempted steps in one call of `advance`; more steps are left to IntegrationLoop
+MAX_ATTEMPTS = 1024  # largest number of attempted steps in one call of `advance`; IntegrationLoop takes the others
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # callbacks that may depend on parameters that change at samples
 CHANGED_PARAMETERS = "the parameters changed at samples"  # value of the field `changes` of the result
 
@@ -116,7 +116,7 @@ class SampledRun:
         self._buffers = (
             np.empty(1),
             np.empty((1, len(self.run.state))),
-            np.empty((MAX_STEPS, self.run.a.N_STEP_COLUMNS)),
+            np.empty((MAX_ATTEMPTS, self.run.a.N_STEP_COLUMNS)),
         )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
         self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time, s; longest allowed time between evaluations, s
@@ -199,7 +199,7 @@ class SampledRun:
         run.choose_first_step(self.t0, end, run.state, run.max_step)
         run.control[a.APART] = min(self._max_gap, run.control[a.APART])
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
-        run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = MAX_STEPS, np.inf
+        run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = MAX_ATTEMPTS, np.inf
         code = run.advance(self._outputs, self._buffers, self._filled)
         self.steps.append(self._buffers[2][: self._filled[1]].copy())
         if code != a.ALL_OUTPUT_DONE:

@@ -20,7 +20,7 @@ TimedState = tuple[float, Array]  # time and state [q, v, ...]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
 LOST_RANK_RATIO = 1e-2  # ratio of singular values below which messages say that constraints lose rank
-N_POSITIONS = 33  # number of positions between two states at which the ratio of singular values is evaluated
+N_POSITIONS = 33  # number of positions between two states at which a ratio of singular values is evaluated
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DISPLACEMENT = 1e-6
@@ -87,22 +87,27 @@ def describe_turn(
     At such a place, other branches of the motion are within the tolerances, and the steps may have switched to one.
     """
     n = system.n_q
-    for (t0, first), (t1, last), across in _passages(crossings, now):
-        size, speeds = (max(np.abs(first[part]).max(), np.abs(last[part]).max()) for part in (_q_slice(n), _v_slice(n)))
+    for (t0, first), (t1, last), across in _crossing_ends(crossings, now):
+        largest_q, largest_v = (
+            max(np.abs(first[part]).max(), np.abs(last[part]).max()) for part in (_q_slice(n), _v_slice(n))
+        )
         change = np.abs(last[_v_slice(n)] - first[_v_slice(n)])
-        least = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
-        if not (change > np.maximum(MIN_TURN * (atol + rtol * speeds), TURN_RATIO * (t1 - t0) * least)).any():
+        least_a = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
+        if not (change > np.maximum(MIN_TURN * (atol + rtol * largest_v), TURN_RATIO * (t1 - t0) * least_a)).any():
             continue
-        near = min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST_RANK_RATIO
+        threshold = (
+            min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / largest_q)) if largest_q > 0.0 else LOST_RANK_RATIO
+        )
         # if no step led across, the run's own steps may have left the branch: evaluate the ratio at the last state only
         here, there = (t0, first), (t1, last)
         ratio = _least_ratio(system, here if across else there, there, rank, unit_free_ratio)
-        if ratio >= near:
+        if ratio >= threshold:
             continue
-        explained = max(
-            _known_acceleration(system, t, state[_q_slice(n)], state[_v_slice(n)], near) for t, state in (here, there)
+        largest_a = max(
+            _largest_acceleration(system, t, state[_q_slice(n)], state[_v_slice(n)], threshold)
+            for t, state in (here, there)
         )
-        change[change <= np.maximum(MIN_TURN * (atol + rtol * speeds), TURN_RATIO * (t1 - t0) * explained)] = 0.0
+        change[change <= np.maximum(MIN_TURN * (atol + rtol * largest_v), TURN_RATIO * (t1 - t0) * largest_a)] = 0.0
         if change.any():
             return (
                 f"Not to be trusted beyond t = {t0:.10g}: near it the constraints lose rank "
@@ -120,11 +125,11 @@ def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
     if times.size < 2:
         return False
     change = largest(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
-    least = np.minimum.reduce(largest(np.abs(rows[-2:, 2 * n : 3 * n]), axis=1))
-    return bool(change > TURN_RATIO * (times[-1] - times[-2]) * least)
+    least_a = np.minimum.reduce(largest(np.abs(rows[-2:, 2 * n : 3 * n]), axis=1))
+    return bool(change > TURN_RATIO * (times[-1] - times[-2]) * least_a)
 
 
-def _passages(crossings: list[list[TimedState]], now: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
+def _crossing_ends(crossings: list[list[TimedState]], now: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
     """Yield, for each crossed singular position, the states before and after, and whether crossing steps were taken."""
     before: TimedState | None = None
     for first, *behind in crossings:
@@ -144,14 +149,14 @@ def _v_slice(n: int) -> slice:
     return slice(n, 2 * n)
 
 
-def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
-    """Return the largest acceleration, computed without the singular values of rows below `near` times the largest."""
+def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
+    """Return the largest |a_j|, without the rows' singular values below `min_ratio` times the largest one."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
-    kept = values > near * values[0]
-    short = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / max(np.abs(v).max(), DISPLACEMENT)
-    rates = [system.velocity_constraint(t + dt, q + dt * v, v) / norms for dt in (-short, short)]
-    gamma = (left.T @ (rates[0] - rates[1]))[kept] / (2.0 * short * values[kept])
+    kept = values > min_ratio * values[0]
+    dt = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / max(np.abs(v).max(), DISPLACEMENT)
+    rates = [system.velocity_constraint(t + step, q + step * v, v) / norms for step in (-dt, dt)]
+    gamma = (left.T @ (rates[0] - rates[1]))[kept] / (2.0 * dt * values[kept])
     equations = np.block([[mass, right[kept].T], [right[kept], np.zeros((int(kept.sum()),) * 2)]])
     solution = np.linalg.lstsq(equations, np.append(units * system.force(t, q, v), gamma), rcond=None)[0]
     return float(np.abs(units * solution[: len(q)]).max())
@@ -255,13 +260,13 @@ def _displacement_to_singular(system: ConstrainedSystem, t: float, q: Array, ran
     Among the directions that the other constraints allow, the smallest singular value changes most along this one.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
-    u, w, held = left[:, rank - 1], right[rank - 1], right[: rank - 1]
+    u, w, other_directions = left[:, rank - 1], right[rank - 1], right[: rank - 1]
     step, gradient = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT), np.zeros(len(q))
     for j, displacement in enumerate(np.eye(len(q)) * step):
         try:
             gradient[j] = u @ (system.rows(t, q + displacement) - system.rows(t, q - displacement)) @ w / (2.0 * step)
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-    gradient -= held.T @ (held @ gradient)
+    gradient -= other_directions.T @ (other_directions @ gradient)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(-values[rank - 1] * gradient / (gradient @ gradient))

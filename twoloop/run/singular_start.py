@@ -21,9 +21,10 @@ from twoloop.run.singular_positions import DISPLACEMENT, scaled_to_unit_masses
 
 Array = NDArray[np.float64]
 
-CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows from one sample to the next, for derivatives along the motion
-WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0  # for f', f''
-MAX_DIFFERENCE_ERROR = 1e-8  # relative size up to which a derivative may be an error of the finite differences
+CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for derivatives along the motion
+# weights of five samples in f' and f''
+WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
+MAX_DIFFERENCE_ERROR = 1e-8  # largest relative error of a derivative by finite differences; smaller ones count as 0
 MIN_RANK_DERIVATIVE = 1e-6  # relative derivative of the rows from which on the rank rises; allowed errors of v0: 1e-8
 # factor by which derivatives of the rows must exceed the derivatives along velocities as small as the tolerances
 MIN_CERTAINTY = 10.0
@@ -37,14 +38,14 @@ MAX_RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, 
 class Branch(NamedTuple):
     """Branch of the motion through a singular position: accelerations there, and a state on the branch beside it.
 
-    `rank`: rank of the rows beside the position. `length`: first step size to try, s.
+    `rank`: rank of the rows beside the position. `first_size`: first step size to try, s.
     """
 
     a: Array
     q: Array
     v: Array
     rank: int
-    length: float
+    first_size: float
 
 
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
@@ -63,55 +64,61 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
 
 def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
     q, v, a = np.split(state[: 3 * system.n_q], 3)
-    way = v if v.any() else a
-    if not way.any():
+    direction = v if v.any() else a
+    if not direction.any():
         return None
-    mass, rows, lengths, units = scaled_to_unit_masses(system, t, q)
+    mass, rows, divisors, units = scaled_to_unit_masses(system, t, q)
     left, _, right = np.linalg.svd(rows)
-    lost, free = left[:, rank:].T, right[rank:].T  # rows u^T with u^T C_q = 0; directions that C_q allows, as columns
+    lost, free = left[:, rank:].T, right[rank:].T  # rows u^T with u^T C_q = 0; null space of C_q (columns)
 
-    def derivative_of_rows(way: Array, step: float) -> Array:
-        samples = [system.rows(t, q + s * way) * units for s in step * np.array([-2.0, -1.0, 1.0, 2.0])]
-        return np.tensordot(WEIGHTS[0, [0, 1, 3, 4]], samples, axes=1) / (step * lengths[:, None])  # type: ignore[no-any-return]
+    def derivative_of_rows(direction: Array, step: float) -> Array:
+        samples = [system.rows(t, q + s * direction) * units for s in step * np.array([-2.0, -1.0, 1.0, 2.0])]
+        return np.tensordot(WEIGHTS[0, [0, 1, 3, 4]], samples, axes=1) / (step * divisors[:, None])  # type: ignore[no-any-return]
 
     def derivative_of_constraints(order: int) -> Array:
         samples = [system.velocity_constraint(t, q + s * v, v) for s in step * np.arange(-2.0, 3.0)]
-        return WEIGHTS[order - 1] @ samples / (step**order * lengths)  # type: ignore[no-any-return]
+        return WEIGHTS[order - 1] @ samples / (step**order * divisors)  # type: ignore[no-any-return]
 
-    size, step = float(np.linalg.norm(rows)), DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(way).max()
-    speed = float(np.linalg.norm(derivative_of_rows(way, step))) / size  # relative change of the rows, 1/s
+    norm = float(np.linalg.norm(rows))
+    step = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(direction).max()
+    speed = float(np.linalg.norm(derivative_of_rows(direction, step))) / norm  # relative change of the rows, 1/s
     if not step * speed > MAX_DIFFERENCE_ERROR * DISPLACEMENT:
         return None
     step = CHANGE_PER_SAMPLE / speed
-    added = lost @ derivative_of_rows(way, step) / speed
-    gained = np.linalg.svd(added @ free, compute_uv=False)  # derivatives of the singular values that are zero here
-    if gained.max() <= MIN_RANK_DERIVATIVE * size:
+    added_rows = lost @ derivative_of_rows(direction, step) / speed
+    slopes = np.linalg.svd(added_rows @ free, compute_uv=False)  # derivatives of the singular values that are zero
+    if slopes.max() <= MIN_RANK_DERIVATIVE * norm:
         return None
-    distance = step * float(np.abs(way).max())  # displacement for finite differences
-    uncertain = np.linalg.norm(derivative_of_rows(allowed * signs(len(q)), distance / float(allowed.max())))
-    clear = gained > max(MIN_CERTAINTY * float(uncertain) / speed, MIN_RANK_DERIVATIVE * size)
-    if not v.any() or gained[~clear].max(initial=0.0) > MIN_RANK_DERIVATIVE * size:
+    distance = step * float(np.abs(direction).max())  # largest displacement of a finite difference
+    uncertainty = np.linalg.norm(derivative_of_rows(allowed * signs(len(q)), distance / float(allowed.max())))
+    is_certain = slopes > max(MIN_CERTAINTY * float(uncertainty) / speed, MIN_RANK_DERIVATIVE * norm)
+    if not v.any() or slopes[~is_certain].max(initial=0.0) > MIN_RANK_DERIVATIVE * norm:
         return False
-    wanted = -np.append(derivative_of_constraints(1), lost @ derivative_of_constraints(2) / (3.0 * speed))
-    equations, rank = np.vstack([rows, added]), rank + int(clear.sum())
-    a = np.asarray(np.linalg.lstsq(equations, wanted, rcond=MAX_DIFFERENCE_ERROR)[0])
-    if not np.abs(equations @ a - wanted).max() <= MAX_RESIDUAL * max(np.abs(wanted).max(), speed * speed * size):
+    right_side = -np.append(derivative_of_constraints(1), lost @ derivative_of_constraints(2) / (3.0 * speed))
+    equations, rank = np.vstack([rows, added_rows]), rank + int(is_certain.sum())
+    a = np.asarray(np.linalg.lstsq(equations, right_side, rcond=MAX_DIFFERENCE_ERROR)[0])
+    scale = max(np.abs(right_side).max(), speed * speed * norm)
+    if not np.abs(equations @ a - right_side).max() <= MAX_RESIDUAL * scale:
         return False
-    motions = np.linalg.svd(equations)[2][rank:].T
-    a += motions @ np.linalg.solve(motions.T @ mass @ motions, motions.T @ (units * system.force(t, q, v) - mass @ a))
+    null_space = np.linalg.svd(equations)[2][rank:].T
+    force = null_space.T @ (units * system.force(t, q, v) - mass @ a)
+    a += null_space @ np.linalg.solve(null_space.T @ mass @ null_space, force)
     a *= units
-    bend = 0.0  # relative acceleration of the rows, 1/s^2
+    acceleration = 0.0  # second derivative of the rows, relative to their norm, 1/s^2
     if a.any():
-        bend = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / size
+        acceleration = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / norm
     for change in BESIDE_CHANGE * 0.5 ** np.arange(N_BESIDE):
-        away = _duration(change, speed, bend)
-        ahead = away * (v + 0.5 * away * a)
-        beside = state_after_jump(system, t, q + ahead, v + away * a)
-        if beside is not None and np.abs(beside[: len(q)] - q - ahead).max() <= MAX_CORRECTION * np.abs(ahead).max():
-            return Branch(a, beside[: len(q)], beside[len(q) :], rank, _duration(STEP_CHANGE, speed, bend))
+        dt = _time_of_change(change, speed, acceleration)
+        displacement = dt * (v + 0.5 * dt * a)
+        new_state = state_after_jump(system, t, q + displacement, v + dt * a)
+        if new_state is None:
+            continue
+        if np.abs(new_state[: len(q)] - q - displacement).max() <= MAX_CORRECTION * np.abs(displacement).max():
+            first_size = _time_of_change(STEP_CHANGE, speed, acceleration)
+            return Branch(a, new_state[: len(q)], new_state[len(q) :], rank, first_size)
     return False
 
 
-def _duration(change: float, speed: float, acceleration: float) -> float:
+def _time_of_change(change: float, speed: float, acceleration: float) -> float:
     """Return the time, s, in which rows change by `change`, given the speed (1/s) and acceleration of their change."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

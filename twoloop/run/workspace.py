@@ -127,9 +127,7 @@ class StaticForm(NamedTuple):
     pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else (0, n_q)
     mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else (0, 0)
     newton_arguments: tuple[Any, ...]  # arguments of `newton_form` that follow t0 and q0
-    newton_program: NDArray[np.int32] | None = (
-        None  # program that factorizes Newton's matrix; None until a plan needs it
-    )
+    newton_program: NDArray[np.int32] | None = None  # factorizes Newton's matrix; None until a plan needs it
     n_groups: int = 0  # number of groups of columns of Newton's matrix, each computed from one difference of forces
 
     def matrix_cost(self) -> float:
