@@ -255,8 +255,8 @@ class Interpolator:
     def _repair_interval(self, table: StateTable, group: Groups, smallest: float) -> None:
         """Cache other states for the polynomial of an interval if they reduce its residual, `smallest` on entry.
 
-        Three sets are tried: states of a step across a singular position, states of N_REPAIR_STEPS steps, and the two ends
-        of the interval alone.
+        Three sets are tried: states of a step across a singular position, states of N_REPAIR_STEPS steps, and only the
+        two ends of the interval.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
@@ -285,7 +285,7 @@ class Interpolator:
         if self.static_form is not None:
             return None
         plan, (begin, end), n = crossing_plan(self.system.n_q), table.t[i : i + 2].tolist(), self.system.n_q
-        kernels.begin(plan.memory, 0.0, begin)
+        kernels.begin_polynomial(plan.memory, 0.0, begin)
         tolerances = self.tolerances.copy()
         tolerances[[indices.ESTIMATE, indices.GAP]] = 1.0, np.inf
         tolerances[indices.LEAST] = tolerances[[RTOL, *range(ATOL, ATOL + n)]].min()

@@ -254,7 +254,7 @@ def reject_turned_velocities(
 ) -> tuple[Status, str]:
     """Return `status` and `message`, or RANK_LOST and a reason if rounding or a change of branch changed velocities.
 
-    `last_step`: [state before the last step] if velocities turned in that step. `output_states`: states at output times.
+    `last_step`: [state before the last step] if velocities turned in that step. `output_states`: at output times.
     """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(place for each in crossings for place in each), *output_states], end)
