@@ -105,8 +105,8 @@ class LaneKit:
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
         self.__dict__.update(own.addresses)
         self.own, self.step = own, step
-        self.matrix_view = CODE.matrix_view(self)
-        self.address = self.matrix_view.ctypes.data
+        self.table = CODE.table(self)
+        self.address = self.table.ctypes.data
 
 
 @typeof_impl.register(LaneKit)
