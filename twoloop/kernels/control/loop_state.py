@@ -50,7 +50,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
     TRIAL_STEPS,  # number of first steps after which the loop stops with SWITCH_METHOD if the next size is at most GAP
     DRIVEN,  # 1: C_t or b may jump
-    ROUGH,  # factor by which errors may exceed their estimates near a jump of a force, see SUDDEN_ERROR in advance.py
+    ROUGH,  # largest ratio of an error to its estimate near a jump of a force, see SUDDEN_ERROR in advance.py
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
     APART,  # largest spacing of samples in time alone, which are taken ahead of short steps, too, s
     # 1: samples follow the motion; 0: samples stay at the state, because a callback raised an error along the motion
@@ -99,11 +99,12 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SAMPLES_MOTION,  # 1 while callbacks are sampled along the motion, at states that the motion may not reach
     # smallest result of min_pivot_ratio (partition.py) at output times and grid points, where steps have to end
     PIVOT_AT_OUTPUT,
-    PIVOT_PASSED,  # smallest pivot within steps since BRIDGE is SUSPENDED, relative to LARGEST_PIVOT; 0: none yet
+    PIVOT_PASSED,  # smallest pivot within steps since BRIDGE became SUSPENDED, relative to LARGEST_PIVOT; 0: none yet
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 29)
 
-# constants of the power iterations for the largest rate of a motion, in stiffness.py and in run/messages.py
+# constants of the power iterations for rho (1/s), the largest rate of a motion, an eigenvalue (or the root of one) of
+# the derivatives of the accelerations; used in stiffness.py and run/messages.py
 DISPLACEMENT = 1e-6  # displacement in finite differences, relative to the largest coordinate or velocity
 INNER_TOL = 1e-8  # tolerance of Newton's method for positions that are projected onto the constraints
 

@@ -216,8 +216,8 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# another assembly may be as near as the projection if displaced positions are projected to positions that differ from
-# the prediction by C_q by more than this, relative to the displacement
+# largest difference between the projection of displaced positions and its linear prediction by C_q, relative to the
+# displacement, for which no other assembly of the mechanism can be as near
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`

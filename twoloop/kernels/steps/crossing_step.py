@@ -117,7 +117,7 @@ def piece_ends(memory, c, t):
 
 @compiled
 def _weighted_sum(weights, a, total):
-    """Store the sum of weights[k] a[k] over the nodes k in `total` (n); a (S, n) are the accelerations at the nodes."""
+    """Store sum_k weights[k] * a[k] over the nodes k in `total` (n); a (S, n) are the accelerations at the nodes."""
     total[:] = 0.0
     for k in range(S):
         for m in range(total.size):

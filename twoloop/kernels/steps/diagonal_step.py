@@ -118,9 +118,8 @@ def factor_newton_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        _fill_newton_matrix(
-            w, memory, n, m, z, storage
-        )  # L D L^T fails if the matrix is indefinite, as in a compressed beam
+        # L D L^T fails if the matrix is indefinite, as for a compressed beam: use L U instead
+        _fill_newton_matrix(w, memory, n, m, z, storage)
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
 
@@ -199,16 +198,16 @@ def filter_dense_error(w, memory, z, e_q, e_v):
     copy(x, e_v)
 
 
-MAX_ITERATIONS = 8  # number of Newton iterations after which a stage has failed
+MAX_ITERATIONS = 8  # largest number of Newton iterations of a stage: if they do not converge, the step fails
 DIVERGENCE_RATIO = 2.0  # ratio of successive corrections above which Newton's method has diverged
-LINEAR_FACTOR = 0.01  # factor on Newton's tolerance with derivatives by differences, which make convergence linear
+LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences, with which convergence is linear
 MAX_CONTRACTION = 0.1  # ratio of successive corrections above which derivatives by differences are computed anew
-VELOCITY_WEIGHT = 0.1  # weight, in the convergence test, of the position error that a correction of velocities causes
+VELOCITY_WEIGHT = 0.1  # weight in the convergence test of the position error caused by a correction of velocities
 
 
 @inlined
 def stages_of(memory, s, n):
-    """Return views of `memory`: velocities (s, n), accelerations (s, n) of stages; accelerations (n) at the start."""
+    """Return views of `memory`: stage velocities (s, n), stage accelerations (s, n), accelerations (n) before the step."""
     last = memory.size - n
     return (
         memory[last - 2 * s * n : last - s * n].reshape((s, n)),
@@ -226,7 +225,7 @@ def gamma_of(options):
 
 @merged
 def _set_stage_state(z, q_bar, v_bar, a, Q, V):
-    """Store V = v_bar + z a and Q = q_bar + z V (n_q), the state of a stage; dependent entries are start values."""
+    """Store the stage state V = v_bar + z a, Q = q_bar + z V (n_q); its dependent entries are only start values."""
     for m in range(Q.size):
         V[m] = v_bar[m] + z * a[m]
         Q[m] = q_bar[m] + z * V[m]
@@ -245,13 +244,13 @@ def has_dense_tangents(f, w):
 
 @merged
 def stages_at_once(options):
-    """Return 1, the number of stages solved at once; with a literal 1, numba would compile newton_systems.py again."""
+    """Return the number of stages solved at once, 1; for a literal 1, numba would compile newton_systems.py again."""
     return int(options[STAGES])
 
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
-    """Update derivatives (at t, Q, V, with accelerations F) and factors, unless they can be reused; return a code."""
+    """Update the derivatives at (t, Q, V), with accelerations F, and the factors, unless still valid; return a code."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -334,12 +333,12 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# number of times that the difference of the two formulas is filtered before it is subtracted from the result: with
-# fewer filters, the method is unstable for vibrations, see tests/kernels/test_diagonal.py
+# number of filters applied to the difference of the two formulas before it is subtracted from the result; with fewer,
+# the method is unstable for vibrations, see tests/kernels/test_diagonal.py
 N_FILTERS = 3
 
-# largest ratio of |sum_k jump_weights[k] a_k| to the range of the stage accelerations a_k that a single jump can cause:
-# at a smaller ratio, `_error_at_jumps` reduces its estimate in proportion
+# largest ratio of |sum_k jump_weights[k] a_k| to the range of the stage accelerations a_k that a single jump can cause;
+# if the ratio is smaller, `_error_at_jumps` reduces its estimate in proportion to it
 MAX_RATIO_BY_ONE_JUMP = 0.174
 
 
@@ -369,7 +368,7 @@ def _factor_filter(f, w, options, memory, h):
 
 @compiled
 def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
-    """Store `factor` h sum_k weights[k] V_stage[k] in e_q, and `factor` h sum_k weights[k] A_stage[k] in e_v.
+    """Store h * factor * sum_k weights[k] * V_stage[k] in e_q, and the same sum of A_stage[k] in e_v.
 
     Only the entries of independent coordinates are computed; they become the first n_dof numbers of e_q and e_v (n_q).
     """
@@ -452,7 +451,7 @@ def _estimate_error(f, w, options, memory, t, h, tolerances, state, new_state, V
 def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
     """Replace (q1, v1), the state at the end of the step, by the result of the embedded formula.
 
-    On entry, E_Q and E_V in `memory` must be the difference of the two formulas, filtered twice by `_estimate_error`.
+    On entry, the vectors E_Q and E_V of `memory` must contain the difference of the two formulas, filtered twice.
     """
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, N_FILTERS):

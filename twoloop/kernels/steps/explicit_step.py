@@ -23,7 +23,7 @@ STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
 STAGE, FINE, COARSE, N_VECTORS = range(4)
 BLOCK = 8  # number of sums that `_weighted_sum` accumulates in registers
 # STRICT: factor on the error estimate once a run has come near a singular position, because phase errors grow at each
-# singular position. The factor is smaller, but at least 1, where (smallest tolerance) / STRICT is below LEAST_STRICT
+# singular position. If the smallest tolerance is below STRICT * LEAST_STRICT, the factor is smaller, but at least 1
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -74,7 +74,7 @@ def tableau_of(options):
 
 @inlined
 def _vector(memory, n, which):
-    """Return a view (2 n padded) of vector `which`, such as STAGE, of `memory`."""
+    """Return a view (2 n, padded) of the vector with index `which`, such as STAGE, in `memory`."""
     return memory[which * _width(n) : (which + 1) * _width(n)]
 
 
@@ -87,7 +87,7 @@ def _slopes(memory, s, n):
 
 @compiled
 def _weighted_sum(weights, slopes, total):
-    """Store the sum of weights[k] slopes[k] over the stages k in `total` (2 n padded), BLOCK entries at a time."""
+    """Store sum_k weights[k] * slopes[k] over the stages k in `total` (2 n, padded), BLOCK entries at a time."""
     for m in range(0, total.size, BLOCK):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for k in range(weights.size):
@@ -112,7 +112,7 @@ def _weighted_sum(weights, slopes, total):
 
 @compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
-    """Set y1 to y + h sum_k weights[k] slopes[k]; `total` is scratch. As y is added last, y is rounded only once."""
+    """Set y1 to y + h * sum_k weights[k] * slopes[k]; `total` is scratch. Adding y last avoids rounding errors."""
     _weighted_sum(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -120,7 +120,7 @@ def _add_weighted_slopes(y, h, weights, slopes, total, y1):
 
 @compiled
 def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
-    """Return the error e^2 / sqrt(e^2 + d^2) of a step from y to y1, in units of the tolerances.
+    """Return the error e^2 / sqrt(e^2 + d^2) of a step from y to y1 (2 n each), in units of the tolerances.
 
     e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
     velocities), relative to atol + rtol |y|. A formula for each component alone would give e, of low order, where the

@@ -43,9 +43,9 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
-# ratio of the last two Newton corrections above which the next step computes new derivatives
+# ratio of the last two Newton corrections of a step above which the next step computes new derivatives
 SLOW_CONTRACTION = 0.05
-# largest Newton correction that counts as a rounding error in steps of fixed size, relative to max(1, |value|)
+# largest Newton correction, relative to max(1, |value|), that counts as a rounding error in steps of fixed size
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
@@ -183,7 +183,7 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the effect, in units of the tolerances, of the velocity error E_V in slow directions, see velocity_error.
+    """Return the effect, in tolerances, of the slowly changing part of the velocity error E_V, see `velocity_error`.
 
     In `filtered_velocity_error`, errors last as long as their fastest component. Here, a filter keeps the component
     that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. The result is 0 if all of E_V
@@ -209,7 +209,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
 
 @kernel(SETTLE)
 def settle_newton(f, w, options, memory, tolerances, accepted):
-    """Store the stage accelerations of an accepted step, from which the next step predicts its own."""
+    """Store the stage accelerations of an accepted step; the next step predicts its stage accelerations from them."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted:
         memory[at.IS_FRESH] = 0.0
@@ -239,8 +239,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage: stiff directions turn as the bodies move, and those of the middle
-            # stage differ least from those of the others. Between stages, a force might act that acts at no stage
+            # compute derivatives at the middle stage, whose stiff directions differ least from those of other stages;
+            # at times between the stages, a force might act that acts at no stage
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])
@@ -271,8 +271,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the state extrapolated to the middle stage may be wrong, for example if friction is not stiff in this state:
-        # repeat with derivatives at the beginning of the step
+        # the state extrapolated to the middle stage may be so wrong that its derivatives are, for example those of
+        # friction: repeat with derivatives at the beginning of the step
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

@@ -98,7 +98,7 @@ from twoloop.kernels.steps.stages import (
     vector,
 )
 
-MAX_ITERATIONS = 15  # number of Newton iterations after which a step has failed
+MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
 # relative difference of step sizes that count as equal: as differences of times, they have rounding errors
 EQUAL_STEP_TOLERANCE = 1e-9
 # largest Newton correction, relative to the smallest tolerance, that counts as a rounding error if it does not decrease
@@ -140,7 +140,7 @@ def _check_band_finite(A, b):
 
 @compiled
 def _has_jacobian_changed(f, w, t, q):
-    """Store C_q at (t, q) in w.Gx; return whether it differs from C_q in w.G."""
+    """Store C_q at (t, q) in w.Gx; return whether this differs from the C_q in w.G."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -177,7 +177,7 @@ def _subtract_reaction_tangent(f, w, t, q, moved, b, K):
 
 @compiled
 def fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
-    """Store the entries with |i - j| <= b of d(Q - C_q^T lam)/dq at (t, q, v) in K (n_q, n_q); return a code.
+    """Store the entries of d(Q - C_q^T lam)/dq at (t, q, v) with |i - j| <= b in K (n_q, n_q); return a code.
 
     The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
     """
@@ -196,7 +196,7 @@ def fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
 
 @compiled
 def fill_tangent_by_v(f, t, q, v, b, D):
-    """Store the entries with |i - j| <= b of dQ/dv in D (n_q, n_q), if the system provides them; return a code."""
+    """Store the entries of dQ/dv with |i - j| <= b in D (n_q, n_q), if the system provides dQ/dv; return a code."""
     if f.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
     _clear_band(D, b)
@@ -236,7 +236,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    # K (later D), T^T M T and the products A T overwrite factors of earlier matrices, which are no longer needed
+    # the storage of earlier factors, which are no longer needed, receives K (later D), T^T M T and products A T
     K, R = as_matrix(matrix_storage(w, n, FILTER), n), as_matrix(matrix_storage(w, n, SYSTEMS), n)
     code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
@@ -314,7 +314,7 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense_matrix(w, memory, s, which, z, matrix):
-    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, and their pivots as number `which`; return a code."""
+    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`; return a code. `which`: index of the pivots, see `pivots_of`."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, DERIVATIVE_V), m)
     damped = memory[HAS_DAMPING] == 1.0
@@ -471,9 +471,9 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _factor_banded_matrix(w, memory, s, b, which, z, numbers, factorize, substitute):
-    """Store the factors of M - z^2 K - z D with the border C_q in `numbers`, and their pivots; return a code.
+    """Store the factors of M - z^2 K - z D with the border C_q in `numbers`, and pivots in `memory`; return a code.
 
-    `which` is the number of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
+    `which`: index of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
     """
     n = w.Q.size
     K, D = _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b), _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b)
@@ -663,7 +663,7 @@ def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, mo
 
 @compiled
 def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
-    """Return whether the `entries` of K or D explain the difference between `base` and `residual` (n_q).
+    """Return whether the `entries` of K or D explain the difference between the residuals `base` and `residual` (n_q).
 
     `base` is the residual at `base_point` (q or v), `residual` that at `moved`; `largest` is the largest term of
     a residual. `residual` and `predicted` (n_q) are overwritten.
@@ -778,7 +778,7 @@ def fill_derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def factor_filter(f, w, options, memory, s, h):
-    """Factor the real matrix I - z^2 J_q - z J_v, z = h gamma0, with which `filter_error` filters; return a code."""
+    """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, with z = h gamma0; return a code."""
     n, z = w.Q.size, h * options[newton_options_index(s) + GAMMA0]
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
@@ -792,7 +792,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def _factor_complex_system(f, w, memory, s, k, z):
-    """Factor the complex matrix I - z^2 J_q - z J_v; z is the step size times eigenvalue k of A; return a code."""
+    """Factor the complex matrix I - z^2 J_q - z J_v for z, the step size times eigenvalue k of A; return a code."""
     n = w.Q.size
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
@@ -806,7 +806,7 @@ def _factor_complex_system(f, w, memory, s, k, z):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor the matrices of gamma0 and of all eigenvalues of A for steps of size h; return a code."""
+    """Factor I - z^2 J_q - z J_v for z = h gamma0, and for z = h l with each eigenvalue l of A; return a code."""
     offset = newton_options_index(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -840,7 +840,7 @@ def _solve_real_system(f, w, memory, s, x):
 
 @compiled
 def _solve_complex_system(f, w, options, memory, s, k, x):
-    """Replace x[:n_dof], a complex right-hand side, by the solution of the linear system of eigenvalue number k."""
+    """Replace x[:n_dof], a complex right-hand side, by the solution of the linear system for eigenvalue k of A."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_scratch(f, w)
@@ -856,7 +856,7 @@ def _solve_complex_system(f, w, options, memory, s, k, x):
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
-    """Replace x[:n_dof], a complex right-hand side, by the solution of the linear system of eigenvalue number k."""
+    """Replace x[:n_dof], a complex right-hand side, by the solution for eigenvalue k of A, which may be real."""
     if k == 0 and options[newton_options_index(s) + N_REAL] > 0.0:  # the first eigenvalue is real: it is gamma0
         real_part = vector(memory, s, w.Q.size, V_MOVED)
         for i in range(x.size):
@@ -885,9 +885,9 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
 
 @compiled
 def correct_stages(f, w, options, memory, s, residual, A_stage):
-    """Replace `residual` (s, n_q) by the Newton corrections of the stage accelerations, and add them to A_stage.
+    """Replace the residuals (s, n_q) by Newton corrections of the stage accelerations; add these to A_stage (s, n_q).
 
-    Only the entries of independent coordinates in `residual` and A_stage (s, n_q) are read and changed.
+    Only the entries of independent coordinates in `residual` and A_stage are read and changed.
     """
     n = w.Q.size
     m = w.independent.size
@@ -896,7 +896,9 @@ def correct_stages(f, w, options, memory, s, residual, A_stage):
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)
     offset += N_EIGEN_SCALARS + s
-    corrections = block(memory, s, n, Q_STAGE)  # a scratch array, overwritten before the next evaluation
+    corrections = block(
+        memory, s, n, Q_STAGE
+    )  # used as scratch: the stage positions are computed anew before their use
     corrections[:, :] = 0.0
     for k in range(n_systems):
         begin_row = offset + 2

@@ -96,10 +96,10 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 
     The stage accelerations have a range w of order h. At the ends of the step, the polynomial through the stages
     differs from the accelerations by e, of order h^s. If terms of successive orders decrease by a constant factor f,
-    then e = w f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, also between an end and
-    the nearest stage, the terms do not decrease: the estimate is h w, and steps shrink until the jump does not matter.
-    Another estimate is needed as well, because e may pass through zero: single steps of pendulums then had errors of
-    100 tolerances.
+    then e = w f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, even between an end of
+    the step and the nearest stage, the terms do not decrease, and the estimate is h w: steps then shrink until the jump
+    no longer matters. A second estimate is needed, too, because e may pass through zero: the errors of single steps of
+    pendulums were then as large as 100 tolerances.
     """
     s, n = A_stage.shape
     offset = N_SCALARS + 2 * s * s + 3 * s
@@ -149,11 +149,12 @@ N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
-# indices of the blocks (s, n_q) in `memory`, and of the vectors (n_q) after the blocks
+# indices of the blocks (s, n_q) in `memory`, such as stage accelerations of the previous step and of the attempted step
+# (TRIAL), and of the vectors (n_q) after the blocks
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# indices of the parts of w.matrices, of n_q^2 entries each: derivatives by q and by v, factors of the real filter
-# matrix, and from SYSTEMS on, for each eigenvalue, the factors of a complex matrix in two parts
+# indices of the parts of w.matrices, each with n_q^2 entries: the derivatives by q, those by v, the factors of the real
+# filter matrix, and from SYSTEMS on, two parts for each eigenvalue: the factors of a complex matrix
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
