@@ -30,14 +30,14 @@ from twoloop.kernels.data.indices import ATOL, DONE, FORM, GAP, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
-N_PARTS = 12  # number of parts of an interval, at whose ends C_t and b are sampled
+N_PARTS = 12  # number of equal parts of an interval; C_t and b are sampled at the ends of the parts
 # coefficients of the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
-TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, relative to slope times np.spacing(t)
+TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, relative to the slope times np.spacing(t)
 STEEPNESS = 4.0  # slope of C_t or b, relative to its mean over the step, above which a part of the step is a ramp
-MAX_RAMP_SHARE = 0.125  # longest part of a step, relative to its size, that counts as a ramp: steps must end at a ramp
+MAX_RAMP_SHARE = 0.125  # longest ramp, relative to the step size, at which a step has to end
 MIN_SPACINGS = 8.0  # duration of an interval, in spacings of floating-point numbers, at which its bisection ends
 SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in an interval
 
@@ -64,7 +64,10 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean absolute slope (per s) and largest absolute value of w.rates[:, row], which spans `length` s."""
+    """Return the mean absolute slope (per s) and the largest absolute value of w.rates[:, row].
+
+    The samples in w.rates span `length` seconds.
+    """
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -92,7 +95,7 @@ def _allowed_error(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest velocity change beyond h times the mean acceleration of both states, over the tolerance."""
+    """Return the largest difference of a velocity change from h times the mean acceleration, in tolerances."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -181,7 +184,7 @@ N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # largest change of an acceleration, relative to the largest acceleration, while a velocity changes by its tolerance: if
 # the change is larger, the acceleration decays, see _acceleration_lasts
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # time after a step's beginning, in spacings of samples, before which a change counts as passed
+CHANGE_MARGIN = 0.01  # a change up to this time after a step's beginning, in spacings of samples, counts as passed
 LARGEST_ROW = (
     N_SAMPLES + 1
 )  # index of the row of w.changes with the largest absolute values so far; rows above: samples
@@ -202,7 +205,7 @@ def _sample_forces(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _largest_value(values):
-    """Return the largest of `values`, or 0 if all are negative: a scale, as single components may always be zero."""
+    """Return the largest of `values`, the scale for all components of a vector; 0 if all are negative."""
     largest = 0.0
     for x in values:
         largest = max(largest, x)
@@ -211,7 +214,7 @@ def _largest_value(values):
 
 @compiled
 def _is_smooth_bend(values, k, n):
-    """Return whether second differences of n + 1 values at index k and beside it have equal signs and similar sizes."""
+    """Return whether the second difference of n + 1 values at index k and the next one have equal signs and similar sizes."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -267,7 +270,10 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time just after component j changes between `low` and `high`, the times of samples k and k + 1."""
+    """Return the time just after the change of component j that lies between samples k and k + 1.
+
+    `low` and `high` are the times of these samples.
+    """
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):
@@ -285,7 +291,8 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
     """Update LAST_CHANGE and SHORTEST_CHANGE in `clock` by the sudden changes on both sides of the bend at `index`.
 
-    Samples k = 0 to n are at begin + k spacing; `column` is the component that bends, `limit` the smallest change.
+    Sample k, from 0 to n, is at the time begin + k * spacing; `column` is the index of the component that bends; a
+    difference of two samples above `limit` may be a sudden change.
     """
     values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
     soonest = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
@@ -342,7 +349,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Update SHORTEST_CHANGE in `clock` by changes within a short step that samples ahead of the step have missed."""
+    """Update SHORTEST_CHANGE in `clock` by changes within a short step, which samples ahead of the step have missed."""
     changes, spacing, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
@@ -391,7 +398,10 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Store the next sudden change along the motion in `clock`; sample a step, or LEAST_DISTANCE spacings if longer."""
+    """Store the time of the next sudden change along the motion in `clock`.
+
+    The motion is sampled over the step size, or over LEAST_DISTANCE spacings of samples if that is longer.
+    """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
     duration = min(max(size, LEAST_DISTANCE * spacing), last - t)

@@ -86,7 +86,7 @@ COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run 
 # multiplied by k + 1 after k trials
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
-QUIET_FACTOR = 10.0  # largest velocities, in tolerances, of oscillations that steps at the stability limit excite
+QUIET_FACTOR = 10.0  # largest velocity, in tolerances, of oscillations that steps at the stability limit excite
 MIN_HIDDEN_RATIO = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
@@ -139,8 +139,9 @@ def switching_options(
 ) -> NDArray[np.float64]:
     """Return the array `options` of a pair of methods.
 
-    `limit` to `ratio` are LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO. `each` has one row for each method: its
-    step-size rule and its value of REUSE. `first` and `second` are the options of the two methods.
+    `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
+    `each` has one row for each method: its step-size rule and its value of REUSE. `first` and `second` are the options
+    of the two methods.
     """
     first = np.asarray(first)  # numbers, or expressions in the parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
@@ -291,7 +292,7 @@ def _begin_phase(w, options, memory, phase, t):
 
 @compiled
 def _judge_trial(w, options, memory, t):
-    """Return the phase that follows a trial, EXPLICIT or IMPLICIT, or -1 while the trial continues; t: present time."""
+    """Return the phase after a trial, EXPLICIT or IMPLICIT, or -1 if the trial continues; t: present time."""
     if memory[STEPS] == N_UNMEASURED_STEPS:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
     if memory[STEPS] < N_UNMEASURED_STEPS + N_MEASURED_STEPS:

@@ -94,7 +94,7 @@ def _difference_table(memory, n, which):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return two scratch rows (n padded) of `memory`, for v and q: mean accelerations, later 1 / allowed errors."""
+    """Return two scratch rows (n, padded) of `memory`, for v and q: mean accelerations, later reciprocal tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]

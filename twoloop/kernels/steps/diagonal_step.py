@@ -207,7 +207,7 @@ VELOCITY_WEIGHT = 0.1  # weight in the convergence test of the position error ca
 
 @inlined
 def stages_of(memory, s, n):
-    """Return views of `memory`: stage velocities (s, n), stage accelerations (s, n), accelerations (n) before the step."""
+    """Return views of `memory`: stage velocities (s, n), stage accelerations (s, n), accelerations at the start (n)."""
     last = memory.size - n
     return (
         memory[last - 2 * s * n : last - s * n].reshape((s, n)),

@@ -65,12 +65,12 @@ from twoloop.kernels.linalg.dense import copy
 # nodes are too far apart to detect short forces, and the defect is evaluated between nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
-START_CONTRACTION = 0.12  # contraction rho for which the size of the first step is guessed anew if a guess is rejected
+START_CONTRACTION = 0.12  # contraction rho for which the first step size is chosen after its first guess is rejected
 MAX_STARTS = 4  # largest number of guesses of the first step size
 DIVERGED_FACTOR = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
-MAX_LIMITED = 24.0  # value of the field LIMITED at which another method takes over, because the motion is stiff
-MIN_CURVED = 0.1  # value of the field CURVED below which accelerations hardly vary within a step
+MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as stiff, and another method takes over
+MIN_CURVED = 0.1  # value of the field CURVED below which accelerations count as hardly varying within a step
 N_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
 MIN_PIVOT_RATIO = 0.4  # ratio of a pivot within a step to that at its beginning below which a singular position is near
 # smallest tolerance with which this method goes on after a singular position: with smaller ones, five more runs of the

@@ -314,7 +314,10 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense_matrix(w, memory, s, which, z, matrix):
-    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`; return a code. `which`: index of the pivots, see `pivots_of`."""
+    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, and their pivots in `memory`; return a code.
+
+    `which`: index of the pivots, see `pivots_of`.
+    """
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, DERIVATIVE_V), m)
     damped = memory[HAS_DAMPING] == 1.0

@@ -149,9 +149,11 @@ N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
-# indices of the blocks (s, n_q) in `memory`, such as stage accelerations of the previous step and of the attempted step
-# (TRIAL), and of the vectors (n_q) after the blocks
+# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous and of the attempted step, residuals,
+# positions and velocities of the stages
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+# indices of the vectors (n_q) after the blocks: accelerations, displaced positions and velocities, estimated errors of
+# positions and velocities, state and accelerations at the middle stage
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # indices of the parts of w.matrices, each with n_q^2 entries: the derivatives by q, those by v, the factors of the real
 # filter matrix, and from SYSTEMS on, two parts for each eigenvalue: the factors of a complex matrix

@@ -99,7 +99,7 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 @inlined
 def series_accelerations(memory, n):
-    """Return the last n numbers of `memory`, a view that stores accelerations computed from the series."""
+    """Return a view of the last n entries of `memory`, which store accelerations computed from the series."""
     return memory[memory.size - n :]
 
 
@@ -116,14 +116,14 @@ def _float_array(options, which):
 
 @inlined
 def series_of(memory, order, n, which):
-    """Return a flat view of the series `which` (0 or 1) of q, row by row: a matrix would cost a function call."""
+    """Return a flat view of series number `which` (0 or 1) of q, row by row: a matrix would cost a function call."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
 
 @merged
 def sum_of_products(X, Y, K, total):
-    """Store the sum of X[j, m] Y[K - j, m] over 0 < j < K in total[m], for eight indices m at a time."""
+    """Store the sum of X[j, m] * Y[K - j, m] over 0 < j < K in total[m], for eight indices m at a time."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for j in range(1, K):
@@ -325,7 +325,10 @@ def end_series(w, order, series):
 
 @compiled
 def expand(f, w, options, memory, t, state, unit):
-    """Store series TARGET about `state` at t, with `unit` (s) as unit of time, by the factors in w; return a code."""
+    """Store the series with index TARGET about `state` at t, in the unit of time `unit` (s); return a code.
+
+    The linear equations of each order are solved with the factors in w.
+    """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
     series = series_of(memory, order, n, memory[TARGET])
@@ -375,13 +378,16 @@ GOLDEN = 0.6180339887498949  # golden section: fractional parts of its multiples
 MAX_DEFECT = 1e300  # replaces an infinite defect, which is returned if a function has no finite value within the step
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
 GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
-MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of it do not overflow
-TOO_SHORT = 2.0  # error that is returned to reject a first step, because the series allows a much longer step
+MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
+TOO_SHORT = 2.0  # error returned to reject a first step because the series allows a much longer step
 
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, which):
-    """Store the series `which` about `state` at t, the state projected last, in `memory`; return a code."""
+    """Store the series with index `which` about `state` at t in `memory`; return a code.
+
+    `state` must be the result of the last projection.
+    """
     n = w.Q.size
     memory[TARGET] = which
     if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # generated code leaves no factors in w
@@ -394,7 +400,7 @@ def _compute_series(f, w, options, memory, t, state, unit, which):
 
 @merged
 def _allowed_step(tolerances, series, unit, order, n):
-    """Return the step size, in units of `unit` (s), at which neither of the last two terms exceeds the tolerances."""
+    """Return the step size, in units of `unit` (s), up to which the last two terms are within the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -448,7 +454,7 @@ def _evaluate_series(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the ratio of the defect at t + s h to the allowed one (no value: infinity). q, v, a (n) are scratch."""
+    """Return the defect at t + s h, relative to the allowed defect (infinity if evaluation fails); q, v, a: scratch."""
     series_a = series_accelerations(memory, q.size)
     _evaluate_series(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
@@ -469,7 +475,7 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 @compiled
 def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the first defect within the step that is too large, or 0; update w.notes[DEFECT], the largest other one.
+    """Return the first defect within the step that is too large, or 0; update w.notes[DEFECT] by smaller defects.
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
@@ -508,7 +514,7 @@ def settle_taylor(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h by the series about its beginning; that about its end limits the next step size."""
+    """Attempt a step of size h by the series about its beginning; compute the series about its end for the next step."""
     n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
