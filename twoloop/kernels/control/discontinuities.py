@@ -214,7 +214,7 @@ def _largest_value(values):
 
 @compiled
 def _is_smooth_bend(values, k, n):
-    """Return whether the second difference of n + 1 values at index k and the next one have equal signs and similar sizes."""
+    """Return whether the second difference at k resembles its neighbour in sign and size (n + 1 values in all)."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
