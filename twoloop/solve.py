@@ -70,9 +70,9 @@ def solve_dae(
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities; `consistent_state` makes them from rough ones.
     method : str or method object
-        "auto" (default), "Taylor", "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9",
-        "RadauIIA13", "TRBDF2", "ESDIRK4", "BDF", "Newmark", "PaperIRK" or "PaperNewmark". Or an object, such as
-        `RungeKutta(...)`, `ESDIRK(...)` or `Newmark(...)`.
+        "auto" (default), "Lobatto16", "Taylor", "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5",
+        "RadauIIA9", "RadauIIA13", "TRBDF2", "ESDIRK4", "BDF", "Newmark", "PaperIRK" or "PaperNewmark". Or an object,
+        such as `RungeKutta(...)`, `ESDIRK(...)` or `Newmark(...)`.
     rtol : float
         Relative tolerance of the error of a step.
     atol : float or array_like (n_q,)
@@ -100,8 +100,8 @@ def solve_dae(
         Whether to compare C_q, C_t, gamma and the tangents with exact derivatives or differences. This is done at the
         first start of a system and at a few states of its runs.
     compiled : bool or "auto"
-        Whether to generate machine code for the equations of the mechanism, for "auto", "Taylor", "DOP853" and
-        "Adams". "auto" (default): for small mechanisms with compiled callbacks.
+        Whether to generate machine code for the equations of the mechanism, for "auto", "Lobatto16", "Taylor", "DOP853"
+        and "Adams". "auto" (default): for small mechanisms with compiled callbacks, and always for "Lobatto16".
     store : str or path, optional
         A new folder in which a run that does not fit into memory is written as it is computed. `twoloop.load` reads
         it again.
@@ -120,8 +120,8 @@ def solve_dae(
 
     Notes
     -----
-    *Method.* "auto" is explicit, with Newton's method while the problem is found to be stiff, see `Auto`. Near a
-    position where the constraints lose rank, any method may take steps by collocation across it.
+    *Method.* "auto" is "Lobatto16" with generated code, else explicit, with Newton's method while the problem is found
+    to be stiff, see `Auto`. Near a singular position, any method may take steps by collocation across it.
 
     *Constraints.* Rows that depend on others at the start are left out and checked at every step; a
     `ConstraintWarning` names them.

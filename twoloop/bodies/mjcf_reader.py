@@ -62,10 +62,10 @@ def from_mjcf(
     - hinge, slide, ball and free joints, any number to a body: where a model has no joint with the same freedoms,
       massless bodies carry one joint each;
     - armature, stiffness, damping, springref; frictionloss, for `solve_with_friction`;
-    - the equalities connect and weld, which are exact here and soft in MuJoCo, and joint equalities;
-    - tendons between two sites as springs, gravcomp, and gravity;
-    - position, velocity, motor, cylinder and general actuators of hinges and slides, where an activation is that of a
-      constant command from t = 0 on; motors of balls, free joints and sites.
+    - the equalities connect and weld, which are exact here and soft in MuJoCo, and those of joints and tendons;
+    - tendons that do not wind about geoms, gravcomp, gravity, and the forces of a medium;
+    - position, velocity, intvelocity, damper, motor, cylinder and general actuators of hinges, slides and tendons,
+      where an activation is that of a constant command from t = 0 on; motors of balls, free joints and sites.
 
     Bodies without joints are merged with their parents.
 

@@ -135,7 +135,8 @@ class Integrator:
         Raises
         ------
         TypeError, ValueError
-            If the start is refused, or the integrator has the method "Taylor" or an option that only `run` supports.
+            If the start is refused, or the integrator has the method "Taylor" or "Lobatto16", or an option that only
+            `run` supports.
         """
         for name in self._options.keys() - OPTIONS_OF_START:
             if self._options[name] not in (None, False, "auto"):

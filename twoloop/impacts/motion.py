@@ -582,7 +582,7 @@ def solve_with_stops(
     ----------
     system, t_span, q0, v0, method, rtol, atol
         As for `solve_dae`. The gaps must not be negative at the start. While stops are closed, "auto" takes the place
-        of "Taylor", which cannot trace their forces, and `compiled=True` has no effect.
+        of "Taylor", which cannot trace their forces, `compiled=True` has no effect, and "Lobatto16" is refused.
     stops : Stop or sequence of Stop
         E.g. `Stop(lambda t, q: q[1], restitution=0.5)`, or `problem.stops` of a model.
     t_eval : array_like, optional
@@ -680,7 +680,7 @@ def solve_with_friction(
     t_span : (float, float), optional
         None: the time span of the problem.
     method, rtol, atol
-        As for `solve_dae`. While stops are closed, "auto" takes the place of "Taylor", which cannot trace their forces.
+        As for `solve_with_stops`.
     t_eval : array_like, optional
         Output times. None: the ends of steps.
     law : "moreau" or "sequential", optional

@@ -21,12 +21,12 @@ STABLE_TO = tuple(
 class Adams:
     """Adams methods of orders 1 to 12, predict-evaluate-correct-evaluate, for smooth motion that is not stiff.
 
-    With two evaluations per step, it is the cheapest method here if the motion, not a stiff force, determines the step
-    size. All coordinates are integrated alike from their accelerations: positions by the double integral of the
-    polynomial through the last accelerations, velocities by the single integral. The end of every step is moved to the
-    nearest state on the constraints, in the metric of M; with nonholonomic rows, to the state with the same independent
-    coordinates. The method thus departs from the paper, whose outer loop has only independent coordinates, and a new
-    partition does not interrupt it.
+    With two evaluations per step, it is cheap where evaluations cost much and the motion, not a stiff force,
+    determines the steps. All coordinates are integrated alike from their accelerations: positions by the double
+    integral of the polynomial through the last accelerations, velocities by the single integral. The end of every step
+    is moved to the nearest state on the constraints, in the metric of M; with nonholonomic rows, to the state with the
+    same independent coordinates. The method thus departs from the paper, whose outer loop has only independent
+    coordinates, and a new partition does not interrupt it.
 
     It starts by itself, with order 1 and a short step. After a run of many steps, a test at a few states shows whether
     stability rather than accuracy limited the steps. If so, `result.message` says so and names other methods.

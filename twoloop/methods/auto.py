@@ -80,7 +80,7 @@ def with_matrix_cost(plan: Plan, cost: float) -> Plan:
 
 @dataclass(frozen=True)
 class Auto:
-    """Default method: explicit steps, and Newton's method where stiffness is measured; a run may switch both ways.
+    """Default method: "Lobatto16" or explicit steps, and Newton's method while the motion is stiff.
 
     A run begins with one of these methods:
 
@@ -132,6 +132,8 @@ class Auto:
         Implicit methods, for loose, tight and the tightest tolerances.
     fixed : method object
         Method for fixed steps.
+    lanes : Lobatto16 or None
+        Method with generated code.
 
     Examples
     --------

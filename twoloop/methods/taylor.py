@@ -41,7 +41,7 @@ def _order(rtol: float, atol: float, least: float, per_digit: float) -> int:
 class Taylor:
     """Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
 
-    It is the cheapest method here at tight tolerances. The callbacks run once in Python on symbols; this takes
+    It suits tight tolerances without generated code. The callbacks run once in Python on symbols; this takes
     milliseconds and compiles nothing. The coefficients of q, v, a and lam follow from the recorded operations, order by
     order. Each order takes one linear solution with the matrix of the accelerations, and no derivative of the
     constraints beyond C_q. gamma and kinematics are not used. A step is as long as the series allows. Its end is moved

@@ -81,13 +81,14 @@ class Result(Record):
     defect : float or None
         Largest defect of the steps relative to the tolerances: the residual of the accelerations at the ends of steps
         and between them. A step with a defect above 1 is rejected, unless rounding in the equations explains it. None
-        for methods other than "Taylor", and for "auto" where it used others; `certify` verifies a run afterwards.
+        if it was not evaluated in all steps: only "Taylor" does so, and "Lobatto16" in long steps; `certify` verifies a
+        run afterwards.
     widest_gap : float or None
         Longest time without an evaluation of the equations, s: shorter features may have been missed. It is the
         longest distance between the evaluation points of "Taylor", or the longest step of other methods; of a step of
-        "DOP853" above a hundredth of the run, 4/15, as its stages are no further apart. At most a hundredth of the
-        run unless the step size is constant. Forces and drives that may change suddenly with time
-        were also sampled at every two-thousandth of the run, and eight times per step. None for a foreign solver.
+        "Lobatto16" or "DOP853" above a hundredth of the run, the longest distance between its stages. At most a
+        hundredth of the run unless the step size is constant. Forces and drives that may change suddenly with time were
+        also sampled at every two-thousandth of the run, and eight times per step. None for a foreign solver.
     t_end : float or None
         End of `t_span`, s. None for a foreign solver.
     system : ConstrainedSystem or None
