@@ -4,10 +4,8 @@ import re
 
 import numba
 
-MIN_VERSION, END_VERSION = (
-    (0, 61),
-    (0, 69),
-)  # supported versions of numba: from MIN_VERSION to below END_VERSION, as in pyproject.toml
+# oldest supported version of numba, and the first version above the supported ones, as in pyproject.toml
+MIN_VERSION, END_VERSION = (0, 61), (0, 69)
 
 
 def check_version(installed: str) -> None:

@@ -1,4 +1,4 @@
-"""Cache machine code on disk: where it is stored, when it is out of date, and what happens if it cannot be stored.
+"""Cache machine code on disk: choose folders, detect files that are out of date, and check who can write files.
 
 Numba's own cache has three shortcomings. It notices changes of the file in which a function is defined, but not changes
 of helpers in other files or of the values of globals, which numba freezes. It raises an error if no folder can be
@@ -46,7 +46,7 @@ ACCESS_ADVICE = (
 
 
 class UntrustedFile(OSError):
-    """Error for a file that another user could have written; the text gives the reason."""
+    """Error for a file that another user could have written; the message gives the reason."""
 
 
 def read_trusted(path: Path) -> bytes:
@@ -111,7 +111,7 @@ def reason_to_distrust(folder: Path) -> str:
             continue
         except OSError as error:
             return f"{each} cannot be examined ({error.strerror})"
-        # in a sticky folder, others than the owner of a file or folder cannot replace it
+        # in a sticky folder, only its owner can replace a file or folder
         is_sticky = each != real_path and status.st_mode & stat.S_ISVTX
         reason = _reason_of_owner(status) if is_sticky else _reason_of_mode(status)
         if reason:
@@ -151,7 +151,7 @@ def _is_private_group(gid: int) -> bool:
     return is_own and set(group.gr_mem) <= {"root", user.pw_name}
 
 
-_temporary_folders: list[tempfile.TemporaryDirectory[str]] = []  # the temporary folder of this process, once it exists
+_temporary_folders: list[tempfile.TemporaryDirectory[str]] = []  # empty, or the temporary folder of this process
 
 
 def _temporary_folder() -> str:
@@ -161,11 +161,11 @@ def _temporary_folder() -> str:
     return _temporary_folders[0].name
 
 
-_warnings: list[str] = []  # the warning that `_warn_first` has printed, if any
+_warnings: list[str] = []  # empty, or the warning that `_warn_first` has printed
 
 
 def _warn_first(text: str) -> None:
-    """Print a warning on stderr if it is the first warning of this process about files of other users."""
+    """Print a warning about files of other users on stderr, unless this process has printed one before."""
     if not _warnings:
         _warnings.append(text)
         print(text, file=sys.stderr, flush=True)
@@ -178,9 +178,9 @@ CHECKSUM_SIZE = hashlib.sha256().digest_size  # length of the checksum at the be
 class CodeFiles:
     """Store the machine code of a function on disk, in one file with a checksum for each key.
 
-    Only the user can write these files. A file that is damaged or out of date counts as missing. There is no index, as
-    in numba's own cache, which may assign the machine code of one function to another if two processes write at the
-    same time.
+    Only the user can write these files. A file that is damaged or out of date counts as missing. Unlike numba's cache,
+    this class has no index of files: if two processes write an index at the same time, it may assign the machine code
+    of one function to another.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, is_limited: bool = False):
@@ -203,7 +203,7 @@ class CodeFiles:
                 old.unlink(missing_ok=True)
 
     def has_file(self, key: Any) -> bool:
-        """Return whether there is a file for a key, which may be damaged or out of date."""
+        """Return whether the file for a key exists; it may be damaged or out of date."""
         return self._path_for_key(key).exists()
 
     def load(self, key: Any) -> Any:
@@ -267,7 +267,7 @@ def compile_cached(
     digests : (str, str) or None
         Digests of everything on which the machine code depends, see `digests_of`. A file with another first digest is
         out of date. The second digest is part of the key of a file, because functions with the same source may have
-        different closure variables. None: the machine code is not stored.
+        different closure variables. None: the machine code is not stored on disk.
     announcement : str
         Text printed on stderr before the first compilation of this process.
     **options
@@ -290,7 +290,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Return a context without garbage collection, which takes a sixth of the compile time, and frees nothing."""
+    """Return a context without garbage collection, which would take a sixth of the compile time, and free nothing."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -301,7 +301,7 @@ def garbage_collection_off() -> Iterator[None]:
 
 
 class BoundedCache(dict[Any, Any]):
-    """Dictionary that keeps its newest MAX_IN_MEMORY entries, because a parameter sweep adds an entry for each run."""
+    """Dictionary of the newest MAX_IN_MEMORY entries; older entries are removed, as each run of a sweep adds one."""
 
     def __setitem__(self, key: Any, value: Any) -> None:
         super().__setitem__(key, value)
@@ -351,7 +351,7 @@ def with_unique_name(function: Callable[..., Any], digests: tuple[str, str] | No
 
 
 class _CompiledFunctionCache(FunctionCache):
-    """Numba's cache of a function, with the digests and files of twoloop; after an error, the function is compiled."""
+    """Numba's cache of a function, with twoloop's digests and files. If a file cannot be read, numba compiles again."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
@@ -374,12 +374,12 @@ class _CompiledFunctionCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the machine code for a signature, or None if it has to be compiled."""
         try:
-            loaded = super().load_overload(sig, target_context)
+            overload = super().load_overload(sig, target_context)
         except Exception:  # an incompatible file from another installation: it is overwritten after the compilation
-            loaded = None
-        if loaded is None and self._announcement:
+            overload = None
+        if overload is None and self._announcement:
             warn_once(self._announcement)
-        return loaded
+        return overload
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Store machine code, or warn that this is impossible."""
@@ -424,10 +424,10 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
     """Return two digests of everything on which the machine code of a function depends; replace its helpers' caches.
 
-    The first digest is that of the function's code, defaults, globals, and the attributes that it uses of modules. The
-    second digest is that of its closure variables. For a compiled helper among these values, the values that the helper
-    uses are hashed, too; numba's cache of the helper is replaced by that of twoloop. Returns None if a value may change
-    without a change of the digest.
+    The first digest covers the code, defaults and globals of the function, and the attributes that it uses of modules.
+    The second digest covers its closure variables. If one of these values is a compiled helper, the values that the
+    helper uses are hashed, too, and twoloop's cache replaces numba's cache of the helper. Returns None if a value may
+    change without a change of the digest.
     """
     digests, helpers = _digests_and_helpers(function)
     for each in helpers:
@@ -436,9 +436,9 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the digests of `digests_of`, and the compiled helpers; each helper follows the helpers that it calls."""
+    """Return the digests of `digests_of`, and the compiled helpers, each of them after the helpers that it calls."""
     code, closure = Digest(), Digest()
-    closure.names = reachable_names(function)  # names of the attributes that the function may use of modules
+    closure.names = reachable_names(function)  # names of attributes of modules that the function may use
     try:
         code.add_function(function, enclosed=False)
         closure.add(closure_values(function))

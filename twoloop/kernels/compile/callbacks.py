@@ -39,7 +39,10 @@ SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed
 
 
 def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return `function`, or its copy that calls bounds-checked copies of helpers, and numba's options to compile it."""
+    """Return the function to compile instead of `function`, and numba's options, with bounds checks if needed.
+
+    The function is `function` or, if a helper computes indices, a copy that calls bounds-checked copies of its helpers.
+    """
     helpers = [helper for place in frozen_locations(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
         return FunctionCopier(_compile_with_bounds_checks).copy_of(function), BOUNDS_CHECK
@@ -56,7 +59,7 @@ def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
-    """Return whether a function may have an index that is no constant or loop counter; True if it has no source."""
+    """Return whether an index in a function may be other than a constant or loop counter; True if it has no source."""
     if is_twoloop(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
@@ -68,7 +71,7 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
 
 
 def _computed_names(tree: ast.AST) -> set[str]:
-    """Return the names in a function whose values may be other than constants, loop counters and array sizes."""
+    """Return the names of variables in a function that may be other than constants, loop counters and array sizes."""
     computed = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
         n_before = len(computed)
@@ -110,12 +113,10 @@ def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ_ONLY_VECTOR = numba.types.Array(
-    f8, 1, "C", readonly=True
-)  # type of a read-only vector, with the memory layout of VECTOR
+READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # its memory layout is that of VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
-# sizes of the vectors among the arguments of callbacks, other than p; lam are the multipliers of C, not those of A
+# sizes of the vectors that callbacks receive, except p: names of attributes of a system; lam: multipliers of C only
 STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
@@ -171,7 +172,7 @@ class CallbackKind:
 
     @cached_property
     def signature(self) -> Any:
-        """Return the signature with which kernels call a callback."""
+        """Return the signature with which kernels call a callback: all arrays are writable."""
         return self._signature(VECTOR)
 
     @property
@@ -413,9 +414,10 @@ def _compile_with_writable_inputs(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a function whose helpers require writable arrays; raise TypeError if it writes to its inputs.
+    """Compile a callback with writable inputs, because its helpers may not accept read-only arrays.
 
-    `error` is the error of the compilation with read-only inputs.
+    Raises TypeError if the callback itself writes to its inputs. `error`: error of the compilation with read-only
+    inputs.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)

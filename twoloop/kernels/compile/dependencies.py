@@ -24,11 +24,11 @@ from numba.core.types import Type
 
 from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, options_of
 
-# libraries whose functions are hashed by name only, because keys also contain the versions of numba and numpy
+# libraries whose functions are hashed by name only; for other versions of numba or numpy, all digests change anyway
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-# largest number of code objects for which `_loaded_names` caches its result: runs create new functions with the same
-# code, and reading their instructions again would take most of the time of tracing
+# largest number of code objects whose loaded names are cached: runs create new functions with the same code, and to
+# read their instructions again would take most of the time of tracing
 MAX_CODES = 2000
 DIGEST_VERSION = 2  # part of all digests: increase it if machine code cached by earlier versions may be wrong
 
@@ -63,7 +63,7 @@ class Digest:
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
-        self.names: set[str] = set()  # names of attributes of modules that the function being added may use
+        self.names: set[str] = set()  # names of the attributes of modules that the current function may use
         self.positions: dict[tuple[int, str], int] = {}  # position of each value added so far, by its id and name
         self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it calls
 
@@ -95,7 +95,7 @@ class Digest:
             self._add_name(value)
 
     def add_function(self, function: Any, enclosed: bool = True) -> None:
-        """Add the code, the defaults and the globals of a function, and if `enclosed`, its closure variables."""
+        """Add the code, the defaults and the globals of a function; if `enclosed`, also its closure variables."""
         outer, self.names = self.names, reachable_names(function)
         self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
         if enclosed:
@@ -136,7 +136,7 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
-        """Register a new value and return True; hash the position of a value registered before, and return False."""
+        """Return whether a value is added for the first time, and register it; hash the position of a known value."""
         key = (id(value), name)
         if key in self.positions:
             self.hash.update(f"<again {self.positions[key]}>".encode())
@@ -152,7 +152,7 @@ def names_of_code(code: types.CodeType) -> set[str]:
 
 
 def globals_of(function: Any) -> dict[str, Any]:
-    """Return the globals that a function and functions within it load, by name; for `math.log`, this is `math`."""
+    """Return the globals that a function and functions within it load, by name; for `math.log`, the global `math`."""
     names = {each.name for each in _loaded_names(function.__code__) if not each.free} & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
@@ -176,7 +176,7 @@ def is_library(module: str) -> bool:
 
 
 def is_twoloop(module: str) -> bool:
-    """Return whether a module is part of twoloop or generated, so that its globals are constant and indices valid."""
+    """Return whether a module is part of twoloop or generated: its globals are constant, and its indices valid."""
     return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
 
 
@@ -184,7 +184,7 @@ def is_twoloop(module: str) -> bool:
 LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
 FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback with the result of `frozen_values`
-NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that do not use the value loaded before them
+NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that leave the value loaded last unused
 
 
 class FrozenValue(NamedTuple):
@@ -210,7 +210,7 @@ class FrozenValue(NamedTuple):
 
 
 class _LoadedName(NamedTuple):
-    """Global or closure variable (`free`) that a code object loads, and the attributes then loaded from its value."""
+    """Name that a code object loads, of a global or (`free`) closure variable, and the attributes loaded from it."""
 
     free: bool
     name: str
@@ -218,7 +218,7 @@ class _LoadedName(NamedTuple):
 
 
 def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue, bytes | None]]:
-    """Return the values that are frozen in a compiled function, each with its bytes if it is an array, else None.
+    """Return the values that numba has frozen in a compiled function, with the bytes of each array (None for others).
 
     The first call, just after the compilation, stores this list in an attribute of `compiled`. `function`: the original
     function, if a copy of it was compiled.
@@ -238,7 +238,7 @@ def _array_bytes(value: Any) -> bytes | None:
 def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[FrozenValue]:
     """Yield the values in a function and its helpers that numba freezes: numbers, arrays, text, functions, modules.
 
-    Values that functions of twoloop use are constant, and not yielded; only the helpers among them are searched.
+    Functions of twoloop use only constants, which are not yielded; the helpers that they call are searched.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
@@ -290,7 +290,7 @@ def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenVa
 
 
 def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
-    """Yield the defaults, globals and closure variables of a function; for a module, also the attributes used of it."""
+    """Yield the defaults, globals and closure variables of a function; of modules, also the used attributes."""
     code, namespace = function.__code__, function.__globals__
     last_arguments = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last_arguments, (function.__defaults__ or ())[::-1], strict=False):
@@ -307,10 +307,10 @@ def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
 
 
 def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
-    """Yield the attributes of a user's module, and of modules within it, that a function uses.
+    """Yield the attributes that a function uses of a user's module, and of modules within this module.
 
-    `attributes` are the names loaded one after another, as in `module.inner.K`. If it is empty, the module itself is
-    passed on, for example to a local variable or a helper, and all attributes listed in `names` are yielded.
+    `attributes` are the names loaded one after another, as in `module.inner.K`. If there are none, the module itself is
+    assigned to a variable or passed to a helper, and all attributes listed in `names` are yielded.
     """
     if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
         return
@@ -326,15 +326,15 @@ def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], nam
 def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
     """Return the globals and closure variables that a code object and the functions within it load."""
     loaded_names: dict[_LoadedName, None] = {}
-    current = None
+    current_name = None
     for each in dis.get_instructions(code):
-        if current is not None and each.opname in LOADS_ATTRIBUTE:
-            current = current._replace(attributes=(*current.attributes, each.argval))
+        if current_name is not None and each.opname in LOADS_ATTRIBUTE:
+            current_name = current_name._replace(attributes=(*current_name.attributes, each.argval))
         elif each.opname not in NO_EFFECT:
-            if current is not None:
-                loaded_names[current] = None
+            if current_name is not None:
+                loaded_names[current_name] = None
             free = each.opname == "LOAD_DEREF" and each.argval in code.co_freevars
-            current = _LoadedName(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
+            current_name = _LoadedName(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
     inner_names = [
         entry for constant in code.co_consts if isinstance(constant, CodeType) for entry in _loaded_names(constant)
     ]
@@ -345,8 +345,8 @@ def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
 class FunctionCopier:
     """Copy functions, and replace the compiled helpers in their globals, defaults and closure variables.
 
-    `wrap(copy, original)` returns the replacement of the helper `original`. `copy` is a copy of its Python function,
-    whose values are replaced after this call.
+    `wrap(copy, original)` returns the replacement of the helper `original`; `copy` is a copy of its Python function,
+    in which values are replaced after this call.
     """
 
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
@@ -354,7 +354,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value, or the value itself; `names`: attributes to replace in a module."""
+        """Return the replacement of a value, or the value itself; `names`: which attributes of modules are replaced."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -366,7 +366,7 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return whether a value has to be replaced: here, whether it is a compiled helper."""
+        """Return whether a value is replaced: in this class, whether it is a compiled helper."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
@@ -379,12 +379,12 @@ class FunctionCopier:
         return self.copies[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
-        """Return the replacement of a function that is not a compiled helper itself."""
+        """Return the replacement of a Python function that is not compiled itself."""
         self._add_copy(function)
         return self.copies[id(function)]
 
     def _add_copy(self, helper: Any) -> None:
-        """Add the replacement of a helper or function to `self.copies`."""
+        """Store the replacement of a helper or function in `self.copies`."""
         function = getattr(helper, "py_func", helper)
         used_names, names = names_of_code(function.__code__), frozenset(reachable_names(function))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())

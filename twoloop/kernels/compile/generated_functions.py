@@ -15,7 +15,7 @@ from numba.core.registry import cpu_target
 
 from twoloop.kernels.compile.caches import UNWRITABLE_CACHE_WARNING, BoundedCache, CodeFiles, sources_folder, warn_once
 
-# whether this version of llvmlite can run single passes of LLVM
+# whether this version of llvmlite can run chosen passes of LLVM instead of all passes
 HAS_SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
@@ -44,14 +44,14 @@ class GeneratedFunctions:
 
 
 class DeferredFunctions:
-    """Functions that are generated when their addresses are first used, because many runs do not need them."""
+    """Functions that are generated only when an address is used first, because many runs do not use them."""
 
     def __init__(self, generate: Callable[[], GeneratedFunctions]):
         self._generate = generate
 
     @cached_property
     def functions(self) -> GeneratedFunctions:
-        """Return the functions, which stay in memory with this object."""
+        """Generate the functions at the first access; they stay in memory with this object."""
         return self._generate()
 
     @property
@@ -87,17 +87,17 @@ def generated_functions(
         return functions  # type: ignore[no-any-return]
     files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
-        stored = files.load(disk_key)
+        names_and_content = files.load(disk_key)
     except Exception:  # an incompatible file from another installation: it is overwritten after the compilation
-        stored = None
-    if stored is None:
+        names_and_content = None
+    if names_and_content is None:
         names, text = write()
-        stored = names, object_code(text, passes)
+        names_and_content = names, object_code(text, passes)
         try:
-            files.save(disk_key, stored)
+            files.save(disk_key, names_and_content)
         except OSError:
             warn_once(UNWRITABLE_CACHE_WARNING)
-    names, content = stored
+    names, content = names_and_content
     _FUNCTIONS_IN_MEMORY[kind][key] = functions = GeneratedFunctions(names, content)
     return functions
 
@@ -108,12 +108,12 @@ def are_cached(kind: str, stamp: str, key: str) -> bool:
 
 
 def _code_files(kind: str, stamp: str) -> CodeFiles:
-    """Return the files of a cache on disk."""
+    """Return the files of the cache `kind` on disk; `stamp`: see `generated_functions`."""
     return CodeFiles(sources_folder(), kind, (binding.llvm_version_info, stamp), True)
 
 
 def _disk_key(key: str) -> Any:
-    """Return the key of a file: the processor, as numba describes it, and the key of the functions."""
+    """Return the key of a file: numba's description of the processor, and the key of the functions."""
     return (*cpu_target.target_context.codegen().magic_tuple(), key)
 
 
@@ -136,10 +136,9 @@ def _shared_target_machine() -> Any:
 
 @cache
 def _two_pass_manager() -> tuple[Any, Any]:
-    """Return a manager of two passes, which make the code of small mechanisms a tenth faster, and their builder.
+    """Return LLVM's manager of two passes, and a builder of passes; cached, because LLVM leaks about 300 kB per pass.
 
-    All other passes together gain no further speed. Passes are created once per process, because LLVM leaks about
-    300 kB for each pass.
+    The two passes make the code of small mechanisms a tenth faster; all other passes together gain no further speed.
     """
     passes = binding.create_new_module_pass_manager()
     passes.add_reassociate_pass()
@@ -148,7 +147,7 @@ def _two_pass_manager() -> tuple[Any, Any]:
 
 
 def _all_pass_manager() -> tuple[Any, Any]:
-    """Return a manager of all passes, and their builder, for a single module; only llvmlite 0.44 requires this."""
+    """Return LLVM's manager of all passes and their builder, for one module; only llvmlite 0.44 requires all passes."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 

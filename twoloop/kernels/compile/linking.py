@@ -45,7 +45,7 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "forget_compiled", "jitable
 def jitable_templates(function: Any) -> list[Any]:
     """Return numba's templates of a function decorated by `register_jitable`, or an empty list for other functions.
 
-    Every caller of such a function compiles it again.
+    Numba compiles such a function again for each function that calls it.
     """
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
@@ -61,7 +61,7 @@ def jitable_templates(function: Any) -> list[Any]:
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
-    """Make a function that is compiled for one signature callable with arguments of a second signature.
+    """Let a compiled function, which has one signature, also be called with arguments of a second signature.
 
     The arguments of both signatures must have the same layout in memory.
     """
@@ -89,7 +89,7 @@ _numba_fix_index = arrayobj.fix_integer_index
 
 
 def _resolved_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
-    """Emit code for an index of an array; in kernels and helpers, a negative index does not count from the end."""
+    """Emit code for an index of an array; in kernels and helpers, code for negative indices is left out."""
     if kind.signed and isinstance(context.active_code_library, _HelperLibrary | _KernelLibrary):
         return context.cast(builder, index, kind, types.intp)
     return _numba_fix_index(context, builder, kind, index, size)
@@ -116,19 +116,19 @@ def _element_address(
 
 _numba_call_type: Any = BaseFunction.get_call_type
 _call_signatures: dict[Any, tuple[Any, Any]] = {}
-# options and their texts by the id of the options; the options are stored so that no other object gets their id
+# options of numba and their texts, by the id of the options; storing the options prevents that their id is reused
 _option_texts: dict[int, tuple[Any, str]] = {}
 
 
 def _options_text(options: Any) -> str:
-    """Return numba's options of a compilation as text, cached."""
+    """Return the text of numba's options of a compilation, from a cache."""
     if id(options) not in _option_texts:
         _option_texts[id(options)] = options, repr(options and options._values)
     return _option_texts[id(options)][1]
 
 
 def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return the signature of a call of a function that numba implements, cached by argument types and options.
+    """Return the signature of a call of a function that numba implements, from a cache by argument types and options.
 
     Without this cache, numba tries all implementations of an operator at each call: a tenth of the compile time.
     """
@@ -145,7 +145,7 @@ _type_sizes: dict[str, int] = {}
 
 
 def _cached_type_size(self: Any, kind: Any) -> Any:
-    """Return the size of a type, bytes, cached; numba would make LLVM parse a module for each variable."""
+    """Return the size of a type, bytes, from a cache; numba would make LLVM parse a module for each variable."""
     name = str(kind)
     if name not in _type_sizes:
         _type_sizes[name] = _numba_type_size(self, kind)
@@ -157,7 +157,7 @@ _inlined_code: dict[Any, Any] = {}
 
 
 def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """Return the intermediate code of an inlined function, cached; numba would analyse the function at each call."""
+    """Return the intermediate code of an inlined function, from a cache; numba would analyse it at each call."""
     if (function, enable_ssa) not in _inlined_code:
         _inlined_code[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
@@ -166,11 +166,11 @@ def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> 
     return code
 
 
-_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types of parts of a statement that contain no variables
+_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types of those parts of a statement that contain no variables
 
 
 def _variables_of_statement(self: Any, part: Any) -> list[Any]:
-    """Return the variables of a statement; numba's version is slower, because it calls a function for each part."""
+    """Return the variables in a statement or a part of it, with fewer calls of functions than numba's own code."""
     if isinstance(part, ir.Var):
         return [part]
     if isinstance(part, ir.Inst):
@@ -200,7 +200,7 @@ def _load_registries_once(self: Any) -> None:
         _numba_load_registries(self)
 
 
-_LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of numba's events of locks
+_LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of events that numba reports when it takes a lock
 
 
 def _without_lock_events(report: Any) -> Any:
@@ -220,7 +220,7 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _without_lock_events(event.start_event)),
     (event, "end_event", _without_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # stands for an attribute that an owner does not have
+_MISSING_ATTRIBUTE = object()  # placeholder for an attribute that the owner does not have itself
 _depth = [0]  # number of nested compilations of kernels
 
 
@@ -228,7 +228,7 @@ _depth = [0]  # number of nested compilations of kernels
 def kernel_rules() -> Iterator[None]:
     """Return a context for compiling a kernel, in which functions of numba are replaced by those of `_RULES`."""
     if _depth[0] == 0:
-        before = [vars(owner).get(name, _MISSING_ATTRIBUTE) for owner, name, _ in _RULES]
+        originals = [vars(owner).get(name, _MISSING_ATTRIBUTE) for owner, name, _ in _RULES]
         for owner, name, rule in _RULES:
             setattr(owner, name, rule)
     _depth[0] += 1
@@ -237,7 +237,7 @@ def kernel_rules() -> Iterator[None]:
     finally:
         _depth[0] -= 1
         if _depth[0] == 0:
-            for (owner, name, _), original in zip(_RULES, before, strict=True):
+            for (owner, name, _), original in zip(_RULES, originals, strict=True):
                 if original is _MISSING_ATTRIBUTE:
                     delattr(owner, name)
                 else:
@@ -245,7 +245,7 @@ def kernel_rules() -> Iterator[None]:
 
 
 class _CodegenWithoutEnvironment:
-    """Wrapper of numba's code generator for code that is never loaded, so that its environment needs no address."""
+    """Wrapper of numba's code generator that stores no addresses of environments, as helpers are never loaded."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -285,7 +285,7 @@ class _HelperLibrary(CPUCodeLibrary):
 
 
 class _KernelLibrary(JITCodeLibrary):
-    """Code of a kernel and of all functions that it calls."""
+    """Machine code of a kernel and of all functions that it calls."""
 
     vectorized = False
 
@@ -297,7 +297,7 @@ class _KernelLibrary(JITCodeLibrary):
 
 
 class _VectorizedLibrary(_KernelLibrary):
-    """Code of a kernel with long loops, which are vectorised."""
+    """Machine code of a kernel with long loops, which are vectorised."""
 
     vectorized = True
 

@@ -26,7 +26,7 @@ _REFERENCES: dict[str, Any] = {}  # all types `Reference`, by name
 
 
 def _reference_named(name: str) -> Any:
-    """Return the `Reference` of this name; pickle calls this function, so that there is only one for each name."""
+    """Return the `Reference` of this name; pickle calls this function, so that no copies arise."""
     return _REFERENCES[name]
 
 
@@ -147,7 +147,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any) -> Any:
-    """Emit code that loads the word at an offset of a table, marked as constant so that LLVM loads it only once."""
+    """Emit code that loads the word at an offset of a table; LLVM may assume that this word never changes."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), offset)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -175,7 +175,7 @@ class _FieldTypes(AttributeTemplate):
 
 @lower_getattr_generic(Reference)
 def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    """Emit code that returns a field: numba's structure of an array, or for a function, the pointer to the table."""
+    """Emit code that returns the value of a field: numba's structure of an array or, for a function, the pointer."""
     if field in typ.functions:  # `call` below loads the address of the function from the table
         return pointer
     kind, offset = typ.arrays[field], typ.offsets[field]

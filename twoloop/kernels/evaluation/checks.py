@@ -47,7 +47,7 @@ def _fit_column_units(rows, columns, mask, logs):
 
     `logs` has the logarithms of |entries|, `mask` has 1 for each entry. Returns whether no unit changed.
     """
-    unchanged = True
+    is_unchanged = True
     for j in range(columns.size):
         total, n = 0.0, 0
         for i in range(rows.size):
@@ -55,9 +55,9 @@ def _fit_column_units(rows, columns, mask, logs):
                 total += rows[i] - logs[i, j]
                 n += 1
         mean = total / n if n > 0 else 0.0
-        unchanged = unchanged and mean == columns[j]
+        is_unchanged = is_unchanged and mean == columns[j]
         columns[j] = mean
-    return unchanged
+    return is_unchanged
 
 
 @exact
@@ -137,11 +137,10 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # the state satisfies the constraints up to rounding. DEFINITE: M varies, and all its eigenvalues are above their limit
 # by EIGENVALUE_MARGIN. INDEFINITE: M varies, and an eigenvalue is below its limit by EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = (
-    0.5  # largest distance from a stored position, relative to the stored sizes, at which these sizes apply
-)
+# largest distance from a recorded position, relative to the recorded sizes of coordinates, at which these sizes apply
+MAX_RELATIVE_DISTANCE = 0.5
 ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
-EIGENVALUE_MARGIN = 2.0  # factor by which eigenvalues must differ from their limit, as rounding errors are smaller
+EIGENVALUE_MARGIN = 2.0  # factor by which eigenvalues must differ from their limit, so that rounding does not decide
 
 
 def results_size(n: int, n_c: int, n_a: int) -> int:

@@ -432,10 +432,10 @@ def _is_on_constraints(f, w, q):
     largest_terms[:] = 0.0
     for k in range(rows.size):
         largest_terms[rows[k]] = max(largest_terms[rows[k]], abs(w.jacobian_values[k] * q[columns[k]]))
-    all_hold = True
+    are_satisfied = True
     for i in range(largest_terms.size):
-        all_hold = all_hold and abs(w.C[i]) <= ROUNDING_OF_ROWS * largest_terms[i]
-    return all_hold
+        are_satisfied = are_satisfied and abs(w.C[i]) <= ROUNDING_OF_ROWS * largest_terms[i]
+    return are_satisfied
 
 
 @compiled

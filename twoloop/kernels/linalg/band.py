@@ -154,20 +154,20 @@ def lu_band(numbers, n, b):
 
 @inlined
 def _border(numbers, n, n_c, b):
-    start = n * (3 * b + 1)
-    return numbers[start : start + n_c * n].reshape((n_c, n))
+    begin = n * (3 * b + 1)
+    return numbers[begin : begin + n_c * n].reshape((n_c, n))
 
 
 @inlined
 def _schur_complement(numbers, n, n_c, b):
-    start = n * (3 * b + 1) + n_c * n
-    return numbers[start : start + n_c * n_c].reshape((n_c, n_c))
+    begin = n * (3 * b + 1) + n_c * n
+    return numbers[begin : begin + n_c * n_c].reshape((n_c, n_c))
 
 
 @inlined
 def _scratch(numbers, n, n_c, b):
-    start = n * (3 * b + 1) + n_c * (n + n_c)
-    return numbers[start : start + n_c]
+    begin = n * (3 * b + 1) + n_c * (n + n_c)
+    return numbers[begin : begin + n_c]
 
 
 @compiled

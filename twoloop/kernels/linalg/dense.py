@@ -33,10 +33,10 @@ def largest_of(x):
 @merged
 def contains(numbers, number):
     """Return whether `number` is one of `numbers`."""
-    contained = False
+    is_contained = False
     for element in numbers:
-        contained = contained or element == number
-    return contained
+        is_contained = is_contained or element == number
+    return is_contained
 
 
 @merged
@@ -192,11 +192,11 @@ def ldl_solve_rows(A, B):
 @merged
 def has_new_entries(G, pattern):
     """Return whether G has a nonzero entry where `pattern` is 0."""
-    entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
-    unseen = 0.0  # sum of the new |entries|: a sum needs no branch, and new entries are rare
-    for i in range(seen.size):
-        unseen += abs(entries[i]) * (1.0 - seen[i])
-    return unseen != 0.0  # also true for NaN
+    entries, recorded = G.reshape(G.size), pattern.reshape(pattern.size)
+    sum_of_new_entries = 0.0  # sum of the new |entries|: a sum needs no branch, and new entries are rare
+    for i in range(recorded.size):
+        sum_of_new_entries += abs(entries[i]) * (1.0 - recorded[i])
+    return sum_of_new_entries != 0.0  # also true for NaN
 
 
 @compiled

@@ -61,7 +61,7 @@ class _PartSupports:
         # bodies with a single coordinate: a joint with one of these may fix a part to the ground
         self.single_coordinate_bodies = single_coordinate_bodies
         self.parts = _DisjointSets(n_bodies)
-        self.grounded = [False] * n_bodies
+        self.is_grounded = [False] * n_bodies
         self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support each part
         # for each hub: one body of each part that the hub supports or has supported
         self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}
@@ -71,7 +71,7 @@ class _PartSupports:
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.single_coordinate_bodies and any(
-            not self.grounded[part] and not self.hubs_by_part[part] for part in parts
+            not self.is_grounded[part] and not self.hubs_by_part[part] for part in parts
         ):
             return True
         return not bodies & self.hubs and not any(self.hubs_by_part[part] for part in parts)
@@ -79,8 +79,8 @@ class _PartSupports:
     def eliminate_joint(self, joint: int) -> None:
         """Merge the parts that an eliminated joint connects, and update their supports."""
         bodies = self.joints[joint]
-        grounded = len(bodies) == 1 or bool(bodies & self.single_coordinate_bodies)
-        self._merge_parts((body for body in bodies if body not in self.hubs), grounded, bodies & self.hubs)
+        is_grounded = len(bodies) == 1 or bool(bodies & self.single_coordinate_bodies)
+        self._merge_parts((body for body in bodies if body not in self.hubs), is_grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
         """Merge an eliminated hub and the parts that it supports, and update their supports."""
@@ -90,17 +90,17 @@ class _PartSupports:
             self.hubs_by_part[body].discard(hub)
         self._merge_parts([hub, *supported_bodies], False, frozenset())
 
-    def _merge_parts(self, bodies: Iterable[int], grounded: bool, hubs: AbstractSet[int]) -> None:
-        """Merge the parts that contain `bodies`; `grounded` and `hubs`: further supports of the merged part."""
+    def _merge_parts(self, bodies: Iterable[int], is_grounded: bool, hubs: AbstractSet[int]) -> None:
+        """Merge the parts that contain `bodies`; `is_grounded` and `hubs`: further supports of the merged part."""
         first, *others = bodies
         part = self.parts.find(first)
         for body in others:
             other_part = self.parts.find(body)
             if other_part != part:
-                grounded = grounded or self.grounded[other_part] or self.grounded[part]
+                is_grounded = is_grounded or self.is_grounded[other_part] or self.is_grounded[part]
                 hubs = {*hubs, *self.hubs_by_part[other_part], *self.hubs_by_part[part]}
                 part = self.parts.join(part, other_part)
-        self.grounded[part] = self.grounded[part] or grounded
+        self.is_grounded[part] = self.is_grounded[part] or is_grounded
         for hub in hubs - self.hubs_by_part[part]:
             self.hubs_by_part[part].add(hub)
             self.supported_bodies[hub].append(part)
@@ -306,12 +306,12 @@ def program_in_order(
         off_diagonal_slots = n + np.searchsorted(entry_keys, column * n + row)
         return np.where(column == row, column, off_diagonal_slots)
 
-    firsts, seconds = [row_of[:0]], [row_of[:0]]
+    first_rows_by_column, second_rows_by_column = [row_of[:0]], [row_of[:0]]
     for rows_in_column in rows_below:
         i, j = _index_pairs(len(rows_in_column))
-        firsts.append(rows_in_column[i])
-        seconds.append(rows_in_column[j])
-    first_of, second_of = np.concatenate(firsts), np.concatenate(seconds)
+        first_rows_by_column.append(rows_in_column[i])
+        second_rows_by_column.append(rows_in_column[j])
+    first_of, second_of = np.concatenate(first_rows_by_column), np.concatenate(second_rows_by_column)
     runs = _update_runs(slots(first_of, second_of), first_of == second_of)
     entry_slots = slots(low, high)
     n_mass = len(mass[0])
@@ -323,9 +323,24 @@ def program_in_order(
     )
     product_rows, first, second = _products_of_entries(jacobian[0], stiff_rows)
     pivot_a, pivot_b = (position[jacobian[1][indices]] for indices in (first, second))
-    stiffened = [product_rows, first, second, slots(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b))]
+    stiffening_section = [
+        product_rows,
+        first,
+        second,
+        slots(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b)),
+    ]
     head = [n_q, n, n_off_diagonal, len(first_of), len(runs), n_mass, len(jacobian[0]), len(product_rows)]
-    parts = [order, begin, row_of, runs, *mass, entry_slots[:n_mass], *jacobian, entry_slots[n_mass:], *stiffened]
+    parts = [
+        order,
+        begin,
+        row_of,
+        runs,
+        *mass,
+        entry_slots[:n_mass],
+        *jacobian,
+        entry_slots[n_mass:],
+        *stiffening_section,
+    ]
     return np.concatenate([np.array(head), *parts]).astype(np.int32)
 
 
@@ -345,9 +360,9 @@ def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integer
     """Return, for each product of two entries of one of the rows `chosen`, the row and the indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
-    ordered = rows[sequence]
+    sorted_rows = rows[sequence]
     for row in chosen:
-        entries = sequence[np.searchsorted(ordered, row) : np.searchsorted(ordered, row + 1)]
+        entries = sequence[np.searchsorted(sorted_rows, row) : np.searchsorted(sorted_rows, row + 1)]
         first_index, second_index = _index_pairs(len(entries))
         parts.append((np.full(len(first_index), row), entries[first_index], entries[second_index]))
     product_rows, first, second = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))

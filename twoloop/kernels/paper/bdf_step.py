@@ -22,17 +22,17 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-SAFETY = 0.9  # factor on the step size after a rejected step; smallest ratio of step sizes after an accepted step
-MIN_STEP_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or a step that ends far from its prediction
+SAFETY = 0.9  # safety factor on the step size after a rejected step; smallest step-size ratio after an accepted step
+MIN_STEP_FACTOR = 0.2  # smallest step-size ratio after a rejected step, or after a step far from its prediction
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
-STEP_SIZE_FACTOR = 6.0  # second factor on the error estimate, for the next step size only, as in VODE: fewer rejections
+STEP_SIZE_FACTOR = 6.0  # additional factor on the error that determines the next step size, to avoid rejections (VODE)
 ORDER_FACTOR = 1.4  # factor on the error estimates of other orders, so that the order rarely changes to and fro
-MIN_INCREASE = 1.2  # smallest factor by which the step size is increased; with a smaller factor, the step size is kept
+MIN_INCREASE = 1.2  # smallest increase of the step size, as a ratio; if it would be smaller, the step size is kept
 MAX_INCREASE = 2.0  # largest ratio of successive step sizes
 
-# indices in `options` of the scalars; the options of the Gauss steps follow
+# indices in `options` of the scalars, which precede the options of the Gauss steps
 HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
-# indices in `memory` of the scalars; the arrays of _coefficient_row and _history_views follow
+# indices in `memory` of the scalars, which precede the arrays of _coefficient_row and _history_views
 (
     HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
     ORDER,
@@ -42,8 +42,8 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
     NEXT_DEPTH,
     N_MEMORY_SCALARS,
 ) = range(7)
-# indices of the rows of coefficients. SPANS: times, s, from earlier points of the history to its last point; NEW_SPANS:
-# times, s, from all points of the history to the end of the step; ERROR_CONSTANTS: error constants of orders 0, 1, ...
+# indices of rows of coefficients. SPANS: times (s) from earlier points of the history to its last point. NEW_SPANS:
+# times (s) from all points of the history to the end of the step. ERROR_CONSTANTS: error constants of orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -69,20 +69,26 @@ def _coefficient_row(memory, row):
 def _history_views(memory, n):
     """Return views of `memory`: differences, trial differences, prediction, rate, and scratch.
 
-    The differences have shapes (N_DIFFERENCES, 2 n); the prediction of (q, v) and `rate`, the derivative of the
-    prediction, have 2 n entries.
+    Both arrays of differences have the shape (N_DIFFERENCES, 2 n). The prediction of (q, v) and its rate, the time
+    derivative, have 2 n entries.
     """
-    o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
+    begin = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
-    differences = memory[o : o + size].reshape((N_DIFFERENCES, 2 * n))
-    trial = memory[o + size : o + 2 * size].reshape((N_DIFFERENCES, 2 * n))
-    o += 2 * size
-    return differences, trial, memory[o : o + 2 * n], memory[o + 2 * n : o + 4 * n], memory[o + 4 * n :]
+    differences = memory[begin : begin + size].reshape((N_DIFFERENCES, 2 * n))
+    trial = memory[begin + size : begin + 2 * size].reshape((N_DIFFERENCES, 2 * n))
+    begin += 2 * size
+    return (
+        differences,
+        trial,
+        memory[begin : begin + 2 * n],
+        memory[begin + 2 * n : begin + 4 * n],
+        memory[begin + 4 * n :],
+    )
 
 
 @kernel(SETTLE)
 def settle_bdf(f, w, options, memory, tolerances, accepted):
-    """Set ORDER to the order chosen; if the attempt was accepted, also replace the history by the trial differences."""
+    """Set ORDER to NEXT_ORDER; if the attempt was accepted, also replace the history by the trial differences."""
     differences, trial, _, _, _ = _history_views(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -116,8 +122,8 @@ def _begin_history(memory, differences, state, h, order):
 def _predict_state(memory, differences, trial, h, prediction, rate):
     """Store the differences, scaled to a step of size h, in `trial`; also store `prediction` and its `rate`.
 
-    The prediction is the value, and `rate` the derivative, of the polynomial of degree ORDER at the end of the step.
-    Also stores NEW_SPANS and ERROR_CONSTANTS.
+    `prediction` is the value, and `rate` the derivative, of the polynomial of degree ORDER at the end of the step.
+    NEW_SPANS and ERROR_CONSTANTS are stored in `memory`.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, new_spans = _coefficient_row(memory, SPANS), _coefficient_row(memory, NEW_SPANS)
@@ -146,11 +152,11 @@ def _predict_state(memory, differences, trial, h, prediction, rate):
 
 @merged
 def _corrector_coefficient(h, k):
-    """Return the coefficient c (s) of the corrector of order k, h / (1 + 1/2 + ... + 1/k)."""
-    leading = 0.0
+    """Return the coefficient c = h / (1 + 1/2 + ... + 1/k), s, of the corrector of order k, see `_correct_state`."""
+    harmonic_sum = 0.0
     for j in range(k):
-        leading += 1.0 / (j + 1.0)
-    return h / leading
+        harmonic_sum += 1.0 / (j + 1.0)
+    return h / harmonic_sum
 
 
 @compiled
@@ -204,7 +210,10 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error, in tolerances, and next step size / this step size; d: y1 - prediction."""
+    """Store NEXT_ORDER; return the error, in units of the tolerances, and the ratio of the next to this step size.
+
+    d is y1 - prediction.
+    """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
@@ -243,7 +252,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _update_differences(memory, trial, y1, d):
-    """Replace the scaled differences in `trial` by those at the end of the step, from the state y1 = prediction + d."""
+    """Replace the scaled differences in `trial` by the differences at the end of the step, y1 = prediction + d."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:
@@ -259,7 +268,7 @@ def _update_differences(memory, trial, y1, d):
 
 @compiled
 def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
-    """Take a step of the Gauss method of order 6, to fill the history of a run with fixed step size; return a code."""
+    """Compute a step of the Gauss method of order 6, to fill the history with fixed step size; return a code."""
     s, n = STARTER_STAGES, w.Q.size
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     A_stage = scratch[: s * n].reshape((s, n))

@@ -31,7 +31,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(SETTLE)
 def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """Store the stage accelerations of an accepted step, to predict the next ones, and its rounding errors."""
+    """Store the stage accelerations and the rounding errors of an accepted step; nothing if `accepted` is false."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = memory_block(memory, s, n, at.A_PREVIOUS), memory_block(memory, s, n, at.A_TRIAL)
@@ -47,10 +47,10 @@ def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by fixed-point iteration; estimate its error by a step of size h and two steps of size h/2.
 
-    The result is the end of the second half step. With EXTRAPOLATION = 1 / (2^order - 1), it is extrapolated by means
-    of the whole step, and projected onto the constraints. The polynomial through the stage accelerations of the last
-    accepted step predicts the stages of the whole step. The polynomial of the whole step predicts those of the half
-    steps. With fixed step size, the result is the end of the whole step.
+    The new state is the end of the second half step. With EXTRAPOLATION = 1 / (2^order - 1), the new state is
+    extrapolated by means of the whole step, and projected onto the constraints. The polynomial through the stage
+    accelerations of the last accepted step predicts the stages of the whole step; the polynomial of the whole step
+    predicts the stages of the half steps. With fixed step size, the new state is the end of the whole step.
     """
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
@@ -112,9 +112,8 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
 
 
-SUDDEN_ERROR = (
-    10.0  # paper_step rejects a step if END_ERROR_WEIGHT `estimate_end_error` exceeds this; not part of the paper
-)
+# largest END_ERROR_WEIGHT * estimate_end_error with which paper_step accepts a step; the paper has no such limit
+SUDDEN_ERROR = 10.0
 
 
 @kernel(ATTEMPT)

@@ -16,11 +16,12 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_fl
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
-# number of rows of ROUNDING, the rounding errors of compensated sums in steps of fixed size: two rows for q and v of
-# the last accepted step, two for q and v of this attempt. Without compensation, the energy of symmetric methods drifts
+# number of vectors of rounding errors of compensated sums, for steps of fixed size: two for q and v of the last
+# accepted step, two for q and v of this attempt. Without compensation, the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# indices in `memory`: of the scalars, then of the stage blocks (s, n_q), then of the vectors (n_q)
+# indices in `memory`: first of scalars; then of blocks (s, n_q), one row for each stage, such as accelerations A; then
+# of vectors (n_q), such as positions Q and velocities V; ROUNDING is the first of N_ROUNDING vectors of rounding errors
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
 A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
@@ -33,46 +34,47 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def memory_block(memory, s, n, which):
-    """Return a view (s, n) of the memory_block with the index `which`, such as A_PREVIOUS, in `memory`."""
+    """Return a view (s, n) of the block with the index `which`, such as A_PREVIOUS, in `memory`."""
     start = N_MEMORY_SCALARS + which * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
 def memory_vector(memory, s, n, which):
-    """Return a view (n) of the memory_vector with the index `which`, such as Q_FULL, in `memory`."""
+    """Return a view (n) of the vector with the index `which`, such as Q_FULL, in `memory`."""
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
     return memory[start : start + n]
 
 
 @inlined
 def rounding_errors_of(memory, s, n, tolerances):
-    """Return a view (N_ROUNDING, n) of ROUNDING; with step-size control, (0, n): sums are then not compensated."""
+    """Return a view (N_ROUNDING, n) of the rounding errors in `memory`; with step-size control, an empty one (0, n)."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + ROUNDING) * n, N_ROUNDING if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
 
 @merged
 def store_rounding_errors(rounding):
-    """Copy the rounding errors of this attempt, once accepted, to the rows of `rounding` for the last accepted step."""
+    """Copy the rounding errors of this attempt to the rows of `rounding` that belong to the last accepted step."""
     for i in range(rounding.shape[0] // 2):
         copy(rounding[rounding.shape[0] // 2 + i], rounding[i])
 
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
 MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_order` has failed; the paper has no limit
-# largest ratio of a change to the first one in a convergent iteration; changes may grow at first, because the iteration
-# matrix is not normal
+# largest ratio of a change to the first change in a convergent iteration; changes may grow at first, because the
+# iteration matrix is not normal
 MAX_GROWTH = 1e3
-MIN_ITERATIONS = 8  # number of iterations after which a change that exceeds the previous one means divergence
+MIN_ITERATIONS = 8  # number of iterations after which a change that exceeds the previous change means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
 @merged
 def _test_convergence(change, last_change, first_change, iteration, tolerance, q):
-    """Return UNDECIDED, CONVERGED or DIVERGED, from the current, the previous and the first change of an iteration.
+    """Return UNDECIDED, CONVERGED or DIVERGED, from the current, the previous and the first change of the stages.
 
-    An iteration has also converged if its changes no longer decrease, but are at most rounding errors of q.
+    An iteration has converged if the change is at most `tolerance`, or if changes no longer decrease because of
+    rounding errors of q.
     """
     if change <= tolerance:
         return CONVERGED
@@ -96,7 +98,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set the rounding errors of this attempt to zero for `coordinates`, the dependent ones, which are not sums."""
+    """Set the rounding errors of this attempt to zero for `coordinates`: dependent ones, which no sum updates."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0
@@ -104,7 +106,7 @@ def _clear_rounding_errors(coordinates, rounding):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
-    """Take a step of size h from (q, v) by iteration on the stage accelerations; return a code and the departure.
+    """Compute a step of size h from (q, v) by iteration on the stage accelerations; return a code and the departure.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
     the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
@@ -122,7 +124,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * total
     first_change = 0.0
     last_change = np.inf
-    result = UNDECIDED
+    convergence = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         # all stages are computed before any is evaluated: in Gauss-Seidel order, convergence requires a smaller h
@@ -147,11 +149,11 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             copy(q1, A_stage[j])
         if iteration == 0:
             first_change = change
-        result = _test_convergence(change, last_change, first_change, iteration, options[OUTER_TOL], q)
-        if result != UNDECIDED:
+        convergence = _test_convergence(change, last_change, first_change, iteration, options[OUTER_TOL], q)
+        if convergence != UNDECIDED:
             break
         last_change = change
-    if result != CONVERGED:
+    if convergence != CONVERGED:
         return OUTER_DIVERGED, 0.0
     for m in range(n):
         sum_q = 0.0
@@ -171,7 +173,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
 @merged
 def _largest_change(coordinates, q, v, q_old, v_old):
-    """Return the largest change of `coordinates` and their velocities since (q_old, v_old), per max(1, |value|)."""
+    """Return the largest change of `coordinates` and their velocities, relative to max(1, |value|)."""
     change = 0.0
     for m in coordinates:
         change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
@@ -181,7 +183,7 @@ def _largest_change(coordinates, q, v, q_old, v_old):
 
 @compiled
 def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
-    """Take a step of size h by the paper's outer loop on y_i = [v_i, q_i]; return a code.
+    """Compute a step of size h by the paper's outer loop on y_i = [v_i, q_i]; return a code.
 
     The loop starts from an Euler step, and ends by the tests (32) and (33). `a` are the accelerations at (t, q, v). Row
     j of A_stage and row j of V_stage are a_j and v_j in K_j = [a_j; v_j]. An iteration updates one stage after another
@@ -245,9 +247,9 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 
 @compiled
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
-    """Return the norm of the difference between a step and two half steps, in units of the tolerances (26).
+    """Return the norm of the difference between a step and two half steps, in units of the tolerances, eq. (26).
 
-    The norm is the largest |component| of positions and velocities if `largest`, else the root mean square (27).
+    The norm is the largest |component| of positions and velocities if `largest`, else the root mean square, eq. (27).
     """
     rtol = tolerances[RTOL]
     total = 0.0
@@ -263,7 +265,7 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 
 @compiled
 def estimate_and_extrapolate(f, w, factor, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
-    """Return a code and Richardson's error estimate, in tolerances; if `factor` > 0, also extrapolate (q1, v1).
+    """Return a code and Richardson's error estimate, in units of the tolerances; if `factor` > 0, extrapolate (q1, v1).
 
     (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. `factor`: 0 or 1 / (2^order - 1).
     """

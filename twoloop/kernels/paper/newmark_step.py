@@ -9,13 +9,13 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# _motion_rate treats a step as a start from rest at the origin if the step increases the largest |coordinate| so far by
-# more than this factor
+# factor of increase of the largest |coordinate| so far, above which _motion_rate treats a step as a start from rest at
+# the origin
 GROWTH_AFTER_REST = 2.0
 TINY = 1e-300  # added to the tolerance, which is zero for a mechanism at rest at the origin
 
-# indices in `memory` of the scalars: largest |coordinate|, |velocity| and |acceleration| so far. The new accelerations
-# (n_q) follow
+# indices in `memory` of the largest |coordinate|, |velocity| and |acceleration| so far; after these scalars, `memory`
+# contains the new accelerations (n_q)
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
 # indices in `options` of newmark_step
@@ -24,7 +24,7 @@ BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 @merged
 def _largest_abs(x, lower_bound):
-    """Return the largest absolute value in x, or `lower_bound` if this is larger."""
+    """Return max|x_m|, or `lower_bound` if this is larger."""
     for m in range(x.size):
         lower_bound = max(lower_bound, abs(x[m]))
     return lower_bound
@@ -32,11 +32,11 @@ def _largest_abs(x, lower_bound):
 
 @compiled
 def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
-    """Return the rate of the motion, 1/s: one over the time in which the largest coordinate changes by its own value.
+    """Return the rate of the motion, 1/s: the reciprocal of the time in which the largest |coordinate| can double.
 
-    The time follows from the largest absolute coordinate, velocity and acceleration so far, because all coordinates may
-    be near zero at a single time, depending on the origin. If the largest coordinate is mainly caused by this step, as
-    after rest at the origin, the time is at least `gap`, s.
+    The time follows from the largest |coordinate|, |velocity| and |acceleration| so far, because all coordinates may be
+    near zero at a single time, depending on the origin. The time is at least `gap` (s) if the largest |coordinate|
+    arises mainly in this step, as after rest at the origin.
     """
     memory[SIZE] = _largest_abs(q, memory[SIZE])
     memory[SPEED] = _largest_abs(v, memory[SPEED])
@@ -68,7 +68,7 @@ def _estimated_error(options, tolerances, rate, h, q, v, a, a1):
 
 @kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: iterate (12) for independent coordinates and the inner loop until the accelerations converge."""
+    """Attempt a step of size h: iterate eq. (12) and the inner loop until the independent accelerations converge."""
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
