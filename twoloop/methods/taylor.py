@@ -133,7 +133,7 @@ class Taylor:
             np.zeros(kernels.memory_size(highest, n_q, program.n_rows, program.n_nodes, *widths)),
             exponent=1.0 / highest,
             safety=1.0,
-            factor_max=kernels.GROWTH,
+            factor_max=kernels.MAX_GROWTH,
             watchful=True,
             projects=True,
             looks_within=True,

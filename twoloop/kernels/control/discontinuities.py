@@ -224,7 +224,7 @@ def _is_smooth_bend(values, k, n):
 
 
 @compiled
-def _find_bend(values, n, slope, least, within):
+def _find_sudden_bend(values, n, slope, least, within):
     """Return the index of the first sudden bend of n + 1 values (0: none), and the limit of second differences.
 
     The limit is SUDDEN_RATIO times the range of the values minus a line of slope `slope` (per sample). The index is 0
@@ -248,11 +248,13 @@ def _first_sudden_bend(values, n, along, least):
     """Return the index of the first sudden bend of n + 1 samples (0: none), and the limit of its second difference.
 
     If `along` is 1, the straight line from the first to the last value is subtracted before the search. The search is
-    repeated among the values before the bend, until it finds no earlier bend. `least`: see `_find_bend`.
+    repeated among the values before the bend, until it finds no earlier bend. `least`: see `_find_sudden_bend`.
     """
-    index, limit = _find_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
+    index, limit = _find_sudden_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
     while index > 1:  # few samples of a smooth curve may bend as much: the argument `within` = True excludes such bends
-        earlier, earlier_limit = _find_bend(values, index, along * (values[index] - values[0]) / index, least, True)
+        earlier, earlier_limit = _find_sudden_bend(
+            values, index, along * (values[index] - values[0]) / index, least, True
+        )
         if earlier == 0:
             break
         index, limit = earlier, earlier_limit

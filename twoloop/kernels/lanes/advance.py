@@ -48,7 +48,7 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status):
-    """Start new runs in idle lanes; return the index of the next new run, and the number of lanes with a run."""
+    """Start runs in idle lanes; return the index of the next run to be started, and the number of lanes with a run."""
     state, new, _, _, _, _, own, _ = offsets_in_work(n, n_rows, numbers.shape[1])
     n_fresh, n_running = 0, 0
     for k in range(LANES):
@@ -85,7 +85,7 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
 
 @compiled
 def _write_states_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
-    """Store the states at the output times within accepted steps in out_q and out_v; NaN where a projection fails."""
+    """Store the states at output times within accepted steps in out_q and out_v, or NaN where the projection fails."""
     while True:
         n_requested = 0
         for k in range(LANES):
@@ -140,7 +140,7 @@ def _count_evaluations(settings, work, n_evaluations):
 
 @compiled
 def _advance_time(work, control, n_steps):
-    """Add the step size to T, and 1 to the entry of `n_steps` (n_runs) of the run, in lanes whose step was accepted."""
+    """In lanes whose step was accepted, add the step size to T, and 1 to the entry of `n_steps` (n_runs) of the run."""
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
             h, t = work[H * LANES + k], work[T * LANES + k]

@@ -57,8 +57,8 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`; its first N_RULE entries are the step-size rule. ROUGH: factor by which errors may exceed their
-# estimates if a force jumps; FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest
+# indices in `options`, whose first N_RULE entries are the step-size rule. ROUGH: largest ratio of an error to its
+# estimate if a force jumps; FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest
 # tolerance of a coordinate. From N_HEAD on, `options` contains the options of the method for a single run
 ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
@@ -68,12 +68,12 @@ MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that 
 END_ROUNDING = (
     1e-10  # a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `size_off_grid`
 )
-LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of a step that failed, as in `Plan`
+LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of the last failed step, as in `Plan`
 LIMIT_MEMORY = 10.0  # number of accepted steps after which H_LIMIT no longer applies, as in `Plan`
 LEAST_FIRST_STEP = 20.0 * SHORTEST  # smallest size of the first step, relative to |t0|
-# number of successive rejected steps after which a run leaves its lane: in stiff motion, steps may remain far too long
+# number of successive rejected steps after which a run leaves its lane, because the motion may be stiff
 MAX_REJECTED = 30
-MOST_STEPS = 100_000  # largest number of steps of a run in a lane, where the user cannot interrupt the run
+MOST_STEPS = 100_000  # largest number of steps of a run in a lane, because the user cannot interrupt runs in lanes
 
 
 @inlined
@@ -84,7 +84,7 @@ def _history_view(work, k):
 
 @compiled
 def _first_step_size(options, control, work, n, state, a, k):
-    """Return the size, s, of the first step in lane k: options[FIRST] times the shortest time scale of the motion."""
+    """Return the first step size (s) in lane k: options[FIRST] times the shortest time scale of the motion."""
     largest_q, largest_v, largest_a, least = 0.0, 0.0, 0.0, np.inf
     for j in range(n):
         largest_q = max(largest_q, abs(work[(state + j) * LANES + k]))
@@ -117,7 +117,7 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Store the size of the next step, at most GAP, in H and X; 0 in lanes without a run. Copy RUNNING to FINE."""
+    """Store the next step size, at most control[GAP], in H and X (0 in lanes without a run); copy RUNNING to FINE."""
     t1 = control[T1]
     for k in range(LANES):
         work[H * LANES + k], t = 0.0, work[T * LANES + k]
@@ -149,10 +149,10 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW onto the constraints; increase ERROR to the change by the projection, if this is larger.
+    """Project NEW onto the constraints; raise ERROR to the change by the projection, in tolerances, if that is larger.
 
-    The change is in units of the tolerances. A change of velocities above 1 shows that a drive has a jump or kink
-    between the stages. `predicted_v` (n) is scratch.
+    If velocities change by more than the tolerances, a drive has a jump or kink between the stages. `predicted_v` (n)
+    is scratch.
     """
     n, order = settings[N], settings[ORDER]
     state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -174,13 +174,13 @@ def end_steps(code, settings, control, work, predicted_v):
 
 @merged
 def _accept_or_shorten(options, work, k):
-    """Store H_NEXT, the size of the next step in lane k; return whether the last step in this lane is accepted."""
+    """Store the size of the next step in lane k in H_NEXT; return whether the last step in this lane is accepted."""
     h, t, error = work[H * LANES + k], work[T * LANES + k], work[ERROR * LANES + k]
     if work[FINE * LANES + k] == 0.0 or not np.isfinite(error):
         work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[LIMIT_AGE * LANES + k] = 0.0
         return False
-    # at a jump of a force, the error estimate may be small by chance: before ROUGH_TO, multiply the estimate by ROUGH
+    # where a force jumps, the error estimate may be small by chance: until ROUGH_TO, multiply the estimate by ROUGH
     error_factor = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
     is_accepted = error * error_factor <= 1.0
     if error > SUDDEN_ERROR and not is_accepted:
@@ -201,7 +201,7 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED according to ERROR and FINE; copy the accelerations `a` at the end of accepted steps to `start`."""
+    """Set ACCEPTED according to ERROR and FINE; copy the final accelerations `a` of accepted steps to `start`."""
     for k in range(LANES):
         work[ACCEPTED * LANES + k] = 0.0
         if work[RUNNING * LANES + k] == 0.0:

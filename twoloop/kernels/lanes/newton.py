@@ -71,11 +71,11 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     H_PREVIOUS,  # size of the step with the accelerations PREVIOUS, s; 0 if there is no such step
     CONSTANT,  # 1: the predicted accelerations of all stages are those at the beginning of the step; else 0
     DURATION,  # duration of an error of the velocities, s, see velocity_errors.py; 0: not known
-    N_OF_LANES,
+    N_SINGLE_VECTORS,
 ) = range(11)
-# indices of the blocks of n vectors: accelerations at STATE; q, v and a at the beginning of the step; sums; q, v and a
-# in the middle of the step; the estimated errors of q and v; the error of v unfiltered, and filtered once; a complex
-# vector, real part first
+# indices of the blocks of n vectors: accelerations at STATE; q, v and a at the beginning of the step; scratch for sums;
+# q, v and a in the middle of the step; estimated errors of q and of v; the error of v before filters and after one
+# filter; the real and the imaginary part of a complex vector
 (
     START,
     BEGIN_Q,
@@ -93,33 +93,35 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     _IMAGINARY,
     N_VECTORS,
 ) = range(15)
-STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # indices of the blocks (s, n), before the weights (s, s)
-# indices of the matrices (n, n), before the pivots; from SYSTEMS on, a real and an imaginary part for each system
+# indices of the blocks (s, n), which the weights (s, s) follow: accelerations of the stages and of the previous step's
+# stages, residuals, and corrections
+STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
+# indices of the matrices (n, n), which the pivots follow; from SYSTEMS on, a real and an imaginary part for each system
 DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
     """Return the length of the method's memory, in vectors; each real eigenvalue or complex pair of A has a system."""
     n_systems = (s + 1) // 2
-    return N_OF_LANES + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
+    return N_SINGLE_VECTORS + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
 
 
 @merged
 def vector_offset(memory, n, block):
     """Return the offset of a block of n vectors, such as START; `memory`: offset of the method's memory."""
-    return memory + N_OF_LANES + block * n
+    return memory + N_SINGLE_VECTORS + block * n
 
 
 @merged
 def block_offset(memory, n, s, block):
     """Return the offset of a block of (s, n) vectors, such as STAGES; `memory`: offset of the method's memory."""
-    return memory + N_OF_LANES + (N_VECTORS + block * s) * n
+    return memory + N_SINGLE_VECTORS + (N_VECTORS + block * s) * n
 
 
 @merged
 def _weights_offset(memory, n, s):
-    """Return the offset of the weights (s, s) with which `predict_stages` multiplies PREVIOUS."""
-    return memory + N_OF_LANES + (N_VECTORS + N_BLOCKS * s) * n
+    """Return the offset of the weights (s, s) by which `predict_stages` multiplies the block PREVIOUS."""
+    return memory + N_SINGLE_VECTORS + (N_VECTORS + N_BLOCKS * s) * n
 
 
 @merged
@@ -160,7 +162,7 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 def compute_derivatives(code, settings, control, c, work):
     """Store the derivatives of the accelerations in the middle of the step by q and v, in lanes with FINE = 1.
 
-    The middle is the time of a stage, because a force that acts only between two stages has no effect on the step.
+    The middle is the time of a stage, because forces that act only between two stages must not affect the step.
     """
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -183,7 +185,7 @@ def compute_derivatives(code, settings, control, c, work):
 
 @compiled
 def factor_systems_of_lanes(settings, method_options, s, work):
-    """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one l of each complex pair."""
+    """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one l of each pair; X: step size."""
     n = settings[N]
     memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_index(s)
@@ -207,10 +209,10 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Store predicted stage accelerations in STAGES: values of the polynomial through PREVIOUS.
+    """Store predicted stage accelerations in STAGES: values of the polynomial through those in PREVIOUS.
 
-    If the step is longer than MAX_STEP_RATIO steps of PREVIOUS, the prediction is constant. `begins`: beginning of the
-    step in units of the step of PREVIOUS: 1 if PREVIOUS belongs to the last step, 0 if it belongs to this step.
+    If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, the prediction is constant. `begins` is 1 if
+    PREVIOUS belongs to the last step, and 0 if it belongs to this step.
     """
     n = settings[N]
     memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
@@ -242,7 +244,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations STAGES; clear FINE in lanes with invalid values."""
+    """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations in STAGES; clear FINE in lanes with invalid values."""
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
@@ -310,7 +312,7 @@ def _correct_stages(settings, method_options, s, work):
 
 @merged
 def _raise_to_largest_value(work, target, begin, n):
-    """Increase the vector `target` to the largest |value| of the n vectors from `begin` on, or to NaN if one is NaN."""
+    """Raise the vector `target` to the largest absolute value in n vectors from `begin` on; NaN if a value is NaN."""
     for i in range(n * LANES):
         magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if magnitude > work[index] or magnitude != magnitude:
@@ -319,7 +321,7 @@ def _raise_to_largest_value(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store LARGEST_Q and LARGEST_V, the largest changes of q and v that CHANGES causes at the stages if X is 1."""
+    """Store in LARGEST_Q and LARGEST_V the largest changes of q and v by CHANGES, divided by X^2 and by X."""
     n = settings[N]
     memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = A.shape[0]
@@ -362,7 +364,7 @@ def _has_iteration_ended(options, work, memory, iteration, k):
 
 @compiled
 def solve_stages(code, settings, control, options, method_options, A, A2, c, work):
-    """Solve for STAGES of a step X from their predictions in lanes with FINE = 1; clear FINE on divergence."""
+    """Solve for STAGES of a step of size X, from the prediction, in lanes with FINE = 1; clear FINE on divergence."""
     n = settings[N]
     memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     iterating, done = memory + ITERATING, memory + DONE
@@ -407,7 +409,7 @@ def store_state_from_stages(settings, b, bA, work):
 
 @merged
 def _allowed_error(control, work, state, new, j, entry, k):
-    """Return the allowed error, in lane k, of entry `entry` of a state [q, v], which belongs to coordinate j."""
+    """Return the allowed error in lane k of entry number `entry` of a state [q, v], which belongs to coordinate j."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[ATOL + j] + control[RTOL] * magnitude
 
@@ -438,7 +440,7 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
 
 @compiled
 def _filter_errors(settings, method_options, s, work, memory):
-    """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), z = gamma0 H, where J is the Jacobian of (v, F)."""
+    """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), with z = gamma0 H and the Jacobian J of (v, F) by (q, v)."""
     n = settings[N]
     gamma0 = method_options[newton_options_index(s) + GAMMA0]
     e_q, e_v, scratch = vector_offset(memory, n, E_Q), vector_offset(memory, n, E_V), vector_offset(memory, n, COMPLEX)
@@ -458,7 +460,7 @@ def _filter_errors(settings, method_options, s, work, memory):
 
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
-    """Return the error, in units of the tolerances, that a velocity error causes in lane k, see velocity_errors.py."""
+    """Return the error, in tolerances, that the estimated velocity error causes in lane k, see velocity_errors.py."""
     raw, once, twice = (
         vector_offset(memory, n, UNFILTERED),
         vector_offset(memory, n, FILTERED_ONCE),
@@ -473,7 +475,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         second_difference = (
             work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
         )
-        largest_difference = max(largest_difference, abs(second_difference))  # (z J)^2 e of the velocity error e
+        largest_difference = max(largest_difference, abs(second_difference))  # |(z J)^2 e| for the velocity error e
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]
@@ -495,7 +497,7 @@ def _velocity_error(control, work, n, error_v, duration, state, new, k):
 
 @merged
 def _motion_time(control, work, n, memory, k):
-    """Return the ratio (s) of the largest velocity to the largest acceleration in lane k, at most LONGEST_GAPS GAP."""
+    """Return (largest velocity) / (largest acceleration) (s) in lane k, at most LONGEST_GAPS * control[GAP]."""
     begin = vector_offset(memory, n, BEGIN_V)
     largest_v = largest_a = 0.0
     for j in range(n):
@@ -507,7 +509,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
-    """Increase ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
+    """Raise ERROR to the error caused by the slowly changing part of E_V, if that is larger, see newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
@@ -543,7 +545,7 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
 
 @compiled
 def _estimate_error(settings, control, method_options, A, work):
-    """Store in ERROR the error estimate, in units of the tolerances, with stiff components suppressed by filters."""
+    """Store in ERROR the error estimate of the step, in tolerances; filters suppress stiff components."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
     offset = newton_options_index(s)

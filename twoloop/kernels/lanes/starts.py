@@ -39,12 +39,14 @@ MAX_REDUNDANT = 1e-4  # eigenvalue of G G^T below which a combination of rows co
 # number of inverse iterations for each row of Z; few are enough, because the eigenvalues of redundant combinations of
 # rows are much smaller than the others
 N_REDUNDANT_ITERATIONS = 5
-GOLDEN = 0.6180339887498949  # fractional parts of its multiples are irregular start values of inverse iterations
+GOLDEN_SECTION = (
+    0.6180339887498949  # fractional parts of its multiples are irregular start values of inverse iterations
+)
 
 
 @merged
 def _subtract_four(work, target, x, dx, y, dy, count):
-    """Apply `subtract_products` to four adjacent lanes; `target`, x, y, dx and dy count numbers, not vectors."""
+    """Apply `subtract_products` to four adjacent lanes; `target`, x, y, dx and dy are indices of entries of `work`."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -58,7 +60,7 @@ def _subtract_four(work, target, x, dx, y, dy, count):
 
 @compiled
 def subtract_products(work, target, x, dx, y, dy, count):
-    """Subtract from the vector `target` the sum over i < `count` of the products of vectors x + i dx and y + i dy."""
+    """Subtract from the vector `target` the products of the vectors x + i * dx and y + i * dy for i < `count`."""
     for k in range(0, LANES, 4):
         _subtract_four(work, target * LANES + k, x * LANES + k, dx * LANES, y * LANES + k, dy * LANES, count)
 
@@ -135,7 +137,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store Z, eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one is not below MAX_REDUNDANT."""
+    """Store Z, the eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one exceeds MAX_REDUNDANT."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -143,7 +145,7 @@ def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factor
     for w in range(n_redundant):
         z = Z + w * n_rows
         for i in range(n_rows):
-            fill_field(work, z + i, 0.5 + (GOLDEN * (i + 1) * (w + 1)) % 1.0)
+            fill_field(work, z + i, 0.5 + (GOLDEN_SECTION * (i + 1) * (w + 1)) % 1.0)
         for _ in range(N_REDUNDANT_ITERATIONS):
             normalise_vector(work, z, n_rows, scratch)
             _solve_with_gram(work, n_rows, gram, z)
@@ -222,8 +224,8 @@ MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
-# displacements of other guesses from the projected positions: factors of `correction`, the change from the first guess
-# to the projected positions, and of the weakest direction
+# displacements of other guesses from the projected positions, as two factors: that of `correction` (the change from the
+# first guess to the projected positions), and that of the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
@@ -267,7 +269,7 @@ _memory_offsets = merged(offsets_in_memory)
 
 @merged
 def _largest_value(work, offset, count, k):
-    """Return the largest absolute value of `count` numbers in lane k, or NaN if one of the numbers is NaN."""
+    """Return the largest absolute value of `count` numbers from `offset` on in lane k, or NaN if one is NaN."""
     largest = 0.0
     for j in range(count):
         magnitude = abs(work[(offset + j) * LANES + k])
@@ -360,7 +362,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
     """
     scratch = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
-        fill_field(work, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
+        fill_field(work, x + i, 0.5 + (GOLDEN_SECTION * (i + 1)) % 1.0)
     for _ in range(N_WEAKEST_ITERATIONS):
         normalise_vector(work, x, n_rows, scratch)
         solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest)
@@ -376,7 +378,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
 
 @compiled
 def _check_other_guesses(code, settings, control, pattern, moves, work):
-    """Clear RUNNING in lanes in which the projection of one of OTHER_GUESSES is far from its prediction by C_q."""
+    """Clear RUNNING in lanes in which another guess has a projection far from its linear prediction by C_q."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
     _, x, change, nearest, correction, weakest, displacement, _, factors_at_nearest, _, _ = _memory_offsets(

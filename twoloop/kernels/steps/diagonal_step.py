@@ -206,7 +206,7 @@ VELOCITY_WEIGHT = 0.1  # weight in the convergence test of the position error ca
 
 
 @inlined
-def stages_of(memory, s, n):
+def stage_views(memory, s, n):
     """Return views of `memory`: stage velocities (s, n), stage accelerations (s, n), accelerations at the start (n)."""
     last = memory.size - n
     return (
@@ -522,7 +522,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
     """Store the accelerations of the last stage of an accepted step, which is the first stage of the next step."""
     if accepted:
         s = int(options[DIAGONAL_OFFSET])
-        _, A_stage, a_end = stages_of(memory, s, w.Q.size)
+        _, A_stage, a_end = stage_views(memory, s, w.Q.size)
         copy(A_stage[s - 1], a_end)  # not F at the last stage, which contains Newton's residual times the stiffness
         memory[at.IS_FRESH] = 0.0
 
@@ -538,7 +538,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    V_stage, A_stage, a_end = stages_of(memory, s, n)
+    V_stage, A_stage, a_end = stage_views(memory, s, n)
     if memory[at.HAS_TRIAL] == 0.0 or memory[at.PARTITION_NUMBER] != w.notes[GENERATION]:
         memory[at.HAS_TRIAL] = 1.0
         memory[at.PARTITION_NUMBER] = w.notes[GENERATION]

@@ -19,9 +19,9 @@ from twoloop.kernels.linalg.dense import copy
 # b (s), c (s) and the weights of the two error estimates (s each). FREE: 1 if stages are not projected
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
 # indices of the vectors in `memory`, after which come the slopes [v, a] of the s stages. A vector or slope has 2 n_q
-# numbers, padded to a multiple of BLOCK
-STAGE, FINE, COARSE, N_VECTORS = range(4)
-BLOCK = 8  # number of sums that `_weighted_sum` accumulates in registers
+# numbers, padded to a multiple of BLOCK_SIZE
+STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
+BLOCK_SIZE = 8  # number of sums that `_weighted_sum` accumulates in registers
 # STRICT: factor on the error estimate once a run has come near a singular position, because phase errors grow at each
 # singular position. If the smallest tolerance is below STRICT * LEAST_STRICT, the factor is smaller, but at least 1
 STRICT, LEAST_STRICT = 10.0, 1e-11
@@ -53,13 +53,13 @@ def options_array(
 
 def memory_size(s: int, n_q: int) -> int:
     """Return the length of `memory` for s stages and n_q coordinates."""
-    return (N_VECTORS + s) * (-(-2 * n_q // BLOCK) * BLOCK)
+    return (N_VECTORS + s) * (-(-2 * n_q // BLOCK_SIZE) * BLOCK_SIZE)
 
 
 @inlined
-def _width(n):
-    """Return 2 n, rounded up to a multiple of BLOCK."""
-    return (2 * n + BLOCK - 1) // BLOCK * BLOCK
+def _padded_width(n):
+    """Return 2 n, rounded up to a multiple of BLOCK_SIZE."""
+    return (2 * n + BLOCK_SIZE - 1) // BLOCK_SIZE * BLOCK_SIZE
 
 
 @inlined
@@ -73,22 +73,22 @@ def tableau_of(options):
 
 
 @inlined
-def _vector(memory, n, which):
-    """Return a view (2 n, padded) of the vector with index `which`, such as STAGE, in `memory`."""
-    return memory[which * _width(n) : (which + 1) * _width(n)]
+def _vector_view(memory, n, which):
+    """Return a view (2 n, padded) of the vector with index `which`, such as STAGE_STATE, in `memory`."""
+    return memory[which * _padded_width(n) : (which + 1) * _padded_width(n)]
 
 
 @inlined
-def _slopes(memory, s, n):
+def _slope_views(memory, s, n):
     """Return a view (s, 2 n padded) of the slopes in `memory`: velocities and accelerations [v, a] of each stage."""
-    begin = N_VECTORS * _width(n)
-    return memory[begin : begin + s * _width(n)].reshape((s, _width(n)))
+    begin = N_VECTORS * _padded_width(n)
+    return memory[begin : begin + s * _padded_width(n)].reshape((s, _padded_width(n)))
 
 
 @compiled
 def _weighted_sum(weights, slopes, total):
-    """Store sum_k weights[k] * slopes[k] over the stages k in `total` (2 n, padded), BLOCK entries at a time."""
-    for m in range(0, total.size, BLOCK):
+    """Store sum_k weights[k] * slopes[k] over the stages k in `total` (2 n, padded), BLOCK_SIZE entries at a time."""
+    for m in range(0, total.size, BLOCK_SIZE):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for k in range(weights.size):
             weight = weights[k]
@@ -144,7 +144,7 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
 
 
 @compiled
-def _error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
+def _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
     """Return the error of a step from y to y1, in units of the tolerances; fill `fine_error` and `coarse_error`."""
     _weighted_sum(fine, slopes, fine_error)
     _weighted_sum(coarse, slopes, coarse_error)
@@ -161,8 +161,12 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    stage, fine_error, coarse_error = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
-    slopes = _slopes(memory, s, n)
+    stage, fine_error, coarse_error = (
+        _vector_view(memory, n, STAGE_STATE),
+        _vector_view(memory, n, FINE_ERROR),
+        _vector_view(memory, n, COARSE_ERROR),
+    )
+    slopes = _slope_views(memory, s, n)
     # near a singular position all stages are projected: it matters on which side of the position a stage lies, and how
     # accurate its velocities are
     is_near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
@@ -185,7 +189,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _add_weighted_slopes(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, is_near)
+        error = _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, is_near)
         if is_near:
             error *= min(max(tolerances[LEAST] / LEAST_STRICT, 1.0), STRICT)
         if not error <= 1.0:

@@ -71,7 +71,7 @@ DIVERGED_FACTOR = 0.6  # ratio of the next step size to the size of a step whose
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
 MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as stiff, and another method takes over
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations count as hardly varying within a step
-N_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
+N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
 MIN_PIVOT_RATIO = 0.4  # ratio of a pivot within a step to that at its beginning below which a singular position is near
 # smallest tolerance with which this method goes on after a singular position: with smaller ones, five more runs of the
 # benchmark A02 were wrong, so another method takes over
@@ -183,7 +183,7 @@ def _accept_polynomial(data):
 
 
 @merged
-def _is_unsuited(w, data, tolerances):
+def _must_change_method(w, data, tolerances):
     """Return whether another method has to take over: near a singular position, or if stiffness limits the steps."""
     is_stiff = data[field.LIMITED] >= MAX_LIMITED or data[field.FAILURES] >= MAX_FAILURES
     is_near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
@@ -198,8 +198,8 @@ def _passes_singular_position(f, w, t, h, state, new_state):
     accelerations. Positions within the step are those of the cubic through the states at both ends.
     """
     n, pivot = w.Q.size, w.notes[PIVOT]
-    for k in range(1, N_PARTS):
-        s = k / N_PARTS
+    for k in range(1, N_PIVOT_PARTS):
+        s = k / N_PIVOT_PARTS
         rest = 1.0 - s
         for m in range(n):
             q0, v0, q1, v1 = state[m], h * state[n + m], new_state[m], h * new_state[n + m]
@@ -223,7 +223,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt one step of size h, and project its end onto the constraints."""
     data, n = _aligned_view(memory), w.Q.size
     data[field.TRIED] = 0.0
-    if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, data, tolerances):
+    if tolerances[ESTIMATE] == 1.0 and _must_change_method(w, data, tolerances):
         return Attempt(UNSUITED, math.inf, 0.0)
     result, error, factor = _solve_collocation(f, w, options, data, tolerances, t, h, state)
     if result == NOT_COMPUTED or (result == REFUSED and tolerances[ESTIMATE] == 0.0):
@@ -310,7 +310,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 def _can_take_next_step(w, data, tolerances, control, clock, h):
     """Return whether another step, of size h, may be taken before the integrator has checked the last step."""
     h_long = clock[at.H_LONG]
-    if h <= control[at.SHORTEST] or h < COLLAPSED * h_long or _is_unsuited(w, data, tolerances):
+    if h <= control[at.SHORTEST] or h < COLLAPSED * h_long or _must_change_method(w, data, tolerances):
         return False
     is_near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
     return not (is_near and h < SHORT_STEP * h_long)

@@ -70,7 +70,7 @@ BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
 
 # indices of the scalars in `memory`. After the scalars, `memory` contains two series of q (ORDER + 1, n_q each) and the
-# arrays of `arrays_of`
+# arrays of `array_views`
 (
     HAS_SERIES,  # 1: the current series has been computed
     CURRENT,  # index, 0 or 1, of the current series: the one about the beginning of the step
@@ -80,7 +80,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
     TRIED,  # 1: the last attempt computed the series about its end, which becomes the current one if it is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
-    TARGET,  # index, 0 or 1, of the series that `expand` computes
+    TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
     # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_DISTANCE; 0: not known yet
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts, which determines the times within a step at which the defect is evaluated
@@ -115,7 +115,7 @@ def _float_array(options, which):
 
 
 @inlined
-def series_of(memory, order, n, which):
+def series_view(memory, order, n, which):
     """Return a flat view of series number `which` (0 or 1) of q, row by row: a matrix would cost a function call."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
@@ -172,7 +172,7 @@ def _store_sums(options, sums, scale, values, out):
 
 
 @compiled
-def begin_operations(options, table, values, z, x, y):
+def start_operations(options, table, values, z, x, y):
     """Store the Taylor coefficients of order 0 of the results z and arguments x and y of a table of operations.
 
     Pending products, whose second factor depends on the accelerations, are set to zero.
@@ -265,7 +265,7 @@ def _fill_second_factors(options, table, values, y):
 
 
 @inlined
-def arrays_of(options, memory, n, n_rows):
+def array_views(options, memory, n, n_rows):
     """Return views of `memory`: coefficients of quantities (N), arguments (X1 to Y2), sums of products; r (n), c."""
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
@@ -289,7 +289,7 @@ def arrays_of(options, memory, n, n_rows):
 
 
 @merged
-def begin_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
+def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
     """Store the coefficients of t and q to order 1, of v and early operations to order 0; set r and c to zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
@@ -298,7 +298,7 @@ def begin_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
         N[0, 1 + j] = series[j] = state[j]
         N[0, 1 + n + j] = state[n + j]
         N[1, 1 + j] = series[n + j] = unit * state[n + j]
-    begin_operations(options, EARLY, N[0], N[0, begin_early:], x, y)
+    start_operations(options, EARLY, N[0], N[0, begin_early:], x, y)
 
 
 @merged
@@ -313,7 +313,7 @@ def integrate_coefficients(K, unit, N, series, a):
 
 
 @merged
-def end_series(w, order, series):
+def finish_series(w, order, series):
     """Count the evaluations in w.counters; return DONE, or NOT_FINITE if `series` is not finite in its last order."""
     w.counters[N_EVALUATIONS] += order - 1
     n = series.size // (order + 1)
@@ -324,20 +324,20 @@ def end_series(w, order, series):
 
 
 @compiled
-def expand(f, w, options, memory, t, state, unit):
+def compute_coefficients(f, w, options, memory, t, state, unit):
     """Store the series with index TARGET about `state` at t, in the unit of time `unit` (s); return a code.
 
     The linear equations of each order are solved with the factors in w.
     """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
-    N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
-    series = series_of(memory, order, n, memory[TARGET])
+    N, X1, Y1, X2, Y2, total1, total2, r, c = array_views(options, memory, n, n_rows)
+    series = series_view(memory, order, n, memory[TARGET])
     A, LAM = 1 + 2 * n, 1 + 3 * n
     begin_early = LAM + n_rows
     begin_late = begin_early + _integer_array(options, EARLY + FIRST + COLUMN).size
     indices, constant = _integer_array(options, BALANCE + SUM_INDICES), _float_array(options, BALANCE + CONSTANT)
 
-    begin_series(options, t, unit, state, N, series, begin_early, X1[0], Y1[0], r, c)
+    start_series(options, t, unit, state, N, series, begin_early, X1[0], Y1[0], r, c)
     for k in range(order - 1):
         K = k + 1
         if K > 1:
@@ -346,7 +346,7 @@ def expand(f, w, options, memory, t, state, unit):
         _next_coefficients(options, EARLY, K, N[K], N[K, begin_early:], X1[K], Y1[K], X1[0], Y1[0], total1)
         _store_sums(options, ROWS, -K / unit, N[K], c)
         if k == 0:
-            begin_operations(options, LATE, N[0], N[0, begin_late:], X2[0], Y2[0])
+            start_operations(options, LATE, N[0], N[0, begin_late:], X2[0], Y2[0])
         else:
             sum_of_products(X2, Y2, k, total2)
             _next_coefficients(options, LATE, k, N[k], N[k, begin_late:], X2[k], Y2[k], X2[0], Y2[0], total2)
@@ -364,7 +364,7 @@ def expand(f, w, options, memory, t, state, unit):
         integrate_coefficients(K, unit, N, series, a)
         _fill_second_factors(options, EARLY, N[K], Y1[K])
         _fill_second_factors(options, LATE, N[k], Y2[k])
-    return end_series(w, order, series)
+    return finish_series(w, order, series)
 
 
 # distance from the constraints, relative to the largest distance that `departure` allows, at which a step should end
@@ -374,10 +374,12 @@ TARGET_DISTANCE = 0.3
 # times the defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
-GOLDEN = 0.6180339887498949  # golden section: fractional parts of its multiples are evenly distributed from 0 to 1
+GOLDEN_SECTION = (
+    0.6180339887498949  # golden section: fractional parts of its multiples are evenly distributed from 0 to 1
+)
 MAX_DEFECT = 1e300  # replaces an infinite defect, which is returned if a function has no finite value within the step
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
-GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
+MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
 TOO_SHORT = 2.0  # error returned to reject a first step because the series allows a much longer step
 
@@ -395,7 +397,7 @@ def _compute_series(f, w, options, memory, t, state, unit, which):
         code = f.general(f, w, EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
         if code != DONE:
             return code
-    return expand(f, w, options, memory, t, state, unit)
+    return compute_coefficients(f, w, options, memory, t, state, unit)
 
 
 @merged
@@ -479,7 +481,7 @@ def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
-    max_gap, shift = tolerances[LOOK], memory[ATTEMPTS] * GOLDEN % 1.0
+    max_gap, shift = tolerances[LOOK], memory[ATTEMPTS] * GOLDEN_SECTION % 1.0
     n_points = 0
     if h > max_gap:
         n_points = int(np.ceil(h / max_gap))
@@ -528,10 +530,12 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         memory[HAS_SERIES], memory[UNIT] = 1.0, h
         if estimated:
-            memory[ALLOWED_SIZE] = _allowed_step(tolerances, series_of(memory, order, n, memory[CURRENT]), h, order, n)
-            if memory[ALLOWED_SIZE] > GROWTH:
+            memory[ALLOWED_SIZE] = _allowed_step(
+                tolerances, series_view(memory, order, n, memory[CURRENT]), h, order, n
+            )
+            if memory[ALLOWED_SIZE] > MAX_GROWTH:
                 return Attempt(DONE, TOO_SHORT, min(memory[ALLOWED_SIZE], MAX_FIRST_FACTOR))
-    series, unit = series_of(memory, order, n, memory[CURRENT]), memory[UNIT]
+    series, unit = series_view(memory, order, n, memory[CURRENT]), memory[UNIT]
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if estimated:
@@ -563,9 +567,11 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(DONE, 0.0, 0.0)
     distance = departure(w, tolerances, h, q, v, q1)
     memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
-    if distance > 0.0:  # if GROWTH or a force ahead shortened the step, x / ALLOWED_SIZE counts as at least 1 / GROWTH
+    if (
+        distance > 0.0
+    ):  # if MAX_GROWTH or a force ahead shortened the step, x / ALLOWED_SIZE counts as at least 1 / MAX_GROWTH
         allowed_factor = (TARGET_DISTANCE / distance) ** (1.0 / order)
-        memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / GROWTH) * allowed_factor)
+        memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / MAX_GROWTH) * allowed_factor)
     if distance > 1.0:
         return Attempt(DONE, distance, allowed_factor)
     if checks_defect:
@@ -579,8 +585,8 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
-    series = series_of(memory, order, n, 1.0 - memory[CURRENT])
-    unit = min(memory[ALLOWED_SIZE] * unit, GROWTH * h) if estimated else h
+    series = series_view(memory, order, n, 1.0 - memory[CURRENT])
+    unit = min(memory[ALLOWED_SIZE] * unit, MAX_GROWTH * h) if estimated else h
     code = _compute_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[CURRENT])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
@@ -589,7 +595,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if estimated:
         memory[NEXT_ALLOWED_SIZE] = _allowed_step(tolerances, series, unit, order, n)
         distance_factor = memory[DISTANCE_FACTOR] if memory[DISTANCE_FACTOR] > 0.0 else 1.0
-        factor = min(distance_factor * memory[NEXT_ALLOWED_SIZE] * unit / h, GROWTH)
+        factor = min(distance_factor * memory[NEXT_ALLOWED_SIZE] * unit / h, MAX_GROWTH)
     return Attempt(DONE, max(error, distance), factor)
 
 
