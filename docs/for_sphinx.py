@@ -16,6 +16,7 @@ DOCS = ROOT / "docs"
 LINK = re.compile(r"(?<=\]\()(?!https?:|mailto:|#)([^)\s#]+)")  # the file of a relative link
 ORPHAN = "---\norphan: true\n---\n\n"  # no warning if a page is not in the menu
 ALL = ":members:"
+OF_MODELS = f"{ALL}\n:inherited-members:\n:exclude-members: assemble, bound, coordinate_of, mode, pull"
 # options of autodoc for what shows members; all others show their docstring
 MEMBERS = {
     "twoloop.impacts.joined.ArcSolution": ":members: __call__",
@@ -28,9 +29,9 @@ MEMBERS = {
     "twoloop.Integrator": ":members: run, start, step, result",
     "twoloop.Taylor": ":exclude-members: program",
     "twoloop.methods.tableaux": ALL,
-    "twoloop.bodies.PlanarModel": f"{ALL}\n:inherited-members:\n:exclude-members: put_together, mode, pull",
-    "twoloop.bodies.SpatialModel": f"{ALL}\n:inherited-members:\n:exclude-members: put_together, mode, pull",
-    "twoloop.bodies.model_problem.ModelProblem": ":members: place, with_parameters",
+    "twoloop.bodies.PlanarModel": OF_MODELS,
+    "twoloop.bodies.SpatialModel": OF_MODELS,
+    "twoloop.bodies.model_problem.ModelProblem": ":members: actuator_forces, joint_coordinate, place, with_parameters",
     "twoloop.bodies.parts.Body": ":members: coordinates, point, direction",
     "twoloop.symbolic.SymbolicMechanism": ":members: system, energy, with_parameters, problem",
     "twoloop.testing.KnownProblem": ":members: acceleration, reaction",
