@@ -73,7 +73,7 @@ from twoloop.kernels.linalg.dense import copy
 # error of a rejected step, in tolerances, above which a force is assumed to change suddenly within the step
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
-# number of accepted steps from which on a short next step ends the trial of a method: the first step size is a guess
+# number of accepted steps before a short next step can end the trial of a method, because the first size is a guess
 FIRST_JUDGED_STEP = 2
 
 
@@ -97,7 +97,7 @@ def start(f, w, t, state):
 
 @merged
 def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return JUMP, RAMP or SMOOTH for C_t and b within a step, and the beginning and end (s) of a jump or ramp."""
+    """Return JUMP, RAMP or SMOOTH for C_t and b within a step, and beginning and end (s) of the jump or ramp."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -205,7 +205,7 @@ def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
 
 @merged
 def _can_take_many(control, clock):
-    """Return whether the method may take many steps in one call, between which the loop checks nothing."""
+    """Return whether the method may take many steps in one call, without any checks by the loop between these steps."""
     if control[at.MAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:

@@ -77,10 +77,10 @@ GAP_TO_LOOK = 10  # ratio of tolerances[GAP] to tolerances[LOOK] if forces may c
 
 @exact
 def _first_step_size(state, n, t, span, smallest):
-    """Return the first step size (s), FIRST_STEP times the time in which coordinates change by max(max|q|, `smallest`).
+    """Return the first step size (s): FIRST_STEP times the time in which coordinates change by the largest |q|.
 
-    The result is at most FIRST_STEP times the duration `span` (s) of the run, and at least MIN_FIRST_STEP spacings of
-    floating-point numbers at t.
+    `smallest` is a lower bound of this |q|. The result is at most FIRST_STEP times the duration `span` (s) of the run,
+    and at least MIN_FIRST_STEP spacings of floating-point numbers at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -101,8 +101,8 @@ def _first_step_size(state, n, t, span, smallest):
 def _set_step_limits(control, tolerances, span, longest, within):
     """Store GAP and LOOK in `tolerances`, and MAX_STEP, APART and SPACING in `control`.
 
-    These limit the time between two evaluations of the equations to LONGEST_UNSEEN times the run's duration `span`. If
-    `within`, the method also evaluates the equations between its stages, and only `longest` (s) limits the step size.
+    They limit the time between two evaluations of the equations to LONGEST_UNSEEN times the duration `span` (s) of the
+    run. If `within`, the method evaluates the equations between its stages, too, and only `longest` (s) limits steps.
     """
     max_gap = LONGEST_UNSEEN * span
     tolerances[GAP], tolerances[LOOK] = max_gap, max_gap / (GAP_TO_LOOK if control[at.BY_STATE] > 0.0 else 1.0)
@@ -149,7 +149,8 @@ def split_steps(steps, counts, h, changes, used_newton):
 # UNUSUAL: Python must read the report, and may have to continue the run
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
-# arrays for runs that are repeated from different starts: to check a start, to choose rows, and to run. Among them are
+# arrays of runs that are repeated from different starts, for checks of a start, the choice of rows, and the run. Among
+# these arrays are
 # - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
 # - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
 # - `last_start`: the last start, see START; `start_rows`: indices of the independent rows at the last start
@@ -192,7 +193,7 @@ PLACE, N_KEPT, N_ADDED, KEPT = range(4)
 
 @merged
 def _has_same_choices(b):
-    """Choose rows and dependent coordinates at a start; return whether these are the choices of the generated code."""
+    """Choose rows and dependent coordinates at a start; return whether the generated code has the same choices."""
     b.scratch[0] = 0.0
     first_bound = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
@@ -315,12 +316,12 @@ def _restore_start(b):
 
 # indices in `last_start`. N_EQUAL: number of successive runs from this start, at most 2. START: index of [t, t1, q, v]
 N_EQUAL, START = 0, 1
-NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started; the data of the started run are saved
+NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started yet; the data of a run just started are saved
 
 
 @exact
 def _is_last_start(last_start, t, t1, q, v):
-    """Return whether the start (t, t1, q, v) equals that in `last_start` bit for bit; store it in `last_start`."""
+    """Return whether the start (t, t1, q, v) equals bit for bit the start in `last_start`, which it then replaces."""
     n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]

@@ -29,7 +29,8 @@ CHECKED_AT = (0.3, 0.7)  # times at which polynomials are checked, as fractions 
 N_CHECKED = len(CHECKED_AT)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# rounding error of q over the duration of the interval, in tolerances of v, above which v gets a polynomial of its own
+# v gets its own polynomial if the rounding error of q, divided by the duration of the interval, exceeds this number of
+# tolerances of v
 MAX_VELOCITY_ROUNDING = 10.0
 # pivot within an interval, relative to the larger one of the pivots at its ends, below which the position is singular
 SINGULAR_PIVOT_RATIO = 0.01
@@ -130,8 +131,8 @@ def _velocity_change(tolerances, v_before, v):
 def _is_singular(f, w, t, states, i, last, time, q, change):
     """Return whether q at `time` is so near a singular position that rounding errors explain `change`.
 
-    `change` is the change of velocities by the projection, in tolerances. The test of the pivot at q is described at
-    SINGULAR_PIVOT_RATIO and WEAK_PIVOT; i and `last` are the states at the ends of the interval.
+    `change` is the change of velocities by the projection, in tolerances. The pivot at q is compared with
+    SINGULAR_PIVOT_RATIO and WEAK_PIVOT; i and `last` are the indices of the states at the ends of the interval.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):

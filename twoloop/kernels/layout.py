@@ -233,7 +233,7 @@ def _layout(
         integers |= static_shapes[1]
         rows_of_G, mass_side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
         n_entries = rows_of_G * n_q
-    # names of the arrays for positions that velocities use, too, if there are no non-holonomic constraints
+    # names of arrays for positions that also serve for velocities if there are no non-holonomic constraints
     of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
     for name in of_positions:
         del integers[f"{name}_v"]
@@ -243,7 +243,7 @@ def _layout(
     of_integers, n_integers = _array_ranges(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + mass_side * mass_side, (mass_side, mass_side)
-    # number of integers at the end of `index` that are used only while the order of elimination is chosen
+    # number of integers at the end of `index` that only the choice of the order of elimination uses
     n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
     n_lasting = of_numbers["matrices"][0], of_integers["index"][1] - n_ordering
     if n_a == 0:

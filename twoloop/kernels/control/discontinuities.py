@@ -166,9 +166,8 @@ LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol ti
 # smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too
 # coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
-MIN_SAMPLES_IN_STEP = (
-    8.0  # least number of samples in a step: a force that acts for a quarter of the step may miss all stages
-)
+# least number of samples in a step: a force that acts for a quarter of the step may miss all stages
+MIN_SAMPLES_IN_STEP = 8.0
 RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one below which samples ahead are taken again
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
@@ -176,18 +175,15 @@ EQUAL_CHANGES = 1e-5  # largest time between two changes that count as one, rela
 # time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
 # at zero, such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
-MIN_STEEPNESS_RATIO = (
-    2.0  # smallest ratio of a sudden change to its neighbouring changes; on a smooth slope, the ratio is smaller
-)
+# smallest ratio of a sudden change to its neighbouring changes; on a smooth slope, the ratio is smaller
+MIN_STEEPNESS_RATIO = 2.0
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # largest change of an acceleration, relative to the largest acceleration, while a velocity changes by its tolerance: if
 # the change is larger, the acceleration decays, see _acceleration_lasts
 MAX_LASTING_CHANGE = 0.5
 CHANGE_MARGIN = 0.01  # a change up to this time after a step's beginning, in spacings of samples, counts as passed
-LARGEST_ROW = (
-    N_SAMPLES + 1
-)  # index of the row of w.changes with the largest absolute values so far; rows above: samples
+LARGEST_ROW = N_SAMPLES + 1  # index of the row of w.changes with the largest absolute values so far, after the samples
 MIDDLE_ROW = N_SAMPLES + 2  # index of the row of w.changes with values between two samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 

@@ -38,18 +38,16 @@ CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partitio
 # freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
-MAX_UNCHECKED_PIVOT = (
-    0.5  # pivot at an end of a step, relative to its largest value so far, below which the step is checked
-)
+# pivot at an end of a step, relative to its largest value so far, below which the step is checked
+MAX_UNCHECKED_PIVOT = 0.5
 # the smallest pivot counts as zero within a step if its smallest sample is below this fraction of its largest change
 # between two samples
 PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: smallest and largest result of near_pivot_ratio; MAX_ROUNDING_ERROR: allowed rounding
 # error, in tolerances; EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-MIN_END_RATIO = (
-    0.25  # static form: pivot at a step's end, relative to that at its start, below which the step is halved
-)
+# static form: pivot at a step's end, relative to that at its start, below which the step is halved
+MIN_END_RATIO = 0.25
 
 
 @merged

@@ -78,9 +78,8 @@ STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limi
 # needs finite differences, which take about eight evaluations per coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in its evaluations
-MIN_COST_IN_TRIALS = (
-    3.0  # least cost of the run, relative to the cost of a trial, at which a trial that may be in vain can begin
-)
+# least cost of the run, relative to the cost of a trial, at which a trial that may be in vain can begin
+MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
 # cost of the run, in units of MIN_COST_IN_TRIALS trials, at which a trial begins whatever the rates are; this number is
 # multiplied by k + 1 after k trials

@@ -4,11 +4,11 @@ An offset is the index of a number in this memory, which begins at an aligned ad
 numbers: one number for each unknown node, or one for each of eight steps that are projected together.
 """
 
-LANES = 8  # number of lanes: numbers in a group that is computed at once
+LANES = 8  # number of lanes, that is, of numbers that are computed at once
 ORDER = 12.0  # the error estimate is proportional to this power of the step size
 MAX_ROUNDING = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
-# codes: how the iteration of the stages ended. REFUSED: the step is rejected. GUESSED: the step size was a guess, and
-# must be replaced by another one. NOT_COMPUTED: accelerations at the nodes could not be computed
+# codes for the end of the iteration of the stages. REFUSED: the step is rejected. GUESSED: the step size was a guess,
+# and must be replaced by another guess. NOT_COMPUTED: accelerations at the nodes could not be computed
 CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
 
 (
@@ -21,7 +21,7 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     TRIED,  # 1: the polynomial that is not CURRENT is that of the attempted step
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     KEPT_DEGREE,  # value of DEGREE before a step was rejected, which a later step restores; 0: no step was rejected
-    MAY_GUESS,  # 1: the step size is a guess, to be replaced by another one if the contraction is far from its target
+    MAY_GUESS,  # 1: the step size is a guess, and is replaced if the contraction is far from its target
     CAREFUL,  # number of coming steps that use the elimination that begins with M
     STARTS,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
@@ -37,9 +37,9 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR,  # largest ratio of the next step size to this one that the convergence allows
     FACTOR_OF_ERROR,  # largest ratio of the next step size to this one that the error allows
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
-    ALLOWED_H,  # largest size of the last step that the error would have allowed, s
+    ALLOWED_H,  # largest size that the error would have allowed for the last step, s
     SIZE,  # largest sum of a velocity and its change in the step, relative to the tolerances
-    STRICTER,  # ratio of the largest of WEIGHTS to the largest of those of iterated coordinates
+    STRICTER,  # ratio of the largest entry of WEIGHTS to the largest entry that belongs to an iterated coordinate
 ) = range(28)
 # offsets of the arrays that follow the scalars
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE

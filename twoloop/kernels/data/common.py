@@ -26,9 +26,7 @@ from twoloop.kernels.data.indices import ATOL, ESTIMATE, FAULT_KIND, FAULT_TIME,
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
-INTEGERS_32 = types.int32[
-    ::1
-]  # type of long programs: 32-bit integers, so that a program fits in the processor's cache
+INTEGERS_32 = types.int32[::1]  # for long programs, which fit in the processor's cache as 32-bit integers
 
 # names of the programs in `Functions`: programs that replace missing callbacks (evaluation/operations.py), and programs
 # for sparse factors of large systems (linalg/symbolic_factorization.py, sparse_lu.py). A missing program has size 0
@@ -48,7 +46,7 @@ class Work(NamedTuple):
     """Arrays that an evaluation writes; allocated once per run.
 
     Sizes: n_q coordinates; n_c rows of C_q and n_a rows of A; r independent rows in C_q, r_v in C_q and A together;
-    n_dof = n_q - r_v. Fields that end in _v belong to velocities; without rows of A they are the arrays of positions.
+    n_dof = n_q - r_v. Fields that end in _v belong to velocities; without rows of A, they are the arrays for positions.
     """
 
     M: Any  # (n_q, n_q) mass matrix
@@ -56,17 +54,17 @@ class Work(NamedTuple):
     G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
     entries: Any  # view of `G` as a vector
     augmented: Any  # view of the memory of `G`, followed by that of `M`
-    S: Any  # (r_v, r_v) G M^-1 G^T of the independent rows, and its factors
-    W: Any  # (r_v, n_q) rows G M^-1 of the independent rows
+    S: Any  # (r_v, r_v) G M^-1 G^T, with the independent rows of G, and its factors
+    W: Any  # (r_v, n_q) G M^-1, with the independent rows of G
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
     D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T; last row: dependent velocities for v_i = 0; columns in elimination order
     Gx: Any  # (n_c + n_a, n_q) C_q and A at a displaced position (for Gamma by differences); scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) value of G from which S and W were computed, for constant M; NaN: not computed yet
-    pattern: Any  # (n_c + n_a, n_q) 1 where G has had a nonzero entry, else 0
-    mass_pattern: Any  # (n_q, n_q) 1 where M has had a nonzero entry, else 0; empty without the augmented form
+    pattern: Any  # (n_c + n_a, n_q) 1 for entries of G that have been nonzero, else 0
+    mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; empty without the augmented form
     places: Any  # (n_c + n_a + 1) index of the first entry of each row of G, then the columns of all entries
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the present step, and with the step tried before
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the present time step, and with the previous one
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b at later times, see discontinuities.py
     Q: Any  # (n_q) force
@@ -150,7 +148,7 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Compiled functions of a method: `attempt` computes a step, `settle` commits or discards it in the memory.
+    """Compiled functions of a method: `attempt` computes a step, `settle` accepts or discards the step in `memory`.
 
     `many` computes several steps in one call, and is None if the method has no such function.
     """
@@ -239,7 +237,7 @@ def _imported_modules(text: str) -> set[str]:
 
 @cache
 def source_digest(module: str) -> str:
-    """Return a digest of the callback signatures, and of the sources of a module and of all modules that it imports.
+    """Return a digest of the callback signatures and of the sources of a module and of all modules that it imports.
 
     `module`: name below twoloop.kernels, such as "steps.stages".
     """
@@ -291,7 +289,7 @@ OPTIONS: dict[str, Any] = {
 
 
 def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Return a decorator that compiles a function which only kernels call, not Python."""
+    """Return a decorator that compiles helpers: functions that kernels call, but not Python."""
     wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
@@ -303,7 +301,7 @@ exact = _helper_decorator(
 )  # keeps the order of floating-point operations as in the source
 compiled = _helper_decorator(forceinline=False)  # compiled as one function, which LLVM inlines only if it is short
 inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
-# inlined by LLVM, so that each call becomes a copy of the code: for short helpers, and for those of every evaluation
+# inlined by LLVM: each call becomes a copy of the code. For short helpers, and for helpers used in every evaluation
 merged = _helper_decorator(forceinline=True)
 
 
@@ -383,7 +381,7 @@ def finite(A):
 
 @compiled
 def not_finite(notes, kind, t, q):
-    """Store t and the kind of a callback with a non-finite value (-1 if q is not finite) in `notes`; return a code."""
+    """Store t, and the kind of the callback whose value is not finite (-1 if q is not), in `notes`; return a code."""
     notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
     notes[FAULT_TIME] = t
     return NOT_FINITE
@@ -391,7 +389,7 @@ def not_finite(notes, kind, t, q):
 
 @compiled
 def faulty_callback(w):
-    """Return the index in Functions of the callback that made an acceleration non-finite; -1: unknown."""
+    """Return the index in Functions of the callback due to which accelerations are not finite; -1: unknown."""
     n_c = w.C.size
     if not finite_vector(w.Rate[:n_c]):
         return RATE
@@ -406,7 +404,7 @@ def faulty_callback(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-SLACK = 1e-9  # excess of a step size over GAP, relative to GAP, that counts as a rounding error
+SLACK = 1e-9  # largest excess of a step size over GAP, relative to GAP, that counts as a rounding error
 
 
 @merged

@@ -6,7 +6,7 @@ the indices of one array; control/loop_state.py has the indices that only the lo
 
 from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
 
-# codes: DONE, or the reason why an evaluation or a step failed
+# codes that kernels return: DONE, or the reason why an evaluation or a step failed
 (
     DONE,
     OUTER_DIVERGED,
@@ -45,8 +45,8 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     N_ACCEPTED,
     N_REJECTED_ERROR,
     N_REJECTED_CONVERGENCE,
-    N_OUTER,  # iterations of the outer loop, for the stages of steps
-    N_INNER,  # iterations of the inner loop, for positions on the constraints
+    N_OUTER,  # number of iterations of the outer loop, which computes the stages of steps
+    N_INNER,  # number of iterations of the inner loop, which projects positions onto the constraints
     N_EVALUATIONS,
     N_PARTITIONS,
     N_FACTORIZATIONS,
@@ -65,18 +65,18 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to largest_difference_step
     GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_STEP_RATIO was chosen
     GAMMA_SCALE,  # largest entry of Gamma so far
-    REUSE,  # the factors of C_qd are not renewed if the last correction of positions is at most this
+    REUSE,  # largest last correction of positions after which the factors of C_qd are not renewed
     ROUNDED,  # rounding error of positions: value of REUSE for states that may be accepted
     GENERATION,  # number of partitions so far
-    RANK,  # rank of C_q, if it differs from the rank for which the workspace is allocated
-    RANK_V,  # rank of C_q and A together, if it differs from the rank for which the workspace is allocated
-    CONTRADICTION,  # index of a violated row that was considered redundant
+    RANK,  # rank of C_q, stored if it differs from the rank for which the workspace is allocated
+    RANK_V,  # rank of C_q and A together, stored if it differs from the rank for which the workspace is allocated
+    CONTRADICTION,  # index of a violated row that counted as redundant
     PIVOT,  # smallest pivot of the last full pivoting, with rows scaled to 1: small near a singular position
-    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check for singular positions
+    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check whether one is near
     NEAR_NOW,  # 1: the last check found a singular position nearby; 2: the next check must renew the partition first
     MASS_SCALE,  # factor on M in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
-    KNOWN,  # 1: w.Rate and w.Gamma[:n_c] are those of the current state, computed by the fused callback
+    KNOWN,  # 1: the fused callback has already computed w.Rate and w.Gamma[:n_c] for the current state
     BY_GENERAL,  # 1: the general inner loop computed the last state in place of the generated code
     EXPLICIT_STEP,  # 1: the last attempted step of a pair of methods was explicit
     DEFECT,  # largest defect of the attempted step, relative to the allowed defect; -1: not evaluated
@@ -85,7 +85,7 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     WIDEST_GAP,  # longest time between two evaluations within accepted steps, s
     KINK_BEFORE,  # time of the last known jump of C_t or b, s
     KINK_AFTER,  # time of the next known jump of C_t or b, s
-    LEANING,  # largest coefficient of an independent row in a redundant one, when this partition was chosen
+    LEANING,  # largest coefficient of an independent row in a redundant row, when the partition was chosen
     SMALLEST,  # static form: smallest squared sine of the angle of a row to previous rows, see linalg/sparse_ldl.py
     TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
     N_NOTES,
@@ -104,7 +104,7 @@ LONGEST_UNSEEN = 0.01  # value of GAP, relative to the duration of the run
 REPORTED_ERROR = 30.0  # largest error of velocities near a singular position, in tolerances, that is not reported
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
-# kinds of intervals between accepted states, for dense output: which values of the states the polynomials interpolate
+# kinds of intervals between accepted states, for dense output; they tell which data the polynomials interpolate
 (
     APART,  # q and v in one polynomial, v and a in another: errors of q and v are independent, and steps are small
     VELOCITIES,  # q and v in one polynomial and its derivative: a contains the noise of stiff modes

@@ -65,9 +65,8 @@ ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 # error of a rejected step, in tolerances, above which a force is assumed to jump within the step, as in advance.py
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step, as in advance.py
-END_ROUNDING = (
-    1e-10  # a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `size_off_grid`
-)
+# a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `size_off_grid`
+END_ROUNDING = 1e-10
 LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of the last failed step, as in `Plan`
 LIMIT_MEMORY = 10.0  # number of accepted steps after which H_LIMIT no longer applies, as in `Plan`
 LEAST_FIRST_STEP = 20.0 * SHORTEST  # smallest size of the first step, relative to |t0|

@@ -39,9 +39,8 @@ MAX_REDUNDANT = 1e-4  # eigenvalue of G G^T below which a combination of rows co
 # number of inverse iterations for each row of Z; few are enough, because the eigenvalues of redundant combinations of
 # rows are much smaller than the others
 N_REDUNDANT_ITERATIONS = 5
-GOLDEN_SECTION = (
-    0.6180339887498949  # fractional parts of its multiples are irregular start values of inverse iterations
-)
+# fractional parts of its multiples are irregular start values of inverse iterations
+GOLDEN_SECTION = 0.6180339887498949
 
 
 @merged

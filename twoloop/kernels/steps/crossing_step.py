@@ -65,9 +65,8 @@ MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a ste
 # smallest allowed ratio of the pivot at the end of a step to the pivot below which nodes are left out; the pivot may be
 # smaller if it is not smaller than at the beginning
 END_MARGIN = 4.0
-REPEAT_FACTOR = (
-    2.0  # error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
-)
+# error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
+REPEAT_FACTOR = 2.0
 TINY = 1e-300  # lower bound of divisors that may be zero
 
 
@@ -311,9 +310,8 @@ def state_at(memory, options, t):
     b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
     fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
-    weights = np.array(
-        [_lagrange_values(c, x) for x in (*(fraction * c), fraction)]
-    )  # values at the Gauss nodes of the interval from the beginning to t, then at t
+    # values of the Lagrange polynomials at the Gauss nodes of the interval from the beginning to t, and at t
+    weights = np.array([_lagrange_values(c, x) for x in (*(fraction * c), fraction)])
     weights_v = fraction * b @ weights[:-1]
     weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
     q, v = q_0 + duration * (fraction * v_0 + duration * (weights_q @ a)), v_0 + duration * (weights_v @ a)

@@ -899,9 +899,7 @@ def correct_stages(f, w, options, memory, s, residual, A_stage):
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)
     offset += N_EIGEN_SCALARS + s
-    corrections = block(
-        memory, s, n, Q_STAGE
-    )  # used as scratch: the stage positions are computed anew before their use
+    corrections = block(memory, s, n, Q_STAGE)  # used as scratch: stage positions are computed anew before their use
     corrections[:, :] = 0.0
     for k in range(n_systems):
         begin_row = offset + 2

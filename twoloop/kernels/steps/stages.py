@@ -294,7 +294,7 @@ def system_storage(w, n, k):
 
 @inlined
 def _storage_after_vectors(memory, s, n, k):
-    """Return a view (2 n) of `memory`, k n entries after the end of the vectors."""
+    """Return a view (2 n) of `memory` that begins k * n entries after the end of the vectors."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
