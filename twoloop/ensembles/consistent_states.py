@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_finite, check_indices
-from twoloop.ensembles.lanes import Integers, aligned, run_in_blocks, threads_of
-from twoloop.ensembles.starts import Starts, all_starts, generic_parameters, is_inconsistent, kit_to_write, system_of
+from twoloop.ensembles.lanes import Integers, aligned_zeros, run_in_blocks, threads_of
+from twoloop.ensembles.starts import Starts, all_starts, generic_parameters, is_inconsistent, system_of, writable_kit
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.problem.system import ConstrainedSystem, check_system
@@ -20,7 +20,7 @@ from twoloop.run.projection import ConsistentState, consistent_state
 if TYPE_CHECKING:
     from twoloop.generate.lane_code import GeneratedLanes, LaneConstraints
 
-MOST_ROWS = 200  # largest number of constraints for SIMD lanes, which use dense factors
+MAX_ROWS = 200  # largest number of constraints for SIMD lanes, which use dense factors
 SECONDS_PER_CALL = 0.01  # estimated time of one call of `consistent_state`, s
 
 
@@ -75,7 +75,7 @@ def consistent_states(
     t = check_finite("t", t)
     starts = all_starts(system, t, q, v, parameters, ("q", "v"))
     kept = [] if keep is None else check_indices("keep", keep, system.n_q)
-    moves = np.array([j not in kept for j in range(system.n_q)], dtype=np.int64)
+    may_change = np.array([j not in kept for j in range(system.n_q)], dtype=np.int64)
 
     def project_one(run: int) -> ConsistentState:
         try:
@@ -83,24 +83,26 @@ def consistent_states(
         except ValueError as error:
             raise ValueError(f"guess {run}: {error}") from error
 
-    fine = np.zeros(len(starts.q), dtype=bool)
+    is_valid = np.zeros(len(starts.q), dtype=bool)
     new_q, new_v = starts.q.copy(), starts.v.copy()
     with suppress(Untraceable):
         lanes = _LaneProjection(system, starts)
-        new_q, new_v, fine = lanes.project(starts, moves, 0)
-        left = np.flatnonzero(~fine)
-        for run in left[:1].tolist():  # redundant rows may be the reason: project one guess, to count them
+        new_q, new_v, is_valid = lanes.project(starts, may_change, 0)
+        remaining = np.flatnonzero(~is_valid)
+        for run in remaining[:1].tolist():  # redundant rows may be the reason: project one guess, to count them
             projected = project_one(run)
             n_redundant = system.n_c - len(projected.dependent)
             if n_redundant > 0:
-                new_q[left], new_v[left], fine[left] = lanes.project(starts.some(left), moves, n_redundant)
-            if not fine[run]:
-                new_q[run], new_v[run], fine[run] = *projected, True
+                new_q[remaining], new_v[remaining], is_valid[remaining] = lanes.project(
+                    starts.subset(remaining), may_change, n_redundant
+                )
+            if not is_valid[run]:
+                new_q[run], new_v[run], is_valid[run] = *projected, True
     # callbacks that were not traced may write beyond their arrays, which only single calls check: call traced ones only
-    traced = np.flatnonzero(fine)
+    traced = np.flatnonzero(is_valid)
     projections = Starts(t, new_q[traced], new_v[traced], starts.parameters[traced])
-    fine[traced] = ~is_inconsistent(kit_to_write(system), projections)
-    for run in np.flatnonzero(~fine).tolist():
+    is_valid[traced] = ~is_inconsistent(writable_kit(system), projections)
+    for run in np.flatnonzero(~is_valid).tolist():
         new_q[run], new_v[run] = project_one(run)
     return new_q, new_v
 
@@ -117,43 +119,43 @@ class _LaneProjection:
     def __init__(self, system: ConstrainedSystem, starts: Starts):
         if system.n_a > 0:
             raise Untraceable("it has nonholonomic rows")
-        if system.n_c > MOST_ROWS:
+        if system.n_c > MAX_ROWS:
             raise Untraceable("single calls have sparse matrices")
         generic, varying = generic_parameters(starts.parameters)
 
-        def make() -> GeneratedLanes[LaneConstraints]:
+        def generate() -> GeneratedLanes[LaneConstraints]:
             from twoloop.generate.lane_code import GeneratedLanes, LaneConstraints
 
-            record = ParameterTape(generic.tolist(), varying)
-            return GeneratedLanes(record, LaneConstraints(system, record.parameters))
+            tape = ParameterTape(generic.tolist(), varying)
+            return GeneratedLanes(tape, LaneConstraints(system, tape.parameters))
 
-        self._own = system.remembered_at(("starts", tuple(varying)), generic.tobytes(), make)
-        if self._own.seconds_to_build > SECONDS_PER_CALL * len(starts.q):
+        self._generated = system.remembered_at(("starts", tuple(varying)), generic.tobytes(), generate)
+        if self._generated.seconds_to_build > SECONDS_PER_CALL * len(starts.q):
             raise Untraceable("it is not worth the code for so few")
 
-    def project(self, starts: Starts, moves: Integers, n_redundant: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def project(self, starts: Starts, may_change: Integers, n_redundant: int) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Project guesses; return positions, velocities, and which of them are valid.
 
-        `moves`: 1 for coordinates that may change. `n_redundant`: number of constraints that depend on the others.
+        `may_change`: 1 for coordinates that may change. `n_redundant`: number of constraints that depend on the others.
         """
         from twoloop.kernels.lanes import layout
         from twoloop.kernels.lanes import starts as kernels
 
-        own, code, q, v = self._own, self._own.code, starts.q.copy(), starts.v.copy()
-        fine = np.zeros(len(q), dtype=np.int64)
+        generated, code, q, v = self._generated, self._generated.code, starts.q.copy(), starts.v.copy()
+        is_valid = np.zeros(len(q), dtype=np.int64)
         n, n_rows = code.n, code.n_rows
-        kit = layout.LaneKit(own.functions)
+        kit = layout.LaneKit(generated.functions)
         settings = np.array([n, n_rows, 0, 0, code.n_numbers, n_redundant], dtype=np.int64)
         control = np.concatenate([[starts.t0], np.zeros(layout.ATOL - 1 + n), code.numbers.values])
-        places = (
+        n_vectors = (
             layout.array_offsets(n, n_rows, code.n_numbers)[-1]
             + kernels.offsets_in_memory(n, n_rows, len(code.pattern) - n_rows - 1, n_redundant)[-1]
         )
 
-        def block(rows: slice) -> None:
-            room, numbers = aligned(places, layout.LANES), own.numbers(starts.parameters[rows])
-            given = code.pattern, moves, numbers, q[rows], v[rows]
-            kernels.start_lanes(kit, settings, control, *given, fine[rows], room)
+        def project_block(rows: slice) -> None:
+            workspace, numbers = aligned_zeros(n_vectors, layout.LANES), generated.numbers(starts.parameters[rows])
+            inputs = code.pattern, may_change, numbers, q[rows], v[rows]
+            kernels.start_lanes(kit, settings, control, *inputs, is_valid[rows], workspace)
 
-        run_in_blocks(block, len(q), threads_of(None))
-        return q, v, fine == 1
+        run_in_blocks(project_block, len(q), threads_of(None))
+        return q, v, is_valid == 1

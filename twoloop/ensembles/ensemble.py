@@ -15,7 +15,7 @@ from twoloop.ensembles.lanes import (
     IN_LANES,
     N_SHORT,
     REASONS,
-    SHORT,
+    SHORT_FORCE,
     LaneRuns,
     is_series_costly,
     lane_methods,
@@ -99,8 +99,8 @@ class Runs:
 
 Flags = NDArray[np.bool_]
 
-FAR = 1e5  # largest distance of a run in lanes from the first run, in tolerances, unless the motion is chaotic
-CALL = 1e-3  # time of a call of solve_dae without its steps, s
+MAX_DISTANCE = 1e5  # largest distance of a run in lanes from the first run, in tolerances, unless the motion is chaotic
+CALL = 1e-3  # time, s, that a call of solve_dae takes besides its steps
 # largest ratio of the time to compile to that of single runs; it may exceed 1, as code is cached for later calls
 MAX_COMPILATION = 20.0
 
@@ -123,10 +123,10 @@ class LaneEnsemble:
     methods : list of str
         Methods that integrated runs in lanes.
     method_of : ndarray (n_runs,)
-        Index in `methods` of the method that integrated each run; -1: none.
+        Index in `methods` of the method that integrated each run in lanes; -1: none.
     reasons : dict
         Why runs were left to `solve_dae`, by their numbers.
-    why : str
+    refusal : str
         Why no run was integrated in lanes, or none by the first method.
     deadline : float
         Time of `time.monotonic` at which runs stop; compilation delays it.
@@ -145,7 +145,7 @@ class LaneEnsemble:
     method_of: NDArray[np.int8] = field(init=False)
     methods: list[str] = field(default_factory=list)
     reasons: dict[int, str] = field(default_factory=dict)
-    why: str = ""
+    refusal: str = ""
     deadline: float = np.inf
 
     def __post_init__(self) -> None:
@@ -172,29 +172,31 @@ class LaneEnsemble:
             If a start is not consistent, naming the run.
         """
         stiff = (first.stats.n_jacobians or 0) > 0
-        involved = method == "auto" and not stiff and is_series_costly(generic_system(self.system, self.starts))
+        series_is_costly = method == "auto" and not stiff and is_series_costly(generic_system(self.system, self.starts))
         tolerances = self.rtol, float(self.atol.min())
-        for each in lane_methods(method, stiff, self.system.n_q, *tolerances, involved):
-            left = np.flatnonzero(~self.in_lanes)
-            if len(left) == 1:
+        for each in lane_methods(method, stiff, self.system.n_q, *tolerances, series_is_costly):
+            remaining = np.flatnonzero(~self.in_lanes)
+            if len(remaining) == 1:
                 break
             try:
                 began = time.monotonic()
                 lanes = LaneRuns(self.system, self.starts, each)
                 self.deadline += time.monotonic() - began
-                singly = len(left) * (first.stats.cpu_time + CALL)
-                if lanes.own.seconds_to_build > MAX_COMPILATION * singly:
-                    raise Untraceable(f"to compile them does not pay for these runs, which take about {singly:.2g} s")
-                self._integrate(lanes, left, first, threads)
+                time_singly = len(remaining) * (first.stats.cpu_time + CALL)
+                if lanes.generated.seconds_to_build > MAX_COMPILATION * time_singly:
+                    raise Untraceable(
+                        f"to compile them does not pay for these runs, which take about {time_singly:.2g} s"
+                    )
+                self._integrate(lanes, remaining, first, threads)
             except Untraceable as reason:
-                self.why = self.why or str(reason)
+                self.refusal = self.refusal or str(reason)
 
     def max_step(self, run: int) -> float:
-        """Return the largest step of a run that is integrated singly: short, if samples in lanes met a short force."""
-        return (self.t1 - self.starts.t0) / N_SHORT if self.reasons.get(run) == REASONS[SHORT] else np.inf
+        """Return the largest step size, s, of a run integrated singly: small if lanes found short forces in it."""
+        return (self.t1 - self.starts.t0) / N_SHORT if self.reasons.get(run) == REASONS[SHORT_FORCE] else np.inf
 
-    def _integrate(self, lanes: LaneRuns, which: Integers, first: Result, threads: int) -> None:
-        """Integrate the runs `which` in lanes.
+    def _integrate(self, lanes: LaneRuns, numbers: Integers, first: Result, threads: int) -> None:
+        """Integrate the runs with these numbers in lanes.
 
         Raises
         ------
@@ -202,32 +204,34 @@ class LaneEnsemble:
             If the first run does not end where it does by `solve_dae`.
         """
         starts, t1, times, rtol, atol = self.starts, self.t1, self.times, self.rtol, self.atol
-        for run in which[is_inconsistent(lanes.kit, starts)[which]].tolist():
+        for run in numbers[is_inconsistent(lanes.kit, starts)[numbers]].tolist():
             _check_start(self.system, starts, run)
-        within = times[times > starts.t0]
-        ends = within if within.size and within[-1] == t1 else np.append(within, t1)
-        q, v = np.full((2, len(which), self.system.n_q, len(ends)), np.nan)
-        status, steps, evaluations, at_end = lanes.integrate(which, t1, ends, rtol, atol, threads, q, v, self.deadline)
-        fine = lanes.check(which, status, t1, rtol, float(atol.min()), q, v, at_end)
-        if fine[0] and first.success:
+        inner_times = times[times > starts.t0]
+        output_times = inner_times if inner_times.size and inner_times[-1] == t1 else np.append(inner_times, t1)
+        q, v = np.full((2, len(numbers), self.system.n_q, len(output_times)), np.nan)
+        status, steps, evaluations, at_end = lanes.integrate(
+            numbers, t1, output_times, rtol, atol, threads, q, v, self.deadline
+        )
+        is_valid = lanes.find_valid_runs(numbers, status, t1, rtol, float(atol.min()), q, v, at_end)
+        if is_valid[0] and first.success:
             reference = first.q[:, -1:]
-            off = np.abs(q[0][:, ends == first.t[-1]] - reference)  # empty if `ends` has no such time
-            if (off > FAR * (atol[:, None] + rtol * np.abs(reference))).any():
-                raise Untraceable(f"the first run ends elsewhere by itself, {FAR:g} tolerances and more away")
-        fine[0] = False
-        n, runs = len(within), which[fine]
-        for states, own, start in ((self.q, q, starts.q), (self.v, v, starts.v)):
-            if len(which) == len(states):  # twice as fast as by indices
-                np.copyto(states[:, :, len(times) - n :], own[:, :, :n], where=fine[:, None, None])
+            deviations = np.abs(q[0][:, output_times == first.t[-1]] - reference)  # empty if there is no such time
+            if (deviations > MAX_DISTANCE * (atol[:, None] + rtol * np.abs(reference))).any():
+                raise Untraceable(f"the first run ends elsewhere by itself, {MAX_DISTANCE:g} tolerances and more away")
+        is_valid[0] = False
+        n, valid_runs = len(inner_times), numbers[is_valid]
+        for states, new_states, start in ((self.q, q, starts.q), (self.v, v, starts.v)):
+            if len(numbers) == len(states):  # twice as fast as by indices
+                np.copyto(states[:, :, len(times) - n :], new_states[:, :, :n], where=is_valid[:, None, None])
             else:
-                states[runs, :, len(times) - n :] = own[fine, :, :n]
+                states[valid_runs, :, len(times) - n :] = new_states[is_valid, :, :n]
             if n < len(times):
-                states[runs, :, 0] = start[runs]
-        self.n_steps[runs], self.n_evaluations[runs] = steps[fine], evaluations[fine]
-        self.method_of[runs] = len(self.methods)
+                states[valid_runs, :, 0] = start[valid_runs]
+        self.n_steps[valid_runs], self.n_evaluations[valid_runs] = steps[is_valid], evaluations[is_valid]
+        self.method_of[valid_runs] = len(self.methods)
         self.methods.append(lanes.method.name)
-        left = np.flatnonzero(~fine)
-        self.reasons |= {int(which[i]): REASONS[int(status[i])] for i in left.tolist() if which[i] > 0}
+        remaining = np.flatnonzero(~is_valid)
+        self.reasons |= {int(numbers[i]): REASONS[int(status[i])] for i in remaining.tolist() if numbers[i] > 0}
 
 
 def _check_start(system: ConstrainedSystem, starts: Starts, run: int) -> None:
@@ -237,24 +241,25 @@ def _check_start(system: ConstrainedSystem, starts: Starts, run: int) -> None:
     try:
         check_start(system_of(system, starts, run), starts.t0, starts.q[run], starts.v[run], derivatives=False)
     except ValueError as error:
-        raise of_run(run, error) from error
+        raise with_run_number(run, error) from error
 
 
-def of_run(run: int, error: ValueError) -> ValueError:
+def with_run_number(run: int, error: ValueError) -> ValueError:
     """Return the error of a single run with the number of the run, and with `consistent_states` in its advice."""
     return ValueError(f"run {run}: {error}".replace("twoloop.consistent_state(", "twoloop.consistent_states("))
 
 
-SHOWN = 5  # largest number of runs that a message names
-FIRST = "the first, which checks the system"  # reason for which the first run is not in lanes
-ROUNDS = 3  # number of times that runs are tried one at a time within a time limit
-# a run that is integrated singly may take this share of the remaining time, or this multiple of the longest run so far
-LARGEST_SHARE, TIMES = 0.1, 3.0
-FIRST_SHARE = 0.5  # largest share of the time limit that the first run takes
-NOT_ENDED = (
+MAX_LISTED = 5  # largest number of runs that a message names
+FIRST_RUN_REASON = "the first, which checks the system"  # reason for which the first run is not in lanes
+N_ROUNDS = 3  # number of attempts for a run that is integrated singly, with increasing time limits
+# smallest time limit of a single run: share of the remaining time, or multiple of the longest single run so far
+MAX_SHARE, MAX_MULTIPLE = 0.1, 3.0
+MAX_FIRST_SHARE = 0.5  # largest share of the time limit that the first run takes
+TIME_LIMIT_MESSAGE = (
     "time_limit ended before the run began or, in lanes, ended: raise it, loosen rtol and atol, or shorten t_span."
 )
-TIGHTER, TIGHT = 0.1, 1e-9  # factor on the tolerances of the first run, unless they are TIGHT or smaller already
+# factor on the tolerances of the first run; applied only to tolerances above TIGHT_TOLERANCE
+FIRST_RUN_FACTOR, TIGHT_TOLERANCE = 0.1, 1e-9
 
 
 def ensemble(
@@ -385,7 +390,7 @@ def _integrate(
     t0, t1 = check_span(t_span)
     if time_limit is not None:
         check_positive("time_limit", time_limit)
-    chosen = check_method(method)
+    method_object = check_method(method)
     check_positive("rtol", rtol)
     tolerance = check_tolerance("atol", atol, system.n_q)
     times = np.array([t0, t1]) if t_eval is None else check_times(t_eval, t0, t1, None)
@@ -394,10 +399,10 @@ def _integrate(
     runs = LaneEnsemble(system, starts, t1, times, float(rtol), tolerance)
     n_runs = len(starts.q)
     status = np.zeros(n_runs, dtype=np.int64)
-    options = {"rtol": float(rtol), "atol": tolerance, "t_eval": times, "method": chosen, "events": events}
+    options = {"rtol": float(rtol), "atol": tolerance, "t_eval": times, "method": method_object, "events": events}
     messages: dict[int, str] = {}
 
-    def single(run: int, max_step: float = np.inf, limit: float = np.inf) -> Result:
+    def solve_singly(run: int, max_step: float = np.inf, limit: float = np.inf) -> Result:
         limited = {"time_limit": limit} if limit < np.inf else {}
         result = _solve_one(system, starts, run, (t0, t1), options | {"max_step": max_step} | limited)
         if result.status is Status.INTERRUPTED:  # Ctrl-C ends all runs, as it does in lanes
@@ -411,45 +416,53 @@ def _integrate(
             messages[run] = result.message
         return result
 
-    may_go = events is None and method in IN_LANES and n_runs > 1
-    if may_go and float(rtol) > TIGHT and tolerance.min() > TIGHT:  # lanes are compared with the first run
-        options |= {"rtol": TIGHTER * float(rtol), "atol": TIGHTER * tolerance}
-    total = np.inf if time_limit is None else float(time_limit)
-    first = single(0, limit=total if n_runs == 1 else FIRST_SHARE * total)  # checks the system, derivatives and all
-    runs.deadline = time.monotonic() + total - min(first.stats.cpu_time, FIRST_SHARE * min(total, 1e9))
+    may_use_lanes = events is None and method in IN_LANES and n_runs > 1
+    # the first run, with which lanes are compared, gets smaller tolerances
+    if may_use_lanes and float(rtol) > TIGHT_TOLERANCE and tolerance.min() > TIGHT_TOLERANCE:
+        options |= {"rtol": FIRST_RUN_FACTOR * float(rtol), "atol": FIRST_RUN_FACTOR * tolerance}
+    total_time = np.inf if time_limit is None else float(time_limit)
+    # the first run checks the system and its derivatives
+    first = solve_singly(0, limit=total_time if n_runs == 1 else MAX_FIRST_SHARE * total_time)
+    runs.deadline = time.monotonic() + total_time - min(first.stats.cpu_time, MAX_FIRST_SHARE * min(total_time, 1e9))
     options |= {"rtol": float(rtol), "atol": tolerance}
     if events is not None:
-        runs.why = "events are looked for in single runs only"
+        runs.refusal = "events are looked for in single runs only"
     elif method not in IN_LANES:
-        runs.why = f"{chosen.name} does not go in lanes"
+        runs.refusal = f"{method_object.name} does not go in lanes"
     elif n_runs > 1:
         runs.integrate_in_lanes(str(method), first, n_threads)
     singly = ~runs.in_lanes
-    _share_time(np.flatnonzero(singly).tolist(), single, status, messages, runs)
-    reasons = {run: runs.reasons.get(run, runs.why) for run in np.flatnonzero(singly).tolist()}
-    if runs.methods or not runs.why:
-        reasons[0] = FIRST
-    message, counts = _message(status, runs, reasons), (runs.n_steps, runs.n_evaluations)
+    _share_time(np.flatnonzero(singly).tolist(), solve_singly, status, messages, runs)
+    reasons = {run: runs.reasons.get(run, runs.refusal) for run in np.flatnonzero(singly).tolist()}
+    if runs.methods or not runs.refusal:
+        reasons[0] = FIRST_RUN_REASON
+    message, counts = _summary(status, runs, reasons), (runs.n_steps, runs.n_evaluations)
     return Runs(times, runs.q, runs.v, status, *counts, singly, message, messages, reasons)
 
 
 def _share_time(
-    left: list[int], single: Callable[..., Result], status: Integers, messages: dict[int, str], runs: LaneEnsemble
+    run_numbers: list[int],
+    solve_singly: Callable[..., Result],
+    status: Integers,
+    messages: dict[int, str],
+    runs: LaneEnsemble,
 ) -> None:
     """Integrate runs one at a time; each has a share of the time limit, and later rounds share the rest."""
-    queue = [run for run in left if run > 0 or status[run] == Status.TIME_LIMIT]
+    queue = [run for run in run_numbers if run > 0 or status[run] == Status.TIME_LIMIT]
     limits, longest = dict.fromkeys(queue, 0.0), 0.0
-    for _ in range(ROUNDS):
-        for place, run in enumerate(queue):
+    for _ in range(N_ROUNDS):
+        for position, run in enumerate(queue):
             began = time.monotonic()
             remaining = runs.deadline - began
-            limit = min(remaining, max(remaining / (len(queue) - place), LARGEST_SHARE * remaining, TIMES * longest))
+            limit = min(
+                remaining, max(remaining / (len(queue) - position), MAX_SHARE * remaining, MAX_MULTIPLE * longest)
+            )
             if limit > 2.0 * limits[run]:  # each attempt starts from t0
                 limits[run] = limit
-                if single(run, runs.max_step(run), limit).success:
+                if solve_singly(run, runs.max_step(run), limit).success:
                     longest = max(longest, time.monotonic() - began)
             elif limits[run] == 0.0 and run > 0:
-                status[run], messages[run] = int(Status.TIME_LIMIT), NOT_ENDED
+                status[run], messages[run] = int(Status.TIME_LIMIT), TIME_LIMIT_MESSAGE
                 if runs.times[0] == runs.starts.t0:
                     runs.q[run, :, 0], runs.v[run, :, 0] = runs.starts.q[run], runs.starts.v[run]
         queue = [run for run in queue if status[run] == Status.TIME_LIMIT]
@@ -458,28 +471,30 @@ def _share_time(
 def _solve_one(
     system: ConstrainedSystem, starts: Starts, run: int, span: tuple[float, float], options: dict[str, Any]
 ) -> Result:
-    own = system_of(system, starts, run)
+    run_system = system_of(system, starts, run)
     try:
-        return solve_dae(own, span, starts.q[run], starts.v[run], **options)
+        return solve_dae(run_system, span, starts.q[run], starts.v[run], **options)
     except ValueError as error:
-        raise of_run(run, error) from error
+        raise with_run_number(run, error) from error
 
 
-def _message(status: Integers, runs: LaneEnsemble, reasons: dict[int, str]) -> str:
+def _summary(status: Integers, runs: LaneEnsemble, reasons: dict[int, str]) -> str:
     failed, n_runs = int((status < 0).sum()), len(status)
     reached = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
     by_reason: dict[str, list[int]] = {}
     for run, reason in reasons.items():
         by_reason.setdefault(reason, []).append(run)
-    if not runs.methods and FIRST not in by_reason:
+    if not runs.methods and FIRST_RUN_REASON not in by_reason:
         return f"{reached}; none went in lanes: {reasons[0]}."
     counts = ((name, int((runs.method_of == k).sum())) for k, name in enumerate(runs.methods))
     in_lanes = "".join(f"{count} in lanes by {name}, " for name, count in counts if count > 0)
-    others = "".join(f"; {_describe_numbers(runs)}: {reason}" for reason, runs in by_reason.items() if reason != FIRST)
-    return f"{reached}; {in_lanes}{len(reasons)} made singly: {FIRST}{others}."
+    others = "".join(
+        f"; {_describe_numbers(runs)}: {reason}" for reason, runs in by_reason.items() if reason != FIRST_RUN_REASON
+    )
+    return f"{reached}; {in_lanes}{len(reasons)} made singly: {FIRST_RUN_REASON}{others}."
 
 
 def _describe_numbers(runs: list[int]) -> str:
     """Describe how many runs are in a list, with the numbers of the first ones."""
-    numbers = ", ".join(map(str, runs[:SHOWN])) + (", ..." if len(runs) > SHOWN else "")
+    numbers = ", ".join(map(str, runs[:MAX_LISTED])) + (", ..." if len(runs) > MAX_LISTED else "")
     return f"run {numbers}" if len(runs) == 1 else f"{len(runs)} runs ({numbers})"

@@ -77,14 +77,14 @@ class Integrator:
         unknown = [name for name in options if name not in names]
         if unknown:
             raise TypeError(f"Integrator has no option {unknown[0]!r}; its options are {', '.join(sorted(names))}")
-        given = {name: options.get(name, parameters[name].default) for name in names - {"events"}}
-        check_options(system, method, rtol, atol, **given)
+        option_values = {name: options.get(name, parameters[name].default) for name in names - {"events"}}
+        check_options(system, method, rtol, atol, **option_values)
         check_events(options.get("events"))
         self.system = system
         self._options = {"method": check_method(method), "rtol": rtol, "atol": copy.copy(atol), **options}
         self._systems: dict[bytes, ConstrainedSystem] = {}
         self._sampled: SampledRun | None = None
-        self._started = system
+        self._started_system = system
 
     def run(
         self,
@@ -112,7 +112,7 @@ class Integrator:
         TypeError, ValueError
             As `solve_dae` and `ConstrainedSystem.with_parameters`.
         """
-        system = self.system if parameters is None else self._system_of(parameters)
+        system = self.system if parameters is None else self._system_with(parameters)
         return solve_dae(system, t_span, q0, v0, t_eval=t_eval, **self._options)
 
     def start(self, t0: float, q0: ArrayLike, v0: ArrayLike, parameters: ArrayLike | None = None) -> SampledState:
@@ -145,7 +145,7 @@ class Integrator:
         t0 = check_finite("t0", t0)
         n, rtol, max_step = self.system.n_q, self._options["rtol"], self._options.get("max_step", np.inf)
         check_positive("max_step", max_step, infinite=True)
-        self._started = self.system if parameters is None else self._system_of(parameters)
+        self._started_system = self.system if parameters is None else self._system_with(parameters)
         system = copy.copy(self.system)
         if self.system.parameters.size:
             system = self.system.with_parameters(self.system.parameters if parameters is None else parameters)
@@ -217,11 +217,11 @@ class Integrator:
         """
         if self._sampled is None:
             raise ValueError("result has the samples since a start: call integrator.start(t0, q0, v0) first")
-        record = replace(self._sampled.record(), system=self._started, method=self._options["method"].name)
+        record = replace(self._sampled.record(), system=self._started_system, method=self._options["method"].name)
         atol = check_tolerance("atol", self._options["atol"], self.system.n_q)
         return record_of(Result, vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
 
-    def _system_of(self, parameters: ArrayLike) -> ConstrainedSystem:
+    def _system_with(self, parameters: ArrayLike) -> ConstrainedSystem:
         system = self.system.with_parameters(parameters)
         cached = self._systems.setdefault(system.parameters.tobytes(), system)
         if len(self._systems) > MAX_SYSTEMS:

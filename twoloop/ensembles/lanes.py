@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from twoloop.checks.arguments import Array
-from twoloop.ensembles.starts import Starts, generic_parameters, generic_system, kit_to_write, system_of
+from twoloop.ensembles.starts import Starts, generic_parameters, generic_system, system_of, writable_kit
 from twoloop.generate.elimination import PivotChoice
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
@@ -57,8 +57,10 @@ class ForceSampling:
         self._tape = ParameterTape(values.tolist(), varying)
         equations = Equations(system, self._tape.parameters)
         graph = equations.graph
-        forms = np.concatenate([equations.of(kind).ravel() for kind in BY_TIME if kind in system.given])
-        self._program = Program(graph, {"": [x for x in forms if any(graph.inputs_of[i] & TIME for i in x.terms)]})
+        expressions = np.concatenate([equations.of(kind).ravel() for kind in BY_TIME if kind in system.given])
+        self._program = Program(
+            graph, {"": [x for x in expressions if any(graph.inputs_of[i] & TIME for i in x.terms)]}
+        )
 
     def has_short_forces(self, times: Array, rtol: float, parameters: Array, q: Array, v: Array) -> NDArray[np.bool_]:
         """Return a mask of the runs with a change that lasts less than two samples, or a value that is not finite.
@@ -85,31 +87,31 @@ def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
     """
     if not values.size:
         return np.zeros(values.shape[1], dtype=bool)
-    finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=(0, 2)))
-    values = np.where(finite[:, None], values, 0.0)
-    least = np.maximum(LEAST_VALUE, LEAST_RANGE * rtol * np.abs(values).max(axis=(0, 2)))
+    is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=(0, 2)))
+    values = np.where(is_finite[:, None], values, 0.0)
+    min_range = np.maximum(LEAST_VALUE, LEAST_RANGE * rtol * np.abs(values).max(axis=(0, 2)))
     size = N_PLACES + 1
     ranges = maximum_filter1d(values, size, axis=0) - minimum_filter1d(values, size, axis=0)
-    change, within = np.diff(values, axis=0), np.maximum(ranges[:-1], ranges[1:])
-    beside = np.zeros_like(change)
+    change, local_range = np.diff(values, axis=0), np.maximum(ranges[:-1], ranges[1:])
+    neighbour = np.zeros_like(change)
     direction = np.sign(change)
-    beside[1:] = change[:-1] * direction[1:]
-    beside[:-1] = np.maximum(beside[:-1], change[1:] * direction[:-1])
-    flanks = (
-        (np.abs(change) > SUDDEN_RATIO * within)
-        & (MIN_STEEPNESS_RATIO * beside < np.abs(change))
-        & (within > least[:, None])
+    neighbour[1:] = change[:-1] * direction[1:]
+    neighbour[:-1] = np.maximum(neighbour[:-1], change[1:] * direction[:-1])
+    is_flank = (
+        (np.abs(change) > SUDDEN_RATIO * local_range)
+        & (MIN_STEEPNESS_RATIO * neighbour < np.abs(change))
+        & (local_range > min_range[:, None])
     )
-    short = (flanks[:-1] & flanks[1:]).any(axis=(0, 2)) | (flanks[:-2] & flanks[2:]).any(axis=(0, 2))
-    return np.asarray(short | ~finite)
+    short = (is_flank[:-1] & is_flank[1:]).any(axis=(0, 2)) | (is_flank[:-2] & is_flank[2:]).any(axis=(0, 2))
+    return np.asarray(short | ~is_finite)
 
 
 # operations of a series per coordinate, from which on "auto" takes DOP853 (measured at 2, 11, 13), and the smallest
 # tolerance for which it does. Lanes need both: at an error of 1e-6, DOP853 takes 1.7 times as long on four-bars, series
 # over twice as long on the spatial slider-crank, where stages in a kernel take 1.5 times as long as generated ones
 COSTLY_SERIES, SMALLEST_FOR_DOP853 = 6.0, 1e-9
-STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # number of stages of the implicit methods
-IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that can run in lanes
+N_STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # number of stages of the implicit methods
+IN_LANES = ("auto", "Taylor", "DOP853", *N_STAGES)  # presets that can run in lanes
 
 
 @dataclass(frozen=True)
@@ -129,8 +131,8 @@ class LaneMethod:
         Numbers that the step kernel reads.
     tableau : tuple of ndarray or None
         For an explicit method with generated code: A, b, c and the weights of two error estimates.
-    unseen : float
-        Largest distance between evaluations in a step, relative to the step.
+    max_gap : float
+        Largest time between evaluations in a step, relative to the step size.
     step, memory : callable
         Functions that return the step kernel, and the size of its memory for given code, in vectors.
     """
@@ -143,7 +145,7 @@ class LaneMethod:
     step: Callable[[], Any]
     memory: Callable[[LaneCode], int]
     tableau: tuple[Array, Array, Array, Array, Array] | None = None
-    unseen: float = 1.0
+    max_gap: float = 1.0
 
 
 def is_series_costly(system: ConstrainedSystem) -> bool:
@@ -160,10 +162,12 @@ def is_series_costly(system: ConstrainedSystem) -> bool:
         return False
 
 
-def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, involved: bool = False) -> list[LaneMethod]:
+def lane_methods(
+    name: str, stiff: bool, n: int, rtol: float, atol: float, series_is_costly: bool = False
+) -> list[LaneMethod]:
     """Return the methods of a preset for n coordinates, in the order in which they are tried.
 
-    "auto" takes Taylor series, then DOP853; the other way round if series are `involved` and the tolerance is not below
+    "auto" takes Taylor series, then DOP853; the other way round if `series_is_costly` and the tolerance is not below
     SMALLEST_FOR_DOP853. For stiff motion it takes the Radau method of single runs, with order 5 at loose tolerances.
     """
     if name == "DOP853":
@@ -175,7 +179,7 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, invol
     tolerance = least_tolerance(rtol, atol)
     if not stiff:
         methods = [_taylor(rtol, atol), _dop853(n, rtol, atol)]
-        return methods[::-1] if involved and tolerance >= SMALLEST_FOR_DOP853 else methods
+        return methods[::-1] if series_is_costly and tolerance >= SMALLEST_FOR_DOP853 else methods
     radau = "RadauIIA5" if tolerance >= TIGHTEST else "RadauIIA9"
     return [_newton(radau, "positions", n, rtol, atol)]
 
@@ -217,10 +221,10 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 
         return memory_size(radau.stages, n)
 
-    radau = radau_iia(STAGES[name])
+    radau = radau_iia(N_STAGES[name])
     method = RungeKutta(radau, outer="newton", tested=tested)
-    for_derivatives = 2 * n + 1
-    return LaneMethod(name, False, radau.order, for_derivatives, _options(method, n, rtol, atol), step, memory)
+    n_for_derivatives = 2 * n + 1
+    return LaneMethod(name, False, radau.order, n_for_derivatives, _options(method, n, rtol, atol), step, memory)
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
@@ -232,15 +236,16 @@ def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-# smallest number of evaluations of the equations in a run: usually, and if forces may be short
+# smallest number of evaluations of the equations in a run: N_SHORT if forces may be short, else N_SAMPLES
 N_SAMPLES, N_SHORT = 100, 2000
-SMALLEST, LARGEST = 128, 4096  # limits of the number of runs in a block, whose coefficients are computed together
-BLOCKS_PER_THREAD = 3  # so that all threads end at about the same time
-# status of runs besides those in layout.py: a short force was met; the time limit ended before the run
-SHORT = min(layout.NO_START, layout.UNLIKE) - 1
-OUT_OF_TIME = SHORT - 1
-STOP_INTERVAL = 0.01  # time after which `stop` is called again, s, for runs that began meanwhile
-AGREES = 1e-7  # largest residual at the end of a run that is attributed to rounding, relative to its terms
+# limits of the number of runs in a block, whose coefficients are computed together
+MIN_BLOCK_RUNS, MAX_BLOCK_RUNS = 128, 4096
+BLOCKS_PER_THREAD = 3  # number of blocks of runs per thread; with 3, all threads end at about the same time
+# statuses of runs besides those in layout.py: SHORT_FORCE, a short force was found; OUT_OF_TIME, the time limit
+SHORT_FORCE = min(layout.NO_START, layout.UNLIKE) - 1
+OUT_OF_TIME = SHORT_FORCE - 1
+STOP_INTERVAL = 0.01  # time, s, between calls of `stop`, which are repeated as more runs may have begun
+MAX_RESIDUAL = 1e-7  # largest residual of the equations at the end of a valid run, relative to their terms
 
 REASONS = {  # reasons for which a run is left to `solve_dae`, by its status in layout.py
     layout.NO_START: "the code made for the first run does not hold at the start",
@@ -250,7 +255,7 @@ REASONS = {  # reasons for which a run is left to `solve_dae`, by its status in 
     layout.MANY_STEPS: "it takes more than 100,000 steps in lanes (stiff, or very fast motion)",
     layout.UNLIKE: "the callbacks do not agree with the code at the end (they branch)",
     OUT_OF_TIME: "the time limit ended before the run did, in lanes",
-    SHORT: "forces or drives change for so short a time that lanes may miss others",
+    SHORT_FORCE: "forces or drives change for so short a time that lanes may miss others",
 }
 
 
@@ -270,27 +275,27 @@ class LaneRuns:
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
-        self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
+        self.system, self.starts, self.method, self.kit = system, starts, method, writable_kit(system)
         generic, varying = generic_parameters(starts.parameters)
-        with_all_terms = generic_system(system, starts)
-        short_forces = may_be_short(with_all_terms, force_was_traced=True)
-        unseen = 1.0 if may_be_steep(with_all_terms, force_was_traced=True) else method.unseen
-        self.n_gaps = N_SHORT if any(short_forces) else N_SAMPLES * unseen  # smallest number of steps in a run
+        generic_copy = generic_system(system, starts)
+        short_forces = may_be_short(generic_copy, force_was_traced=True)
+        gap = 1.0 if may_be_steep(generic_copy, force_was_traced=True) else method.max_gap
+        self.n_gaps = N_SHORT if any(short_forces) else N_SAMPLES * gap  # smallest number of steps in a run
         self.sampling = ForceSampling(system, generic, varying) if short_forces.by_time else None
         choice = PivotChoice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # the latest code is cached
 
-        def make() -> GeneratedLanes[LaneCode]:
+        def generate() -> GeneratedLanes[LaneCode]:
             from twoloop.generate.lane_code import GeneratedLanes, LaneCode  # loads kernels: at the first ensemble
 
-            record = ParameterTape(generic.tolist(), varying)
-            return GeneratedLanes(record, LaneCode(system, choice, record.parameters, method.series, method.tableau))
+            tape = ParameterTape(generic.tolist(), varying)
+            return GeneratedLanes(tape, LaneCode(system, choice, tape.parameters, method.series, method.tableau))
 
-        self.own = system.remembered_at(kind, generic.tobytes(), make)
+        self.generated = system.remembered_at(kind, generic.tobytes(), generate)
 
     def integrate(
         self,
-        which: Integers,
+        numbers: Integers,
         t1: float,
         times: Array,
         rtol: float,
@@ -300,33 +305,33 @@ class LaneRuns:
         out_v: Array,
         deadline: float = np.inf,
     ) -> tuple[Integers, Integers, Integers, Array]:
-        """Integrate the runs `which`; return status (see layout.py), steps, evaluations, and rows [a, lam] at the end.
+        """Integrate the runs with these numbers; return status (see layout.py), steps, evaluations, and final rows [a, lam].
 
         States at `times` are written to `out_q` and `out_v`. Runs stop at the deadline, a time of `time.monotonic`.
         """
         from twoloop.kernels.lanes.control import MOST_STEPS
 
-        n_runs = len(which)
+        n_runs = len(numbers)
         status, n_steps, n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
         n_evaluations += 1  # the evaluation at the start
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
 
-        def block(rows: slice) -> None:
+        def integrate_block(rows: slice) -> None:
             out = out_q[rows], out_v[rows], ends[rows]
             counts = status[rows], n_steps[rows], n_evaluations[rows]
-            self._integrate(which[rows], t1, times, rtol, atol, out, counts)
+            self._integrate_block(numbers[rows], t1, times, rtol, atol, out, counts)
 
         def stop() -> None:
             """End the runs in all threads, as if they had taken MOST_STEPS steps."""
             n_steps[status == layout.UNDECIDED] = MOST_STEPS
 
-        if not run_in_blocks(block, n_runs, threads, deadline, stop):
+        if not run_in_blocks(integrate_block, n_runs, threads, deadline, stop):
             status[(status == layout.MANY_STEPS) | (status == layout.UNDECIDED)] = OUT_OF_TIME
         return status, n_steps, n_evaluations, ends
 
-    def _integrate(
+    def _integrate_block(
         self,
-        which: Integers,
+        numbers: Integers,
         t1: float,
         times: Array,
         rtol: float,
@@ -336,36 +341,40 @@ class LaneRuns:
     ) -> None:
         from twoloop.kernels.lanes import advance
 
-        starts, code, method = self.starts, self.own.code, self.method
+        starts, code, method = self.starts, self.generated.code, self.method
         n, n_rows = code.n, code.n_rows
-        numbers = self.own.numbers(starts.parameters[which])
+        run_parameters = self.generated.numbers(starts.parameters[numbers])
         begin = layout.array_offsets(n, n_rows, code.n_numbers)[-1]
-        room = aligned(begin + method.memory(code), layout.LANES)
-        kit = layout.LaneKit(self.own.functions, method.step())
+        workspace = aligned_zeros(begin + method.memory(code), layout.LANES)
+        kit = layout.LaneKit(self.generated.functions, method.step())
         redundant = bool(code.equations.redundant_rows.conditions)
         settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.n_gaps, rtol], atol, code.numbers.values])
-        given = np.ascontiguousarray(starts.q[which]), np.ascontiguousarray(starts.v[which])
-        arrays = times, numbers, *given, *out, *counts, room
+        inputs = np.ascontiguousarray(starts.q[numbers]), np.ascontiguousarray(starts.v[numbers])
+        arrays = times, run_parameters, *inputs, *out, *counts, workspace
         advance.advance_lanes(kit, settings, control, method.options, *arrays)
 
-    def agree(self, which: Integers, ended: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array) -> Flags:
+    def satisfies_equations(
+        self, numbers: Integers, has_ended: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array
+    ) -> Flags:
         """Return a mask of the runs that satisfy the equations, evaluated by the callbacks, at their end.
 
-        ended : runs to be checked; q, v : (n_runs, n, n_t), the last ones at the end; ends : rows [a, lam] there.
+        has_ended: mask of runs to check. q, v: (n_runs, n, n_t), up to the end. ends: rows [a, lam] at the end.
         """
         from twoloop.kernels.lanes.starts import motion_residuals
 
         n, n_c = self.system.n_q, self.system.n_c
-        room, worst = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(which), np.inf)
-        rows = np.where(ended, which, -1)
-        motion_residuals(*self.kit, t1, AGREES, atol, rows, self.starts.parameters, q, v, ends, room, worst)
-        agreed: Flags = worst <= 1.0
-        return agreed
+        workspace, residuals = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(numbers), np.inf)
+        rows = np.where(has_ended, numbers, -1)
+        motion_residuals(
+            *self.kit, t1, MAX_RESIDUAL, atol, rows, self.starts.parameters, q, v, ends, workspace, residuals
+        )
+        is_satisfied: Flags = residuals <= 1.0
+        return is_satisfied
 
-    def check(
+    def find_valid_runs(
         self,
-        which: Integers,
+        numbers: Integers,
         status: Integers,
         t1: float,
         rtol: float,
@@ -374,39 +383,39 @@ class LaneRuns:
         v: Array,
         ends: Array,
     ) -> Flags:
-        """Return a mask of the runs that have all states and agree with callbacks; set the status of the others."""
-        ended = status == layout.ENDED
-        finite = np.isfinite(q).all(axis=(1, 2))
-        fine = ended & finite
-        status[ended & ~finite] = layout.NO_STATE
-        agreed = self.agree(which, fine, t1, atol, q, v, ends)
-        status[fine & ~agreed] = layout.UNLIKE
-        fine &= agreed
+        """Return a mask of the runs that have all states and satisfy the callbacks; set the status of the others."""
+        has_ended = status == layout.ENDED
+        is_finite = np.isfinite(q).all(axis=(1, 2))
+        is_valid = has_ended & is_finite
+        status[has_ended & ~is_finite] = layout.NO_STATE
+        is_satisfied = self.satisfies_equations(numbers, is_valid, t1, atol, q, v, ends)
+        status[is_valid & ~is_satisfied] = layout.UNLIKE
+        is_valid &= is_satisfied
         if self.sampling is not None:
-            times, runs = np.linspace(self.starts.t0, t1, N_SHORT + 1), np.flatnonzero(fine)
-            given = self.starts.parameters[which[runs]], q[runs, :, -1], v[runs, :, -1]
-            short = runs[self.sampling.has_short_forces(times, rtol, *given)]
-            status[short], fine[short] = SHORT, False
-        return fine
+            times, runs = np.linspace(self.starts.t0, t1, N_SHORT + 1), np.flatnonzero(is_valid)
+            inputs = self.starts.parameters[numbers[runs]], q[runs, :, -1], v[runs, :, -1]
+            short = runs[self.sampling.has_short_forces(times, rtol, *inputs)]
+            status[short], is_valid[short] = SHORT_FORCE, False
+        return is_valid
 
 
 def run_in_blocks(
-    work: Callable[[slice], None],
+    task: Callable[[slice], None],
     n_runs: int,
     threads: int,
     deadline: float = np.inf,
     stop: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Call `work` for blocks of runs in threads; return whether all blocks ended before the deadline.
+    """Call `task` for blocks of runs in threads; return whether all blocks ended before the deadline.
 
-    At the deadline, or after an exception in this thread, `stop` must make `work` end.
+    `stop` is called at the deadline, or after an exception in this thread, and must make `task` end.
     """
     n_blocks = 1 if threads == 1 else BLOCKS_PER_THREAD * threads
-    size = int(np.clip(-(-n_runs // n_blocks), SMALLEST, LARGEST))
+    size = int(np.clip(-(-n_runs // n_blocks), MIN_BLOCK_RUNS, MAX_BLOCK_RUNS))
     blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
     stopped = False
     with ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(work, rows) for rows in blocks]
+        futures = [pool.submit(task, rows) for rows in blocks]
         try:
             while wait(
                 futures, None if deadline == np.inf else max(STOP_INTERVAL, deadline - time.monotonic())
@@ -422,16 +431,16 @@ def run_in_blocks(
     return not stopped
 
 
-def aligned(vectors: int, lanes: int) -> Array:
+def aligned_zeros(vectors: int, lanes: int) -> Array:
     """Return zeros at an address that is aligned to the size of a vector of lanes."""
     size = 8 * lanes
-    room = np.zeros(vectors * lanes + lanes)
-    first = -room.ctypes.data % size // 8
-    return room[first : first + vectors * lanes]
+    workspace = np.zeros(vectors * lanes + lanes)
+    first = -workspace.ctypes.data % size // 8
+    return workspace[first : first + vectors * lanes]
 
 
-def threads_of(wanted: int | None) -> int:
-    """Return the number of threads: `wanted`, else one for each core that this process may use."""
-    if wanted is not None:
-        return wanted
+def threads_of(requested: int | None) -> int:
+    """Return the number of threads: `requested`, else one for each core that this process may use."""
+    if requested is not None:
+        return requested
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

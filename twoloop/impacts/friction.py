@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
 Signs = list[int | None]  # for each joint its sliding direction, STICKS or IDLE
-STICKS, IDLE = 0, None  # held by its friction; held by stops and other joints already
-INDEPENDENT = 1e-9  # relative to a free joint: smallest compliance of a joint while the other joints are held
-AT_REST = 1e-10  # relative to the largest velocities of the last arc: smaller rates count as zero
-COUPLING_TOLERANCE = 1e-6  # tolerance of the coefficients by which one displacement follows from another
+STICKS, IDLE = 0, None  # states of a joint: held by its friction; held already by stops and other joints
+MIN_COMPLIANCE = 1e-9  # smallest compliance of a joint that can slide while others are held, relative to a free joint
+REST_RATE = 1e-10  # largest rate that counts as zero, relative to the largest velocities of the last arc
+COUPLING_TOLERANCE = 1e-6  # tolerance of coefficients, 0, 1 or -1, by which one displacement follows from others
 EVEN_WEIGHT = 1e-6  # relative weight of the regularisation that distributes a shared load evenly
-SOLVER_SCALE = 1e3  # scales the problem so that its gradients exceed the tolerance of the solver
+SOLVER_SCALE = 1e3  # factor on the equations, so that their gradients exceed the tolerance of the solver
 MAX_SOLVER_ITERATIONS = 1000
-MAX_LOAD_ITERATIONS = 200  # fixed-point iterations of the loads that bound the friction ...
-LOAD_TOLERANCE = 1e-10  # ... until they change by less, relative to the largest
-OUTSIDE = 1e-9  # relative: smaller components of rates and accelerations outside the range of D are rounding
-CLOSING_TOLERANCE = 1e-6  # relative: largest rate or acceleration at which a stop may still close
-SLIDING_TOLERANCE = 1e-9  # relative to the terms of an acceleration: smaller accelerations are rounding
+MAX_LOAD_ITERATIONS = 200  # largest number of fixed-point iterations for the loads that bound the friction
+LOAD_TOLERANCE = 1e-10  # change of the loads that ends these iterations, relative to the largest load
+MAX_OUTSIDE = 1e-9  # largest component of b outside the range of D that counts as rounding, relative to max|b|
+CLOSING_TOLERANCE = 1e-6  # largest acceleration (or rate) with which a stop may still close, relative to max|c|
+SLIDING_TOLERANCE = 1e-9  # largest acceleration that counts as rounding, relative to the sum of its terms
 
 
 class Undetermined(ValueError):
@@ -48,8 +48,8 @@ class Tangents(NamedTuple):
 def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
     """Return the velocity changes (n_q, k) by unit impulses: M X + G^T Y = W^T with G X = 0, for all constraints."""
     matrix, lengths, _ = scaled_equations(system, t, q)
-    right = np.vstack([W.T, np.zeros((len(lengths), len(W)))])
-    return np.asarray(np.linalg.lstsq(matrix, right, rcond=NEGLIGIBLE_RATIO)[0][: system.n_q], dtype=float)
+    right_side = np.vstack([W.T, np.zeros((len(lengths), len(W)))])
+    return np.asarray(np.linalg.lstsq(matrix, right_side, rcond=NEGLIGIBLE_RATIO)[0][: system.n_q], dtype=float)
 
 
 def solve_complementarity(D: Array, b: Array) -> Array:
@@ -59,7 +59,7 @@ def solve_complementarity(D: Array, b: Array) -> Array:
     """
     if not len(b):
         return np.zeros(0)
-    x = nnls(*_squares(D, b))[0]
+    x = nnls(*_least_squares_form(D, b))[0]
     # nnls finds the active set; the forces are then computed from D, without the rounding of its square root
     active = x > 0.0
     x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE_RATIO)[0]
@@ -73,17 +73,17 @@ def solve_bounded(D: Array, c: Array, n: int, limit: Array) -> Array:
     added with a small weight, so that a load that could be shared in any proportion is shared evenly.
     """
     tiny = np.finfo(np.float64).tiny
-    B, y = _squares(D, c)
+    B, y = _least_squares_form(D, c)
     size = np.sqrt(D.diagonal().max())
     # scale of the forces, so that the unknowns are of order 1
     unit = max(float(np.linalg.norm(y)) / size, NEGLIGIBLE_RATIO * float(limit.max()), tiny)
     bound = np.maximum(limit / unit, tiny)
     regularisation = np.zeros((len(limit), len(c)))
     regularisation[:, n:] = np.diag(EVEN_WEIGHT * np.sqrt(bound.min() / bound))
-    matrix, right = np.vstack([B / size, regularisation]), np.append(y / (size * unit), 0.0 * limit)
+    matrix, right_side = np.vstack([B / size, regularisation]), np.append(y / (size * unit), 0.0 * limit)
     limits = np.append(np.zeros(n), -bound), np.append(np.full(n, np.inf), bound)
     solution = lsq_linear(
-        SOLVER_SCALE * matrix, SOLVER_SCALE * right, limits, "bvls", tol=1e-14, max_iter=MAX_SOLVER_ITERATIONS
+        SOLVER_SCALE * matrix, SOLVER_SCALE * right_side, limits, "bvls", tol=1e-14, max_iter=MAX_SOLVER_ITERATIONS
     )
     x, free = solution.x, solution.active_mask == 0
     residual = (D @ x + c / unit)[free]  # due to the small weight
@@ -106,16 +106,16 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     n_tangents = len(tangents.normal)
     n = len(c) - len(limit) - n_tangents
     tangent_rows = np.arange(len(c) - n_tangents, len(c))
-    moving = tangents.sign != 0
-    unknown = np.setdiff1d(np.arange(len(c)), tangent_rows[moving])
+    is_sliding = tangents.sign != 0
+    unknown = np.setdiff1d(np.arange(len(c)), tangent_rows[is_sliding])
     x, tolerance = np.zeros(len(c)), NEGLIGIBLE_RATIO * np.abs(c).max(initial=0.0) / D.diagonal().max(initial=1e-300)
     for _ in range(MAX_LOAD_ITERATIONS):
-        new, load = np.zeros(len(c)), tangents.coefficient * x[tangents.normal]
-        new[tangent_rows] = -tangents.sign * load
-        right, bounds = (c + D @ new)[unknown], np.append(limit, load[~moving])
+        new_x, load = np.zeros(len(c)), tangents.coefficient * x[tangents.normal]
+        new_x[tangent_rows] = -tangents.sign * load
+        right_side, bounds = (c + D @ new_x)[unknown], np.append(limit, load[~is_sliding])
         D_kept = D[np.ix_(unknown, unknown)]
-        new[unknown] = holding_forces(D_kept, right, n, bounds)
-        change, x = np.abs(new - x).max(), new
+        new_x[unknown] = holding_forces(D_kept, right_side, n, bounds)
+        change, x = np.abs(new_x - x).max(), new_x
         if change <= LOAD_TOLERANCE * np.abs(x).max() + tolerance:
             break
     else:
@@ -125,32 +125,32 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
         raise Undetermined("stops push against each other: no motion opens all of them or keeps them closed")
     if not n_tangents:
         return x, np.zeros(0, dtype=int)
-    starts = np.sign(acceleration) * (np.abs(acceleration) > SLIDING_TOLERANCE * terms)
-    slides = np.where(moving, tangents.sign, starts[tangent_rows]).astype(int)
+    acceleration_signs = np.sign(acceleration) * (np.abs(acceleration) > SLIDING_TOLERANCE * terms)
+    slides = np.where(is_sliding, tangents.sign, acceleration_signs[tangent_rows]).astype(int)
     return _solve_contacts(D, c, x, n, tangents._replace(sign=slides)), slides
 
 
 def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) -> Array:
     """Solve the linear equations of contacts whose states are known; forces of joints remain unchanged."""
     tangent_rows = np.arange(len(c) - len(tangents.normal), len(c))
-    pushes = np.append(x[:n] > 0.0, np.zeros(len(c) - n, dtype=bool))
+    is_pushing = np.append(x[:n] > 0.0, np.zeros(len(c) - n, dtype=bool))
     loads = np.zeros((len(c), len(c)))  # x = loads y, where y are forces of stops and friction at rest
-    loads[pushes, pushes] = 1.0
-    loads[tangent_rows, tangents.normal] = -tangents.sign * tangents.coefficient * pushes[tangents.normal]
-    holds = pushes.copy()
-    holds[tangent_rows] = (tangents.sign == 0) & pushes[tangents.normal]
-    loads[holds, holds] = 1.0
-    A = (D @ loads)[np.ix_(holds, holds)]
+    loads[is_pushing, is_pushing] = 1.0
+    loads[tangent_rows, tangents.normal] = -tangents.sign * tangents.coefficient * is_pushing[tangents.normal]
+    is_held = is_pushing.copy()
+    is_held[tangent_rows] = (tangents.sign == 0) & is_pushing[tangents.normal]
+    loads[is_held, is_held] = 1.0
+    A = (D @ loads)[np.ix_(is_held, is_held)]
     if np.linalg.eigvals(A).real.min(initial=0.0) < -NEGLIGIBLE_RATIO * np.abs(A).max(initial=0.0):
         raise Undetermined("friction of stops is so large that their forces are not unique (P. Painlevé): they may jam")
-    fixed = np.where(pushes, 0.0, x)
+    fixed = np.where(is_pushing, 0.0, x)
     fixed[tangent_rows] = 0.0
     y = np.zeros(len(c))
-    y[holds] = np.linalg.lstsq(A, -(c + D @ fixed)[holds], rcond=NEGLIGIBLE_RATIO)[0]
+    y[is_held] = np.linalg.lstsq(A, -(c + D @ fixed)[is_held], rcond=NEGLIGIBLE_RATIO)[0]
     return np.asarray(loads @ y + fixed)
 
 
-def _squares(D: Array, b: Array) -> tuple[Array, Array]:
+def _least_squares_form(D: Array, b: Array) -> tuple[Array, Array]:
     """Return B and y with B^T B = D and B^T y = -b.
 
     With dependent rows of stops, b may have a component outside the range of D, for example if parallel stops close at
@@ -158,7 +158,7 @@ def _squares(D: Array, b: Array) -> tuple[Array, Array]:
     """
     values, vectors = np.linalg.eigh(0.5 * (D + D.T))
     components, threshold = vectors.T @ b, NEGLIGIBLE_RATIO * values.max(initial=0.0)
-    significant = (values > threshold) | (np.abs(components) > OUTSIDE * np.abs(b).max(initial=0.0))
+    significant = (values > threshold) | (np.abs(components) > MAX_OUTSIDE * np.abs(b).max(initial=0.0))
     roots = np.sqrt(np.maximum(values[significant], threshold))
     return roots[:, None] * vectors[:, significant].T, -components[significant] / roots
 
@@ -182,8 +182,8 @@ class Modes:
     """Provide the system of each contact mode; this base class has one system without friction, in a single mode."""
 
     def __init__(self, system: ConstrainedSystem):
-        self.system, self.n = system, 0
-        self.static = self.kinetic = np.zeros(0)
+        self.system, self.n_joints = system, 0
+        self.static_friction = self.kinetic_friction = np.zeros(0)
         self.idle_friction: dict[int, float] = {}  # constant friction of IDLE joints
 
     def gradients(self, q: Array, k: int | None = None) -> Array:
@@ -198,7 +198,7 @@ class Modes:
         """Return the accelerations of joints at rest: none."""
         return np.zeros(0)
 
-    def system_of(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
+    def mode_system(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
         """Return the system; there are no rows of sticking joints."""
         return self.system, {}
 
@@ -222,8 +222,9 @@ class FrictionModes(Modes):
         super().__init__(problem.system)
         self._problem, self._model, self._frictions = problem, problem.model, problem.model.dry
         self._names = [friction.name for friction in self._frictions]
-        self.n, self.static = len(self._frictions), np.array([friction.static for friction in self._frictions])
-        self.kinetic = np.array([friction.kinetic for friction in self._frictions])
+        self.n_joints = len(self._frictions)
+        self.static_friction = np.array([friction.static for friction in self._frictions])
+        self.kinetic_friction = np.array([friction.kinetic for friction in self._frictions])
         self._forces = [self._model.pull(friction, problem.parameters) for friction in self._frictions]
         self._sliding_systems: dict[tuple[int | None, ...], ConstrainedSystem] = {}
         self._check_independent(problem.t_span[0], problem.q0)
@@ -231,7 +232,7 @@ class FrictionModes(Modes):
     def gradients(self, q: Array, k: int | None = None) -> Array:
         """Return the gradients of the joint displacements, (n, n_q); or of one joint, (n_q,)."""
         if k is None:
-            return np.array([self.gradients(q, joint) for joint in range(self.n)])
+            return np.array([self.gradients(q, joint) for joint in range(self.n_joints)])
         return self._forces[k].force(0.0, q, np.zeros_like(q))
 
     def _check_independent(self, t: float, q: Array) -> None:
@@ -242,7 +243,7 @@ class FrictionModes(Modes):
         for k, friction in enumerate(self._frictions):
             D_before = D[:k, :k]
             compliance = D[k, k] - D[k, :k] @ np.linalg.lstsq(D_before, D[:k, k], rcond=NEGLIGIBLE_RATIO)[0]
-            if not compliance > INDEPENDENT * scale[k]:
+            if not compliance > MIN_COMPLIANCE * scale[k]:
                 others = ", ".join(map(repr, self._names[:k]))
                 raise ValueError(
                     f"the joint of {friction.name!r} cannot slide by itself: drives or other joints hold it"
@@ -261,11 +262,11 @@ class FrictionModes(Modes):
         """Return the accelerations of joints at rest for given accelerations a of the coordinates."""
         if not resting:
             return np.zeros(0)
-        system, rows = self.system_of(signs, t, q)
+        system, rows = self.mode_system(signs, t, q)
         R, gamma = system.jacobian(t, q), system.gamma(t, q, v)
         return np.array([self.row_sign(k, system, rows[k], t, q) * (R[rows[k]] @ a - gamma[rows[k]]) for k in resting])
 
-    def system_of(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
+    def mode_system(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
         """Return the system with some joints sliding and the others held in place, and the rows of the latter."""
         if not {STICKS, IDLE} & set(signs):
             return self.sliding_system(signs, t, q), {}
@@ -287,7 +288,7 @@ class FrictionModes(Modes):
     def _build(
         self, name: str, signs: Signs, positions: dict[str, float], t: float, q: Array
     ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
-        forces = {name: -(signs[k] or 0) * self.kinetic[k] for k, name in enumerate(self._names)}
+        forces = {name: -(signs[k] or 0) * self.kinetic_friction[k] for k, name in enumerate(self._names)}
         forces |= {self._names[k]: self.idle_friction[k] for k, sign in enumerate(signs) if sign is IDLE}
         return self._model.mode(name, self._problem.parameters, forces, positions, t, q)
 
@@ -298,21 +299,21 @@ class Mode(NamedTuple):
     Attributes
     ----------
     signs : list
-    resting : tuple of int
-    slips : dict
-        Direction of sliding by stop.
-    sticks : dict
+    closed_stops : tuple of int
+    sliding_stops : dict
+        Direction of sliding (1 or -1) by stop.
+    sticking_groups : dict
         Groups of stops that stick together, by one stop of each group.
     """
 
     signs: Signs
-    resting: tuple[int, ...] = ()
-    slips: dict[int, int] = {}  # noqa: RUF012
-    sticks: dict[int, list[int]] = {}  # noqa: RUF012
+    closed_stops: tuple[int, ...] = ()
+    sliding_stops: dict[int, int] = {}  # noqa: RUF012
+    sticking_groups: dict[int, list[int]] = {}  # noqa: RUF012
 
 
 class StopFriction:
-    """Track which stops of a motion slide or stick.
+    """Record of the stops that slide or stick in a motion.
 
     Parameters
     ----------
@@ -323,20 +324,20 @@ class StopFriction:
     def __init__(self, stops: Sequence[Stop], t: float, q: Array):
         self._stops = stops
         with_friction = [k for k, stop in enumerate(stops) if stop.friction > 0.0]
-        self.place = {k: i for i, k in enumerate(with_friction)}
+        self.slide_index = {k: i for i, k in enumerate(with_friction)}
         self.slides = Gaps("slide", [stops[k] for k in with_friction], t, q)
-        self.still: set[int] = set()  # stops that have come to rest or stick
-        self.released: set[int] = set()  # stops that stuck in the last arc
+        self.resting_stops: set[int] = set()  # stops that have come to rest or stick
+        self.released_stops: set[int] = set()  # stops that stuck in the last arc
 
-    def rows(
+    def contact_rows(
         self, closed: Sequence[int], t: float, q: Array, v: Array, speeds: Array
     ) -> tuple[list[int], Gap, Tangents]:
         """Return which of the closed stops have friction, their displacements, and how they slide."""
-        stops = [k for k in closed if k in self.place]
-        slides = Gap(*(part[[self.place[k] for k in stops]] for part in self.slides.at(t, q, v)))
-        at_rest = np.array([k in self.still or k in self.released for k in stops], dtype=bool)
-        moves = ~at_rest & (np.abs(slides.u) > AT_REST * (np.abs(slides.W) @ speeds))
-        signs = (np.sign(slides.u) * moves).astype(int)
+        stops = [k for k in closed if k in self.slide_index]
+        slides = Gap(*(part[[self.slide_index[k] for k in stops]] for part in self.slides.at(t, q, v)))
+        at_rest = np.array([k in self.resting_stops or k in self.released_stops for k in stops], dtype=bool)
+        is_sliding = ~at_rest & (np.abs(slides.u) > REST_RATE * (np.abs(slides.W) @ speeds))
+        signs = (np.sign(slides.u) * is_sliding).astype(int)
         normals = np.array([list(closed).index(k) for k in stops], dtype=int)
         return stops, slides, Tangents(normals, np.array([self.coefficient(k) for k in stops]), signs)
 
@@ -344,13 +345,13 @@ class StopFriction:
         """Return the coefficient of friction of a stop."""
         return self._stops[k].friction
 
-    def groups(self, D: Array, base: list[int], rows: dict[int, int]) -> dict[int, list[int]]:
+    def sticking_groups(self, D: Array, base: list[int], rows: dict[int, int]) -> dict[int, list[int]]:
         """Return stops that stick, in groups with one displacement; D has the rows `base`, and `rows` by stop."""
         groups: dict[int, list[int]] = {}
         first: dict[int, int] = {}  # first stop of a group by its row
         for k, row in rows.items():
             weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE_RATIO)[0]
-            if D[row, row] - D[row, base] @ weights > INDEPENDENT * D[row, row]:
+            if D[row, row] - D[row, base] @ weights > MIN_COMPLIANCE * D[row, row]:
                 base.append(row)
                 groups[k], first[row] = [k], k
                 continue
@@ -365,6 +366,6 @@ class StopFriction:
 
     def update(self, mode: Mode, ended: set[int]) -> None:
         """Update which stops came to rest or were released; `ended`: stops whose events ended the arc."""
-        self.released = {k for stop, group in mode.sticks.items() if stop in ended for k in group}
-        self.still = {k for stop, group in mode.sticks.items() if stop not in ended for k in group}
-        self.still |= mode.slips.keys() & ended
+        self.released_stops = {k for stop, group in mode.sticking_groups.items() if stop in ended for k in group}
+        self.resting_stops = {k for stop, group in mode.sticking_groups.items() if stop not in ended for k in group}
+        self.resting_stops |= mode.sliding_stops.keys() & ended

@@ -14,7 +14,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics, Status, failure_link
 
-CHANGES = "velocities jumped in impacts, or stops were closed or joints stuck for a while"
+CHANGES_NOTE = "velocities jumped in impacts, or stops were closed or joints stuck for a while"
 
 
 class Impact(NamedTuple):
@@ -139,7 +139,7 @@ def join_arcs(
     counts: dict[str, Any] = {
         name: _concatenated(arcs, name) for name in ("rejected_error", "rejected_convergence", "partitioned")
     }
-    changes = CHANGES if impacts or any(arc.system is not system for arc in arcs) else ""
+    changes = CHANGES_NOTE if impacts or any(arc.system is not system for arc in arcs) else ""
     t, q, v, a, lam = table
     return Result(
         *(t, q, v, a, lam),

@@ -22,10 +22,10 @@ from twoloop.checks.arguments import (
 )
 from twoloop.impacts.contact import Accelerations, ContactSystem, Gap, Gaps
 from twoloop.impacts.friction import (
-    AT_REST,
     IDLE,
-    INDEPENDENT,
+    MIN_COMPLIANCE,
     NEGLIGIBLE_RATIO,
+    REST_RATE,
     STICKS,
     FrictionModes,
     Mode,
@@ -55,24 +55,24 @@ from twoloop.solve import solve_dae
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
-REBOUND_HEIGHT = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
-SAMPLES = 2000  # smallest number of evaluations of gaps, forces and rates of sliding over a motion
-CLOSED = 1e3  # squared rate over (REBOUND_HEIGHT times acceleration) below which a stop may press against others
-ROUNDING = 1e-13  # relative to max(1, |q|)
-LEAST_STEP = 1e-9  # first step of an arc, relative to max(1 s, t)
-ZERO = 1e-20  # m or rad, or per s: smaller coordinates and rates are rounding errors
-STALLED = 1e-13  # relative to max(1 s, t): shorter arcs count as stalled ...
-MAX_STALLED = 30  # ... and this many stalled arcs in a row end the motion
-RELEASED = 1e-7  # relative reduction of the static friction of a joint just released, which prevents chattering
-MARGIN = 1e-9  # relative: margin of a joint held by its full friction
-EQUAL_GAPS = 4e-15  # relative to max(1, |q|): gaps of stops that close at once differ by less, because of rounding
-TIED_GAPS = 0.01  # in heights REBOUND_HEIGHT: the tolerance does not determine the order of gaps that differ by less
-MAX_DISPLACEMENT = 10.0  # in heights REBOUND_HEIGHT: motion during a sequence followed without integration
-MAX_GAP = 1e4  # in heights REBOUND_HEIGHT: largest gap of a stop that such a sequence may reach
-LEAST_RATE = 1e-13  # relative to the velocities: smaller rates in such a sequence are rounding errors
-MAX_DIFFERENCE = 1e-6  # relative to the velocities: larger differences between two laws of impact count
+REBOUND_HEIGHT = 0.01  # height of a rebound, relative to atol, below which the stop stays closed
+MIN_EVALUATIONS = 2000  # smallest number of evaluations of gaps, forces and rates of sliding in a motion
+PRESSED_RATIO = 1e3  # squared rate, over (rebound height times acceleration), up to which stops may press together
+ROUNDING = 1e-13  # rounding errors of gaps and rates, relative to max(1, |q|)
+FIRST_STEP_RATIO = 1e-9  # smallest first step size of an arc, relative to max(1 s, t)
+NEGLIGIBLE_VALUE = 1e-20  # coordinate (m or rad) or rate (m/s or rad/s) below which it is a rounding error
+MAX_STALLED_TIME = 1e-13  # longest duration of a stalled arc, relative to max(1 s, t)
+MAX_STALLED_ARCS = 30  # number of stalled arcs in a row that ends the motion
+RELEASE_REDUCTION = 1e-7  # relative reduction of the static friction of a joint just released, against chattering
+STICKING_MARGIN = 1e-9  # relative tolerance in comparing the friction that a joint needs with what is available
+EQUAL_GAPS = 4e-15  # largest difference of gaps that close at once, due to rounding, relative to max(1, |q|)
+TIED_GAPS = 0.01  # largest gap, in rebound heights, of stops whose order of closing the tolerance leaves open
+MAX_DISPLACEMENT = 10.0  # largest motion, in rebound heights, in a sequence of impacts that is not integrated
+MAX_GAP = 1e4  # largest gap, in rebound heights, of stops in a sequence of impacts
+MIN_RATE_RATIO = 1e-13  # smallest rate in a sequence of impacts, relative to the velocities; smaller: rounding
+MAX_DIFFERENCE = 1e-6  # largest difference between two laws of impact that does not count, relative to velocities
 TOUCHING_EVENT = "an impact reaches stops that touch"
-MAX_LISTED = 100  # longest sequence of impacts that are listed one by one
+MAX_LISTED = 100  # largest number of impacts of a sequence that are listed one by one
 LAWS = ("moreau", "sequential")
 
 
@@ -103,22 +103,24 @@ class Motion:
     ):
         self.system, self.modes, self.stops, self.options = modes.system, modes, list(stops), options
         self.t, self.q, self.v = t, q, v
-        self.e = np.array([stop.restitution for stop in stops])
+        self.restitution = np.array([stop.restitution for stop in stops])
         self.gaps, self.friction = Gaps("gap", stops, t, q), StopFriction(stops, t, q)
-        self.law, self.unfinished = law, []  # type: ignore[var-annotated]
-        self.depends: list[tuple[float, list[str], str]] = []  # where the law matters: time, stops, event
+        self.law, self.unfinished_sequences = law, []  # type: ignore[var-annotated]
+        self.law_dependent_impacts: list[tuple[float, list[str], str]] = []  # where the law matters: time, stops, event
         self.noise = EQUAL_GAPS * max(1.0, float(np.abs(q).max()))
-        self.low = max(REBOUND_HEIGHT * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max())))
-        closed = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.low)
+        self.rebound_height = max(
+            REBOUND_HEIGHT * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max()))
+        )
+        closed = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.rebound_height)
         if closed.size:
             gap = float(self.gaps.at(t, q, v).g[closed[0]])
             raise ValueError(f"gaps must not be negative at q0; that of {stops[closed[0]].name!r} is {gap:.3g}")
         self.arcs: list[Result] = []
         self.impacts: list[Impact] = []
-        self.opened: list[int] = []  # stops whose force has just vanished
+        self.opened_stops: list[int] = []  # stops whose force has just vanished
         self.speeds = np.abs(v)  # largest velocities of the last arc
-        self.still: set[int] = set()  # joints that have stopped or stick
-        self.released: set[int] = set()  # joints that stuck in the last arc
+        self.resting_joints: set[int] = set()  # joints that have stopped or stick
+        self.released_joints: set[int] = set()  # joints that stuck in the last arc
         self._contact_systems: dict[Any, tuple[ConstrainedSystem, ConstrainedSystem]] = {}
         self._acceleration_cache: dict[int, tuple[ConstrainedSystem, Accelerations]] = {}
 
@@ -128,7 +130,7 @@ class Motion:
             return self._integrate(t1, times)
 
     def _integrate(self, t1: float, times: Array | None) -> Result:
-        stalled, self.sample_interval = 0, (t1 - self.t) / SAMPLES
+        stalled, self.sample_interval = 0, (t1 - self.t) / MIN_EVALUATIONS
         while True:
             t_before = self.t
             try:
@@ -141,7 +143,7 @@ class Motion:
             if arc.status != Status.EVENT or self.t >= t1:
                 return self._result(times)
             stalled = stalled + 1 if self._is_stalled(t_before) else 0
-            if stalled == MAX_STALLED:
+            if stalled == MAX_STALLED_ARCS:
                 names = dict.fromkeys(name for impact in self.impacts[-9:] for name in impact.stops)
                 stops = f" ({', '.join(map(repr, names))})" if names else ""
                 reason = (
@@ -156,21 +158,21 @@ class Motion:
         return join_arcs(self.system, self.arcs, self.impacts, times, stagnated, f"{self._counts}{self._law_note()}")
 
     def _is_stalled(self, before: float) -> bool:
-        return self.t - before <= STALLED * max(1.0, abs(self.t))
+        return self.t - before <= MAX_STALLED_TIME * max(1.0, abs(self.t))
 
     def _law_note(self) -> str:
         """Describe where the outcome depends on the law of impacts, or which sequence was not followed to its end."""
         note = ""
-        if self.depends:
-            t, stops, event = self.depends[0]
+        if self.law_dependent_impacts:
+            t, stops, event = self.law_dependent_impacts[0]
             note = (
                 f" At t = {t:.6g} {event} ({', '.join(map(repr, stops))}), and the outcome depends on the law: "
                 "Moreau's law, used here, joins their impacts into one; impacts one after another, as in Newton's "
                 "cradle, give other velocities. For these, leave a small gap between the bodies or set "
                 'law="sequential"; law="moreau" confirms the choice.'
             )
-        if self.unfinished:
-            t, stops = self.unfinished[0]
+        if self.unfinished_sequences:
+            t, stops = self.unfinished_sequences[0]
             note += f" At t = {t:.6g} impacts at {', '.join(map(repr, stops))} were too many to follow: do not trust "
             note += "the motion after them."
         return note
@@ -178,63 +180,67 @@ class Motion:
     @property
     def _counts(self) -> str:
         changes = f"{len(self.arcs) - 1} changes between sliding and sticking."
-        if self.stops and (self.modes.n or self.friction.place):
+        if self.stops and (self.modes.n_joints or self.friction.slide_index):
             return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of sliding, sticking or contact."
-        return changes if self.modes.n else f"{len(self.impacts)} impacts."
+        return changes if self.modes.n_joints else f"{len(self.impacts)} impacts."
 
     def _resolve_contacts(self) -> Mode:
         """Apply an impact; return the mode after it: which joints and stops slide or stick, which stops are closed."""
         gap = self.gaps.at(self.t, self.q, self.v)
-        near = np.flatnonzero(gap.g <= self.low)
-        slow = np.zeros(near.size, dtype=bool)
-        if near.size:
-            if self._follow_impacts(gap, near):
+        near_stops = np.flatnonzero(gap.g <= self.rebound_height)
+        is_slow = np.zeros(near_stops.size, dtype=bool)
+        if near_stops.size:
+            if self._follow_impacts(gap, near_stops):
                 gap = self.gaps.at(self.t, self.q, self.v)
                 # stops that are still open will be hit later, in impacts of their own
-                open_stops = (gap.g > self.noise) & (gap.u < -AT_REST * (np.abs(gap.W) @ self.speeds))
-                near = np.flatnonzero((gap.g <= self.low) & ~open_stops)
-            for _ in range(MAX_STALLED if near.size else 0):
-                slow = self._apply_impulses(gap, near)
+                open_stops = (gap.g > self.noise) & (gap.u < -REST_RATE * (np.abs(gap.W) @ self.speeds))
+                near_stops = np.flatnonzero((gap.g <= self.rebound_height) & ~open_stops)
+            for _ in range(MAX_STALLED_ARCS if near_stops.size else 0):
+                is_slow = self._apply_impulses(gap, near_stops)
                 gap = self.gaps.at(self.t, self.q, self.v)
                 # the law may let a stop close that had opened: it is hit next
-                if not (gap.u[near] < -AT_REST * (np.abs(gap.W[near]) @ self.speeds)).any():
+                if not (gap.u[near_stops] < -REST_RATE * (np.abs(gap.W[near_stops]) @ self.speeds)).any():
                     break
-            slow = slow[: near.size] & ~np.isin(near, self.opened)  # an opened stop has no force
-        closing = near[slow]
+            # an opened stop has no force
+            is_slow = is_slow[: near_stops.size] & ~np.isin(near_stops, self.opened_stops)
+        closing = near_stops[is_slow]
         signs, resting_joints = self._sliding_directions(self.v)
         if not closing.size and not resting_joints:
             return Mode(signs)
         a, c_joints = self._free_accelerations(signs, resting_joints, self.v)
         gap = self.gaps.at(self.t, self.q, self.v)
-        touching, slide, tangents = self.friction.rows(closing.tolist(), self.t, self.q, self.v, self.speeds)
+        touching, slide, tangents = self.friction.contact_rows(closing.tolist(), self.t, self.q, self.v, self.speeds)
         c = np.concatenate([gap.W[closing] @ a + gap.bias[closing], c_joints, slide.W @ a + slide.bias])
         W = np.vstack([gap.W[closing], self.modes.gradients(self.q)[resting_joints], slide.W])
         D = W @ responses(self.system, self.t, self.q, W)
         n, end = len(closing), len(closing) + len(resting_joints)
-        reduction = np.array([(1.0 - RELEASED) if k in self.friction.released else 1.0 for k in touching])
+        reduction = np.array(
+            [(1.0 - RELEASE_REDUCTION) if k in self.friction.released_stops else 1.0 for k in touching]
+        )
         tangents = tangents._replace(coefficient=tangents.coefficient * reduction)
         force, slides = coulomb_forces(D, c, self._available_friction(resting_joints), tangents)
         pushes = force[:n] > 0.0
         base = np.flatnonzero(pushes).tolist()
         accelerations = (D @ force + c)[n:end]  # accelerations of the joints
-        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:end] + D.diagonal()[n:end] * self.modes.static[resting_joints]
+        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:end]
+        terms += D.diagonal()[n:end] * self.modes.static_friction[resting_joints]
         for k, sign, moves, row in zip(
             resting_joints,
             np.sign(accelerations),
-            np.abs(accelerations) > MARGIN * terms,
+            np.abs(accelerations) > STICKING_MARGIN * terms,
             range(n, end),
             strict=True,
         ):
             signs[k] = int(sign) if moves else self._stick_or_idle(k, force[row], D, row, base, pushes.sum())
         rubbing = [(k, end + i, int(slides[i])) for i, k in enumerate(touching) if pushes[tangents.normal[i]]]
-        sticks = self.friction.groups(D, base, {k: row for k, row, sign in rubbing if not sign})
-        slips = {k: sign for k, _, sign in rubbing if sign}
-        return Mode(signs, tuple(closing[pushes].tolist()), slips, sticks)
+        sticks = self.friction.sticking_groups(D, base, {k: row for k, row, sign in rubbing if not sign})
+        sliding_stops = {k: sign for k, _, sign in rubbing if sign}
+        return Mode(signs, tuple(closing[pushes].tolist()), sliding_stops, sticks)
 
     def _available_friction(self, joints: list[int]) -> Array:
         """Return the friction available to joints at rest; slightly reduced for those just released."""
-        reduced = np.minimum(self.modes.kinetic, (1.0 - RELEASED) * self.modes.static)
-        return np.array([(reduced if k in self.released else self.modes.static)[k] for k in joints])
+        reduced = np.minimum(self.modes.kinetic_friction, (1.0 - RELEASE_REDUCTION) * self.modes.static_friction)
+        return np.array([(reduced if k in self.released_joints else self.modes.static_friction)[k] for k in joints])
 
     def _stick_or_idle(self, k: int, force: float, D: Array, row: int, base: list[int], n_pushing: int) -> int | None:
         """Return STICKS, or IDLE if pushing stops and sticking joints already hold the joint.
@@ -242,42 +248,43 @@ class Motion:
         The friction of an idle joint is constant until one of these releases it; it is zero if stops alone hold it.
         """
         weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE_RATIO)[0]
-        if D[row, row] - D[row, base] @ weights > INDEPENDENT * D[row, row]:
+        if D[row, row] - D[row, base] @ weights > MIN_COMPLIANCE * D[row, row]:
             base.append(row)
             return STICKS
-        self.modes.idle_friction[k] = force if np.abs(weights[n_pushing:]).max(initial=0.0) > INDEPENDENT else 0.0
+        self.modes.idle_friction[k] = force if np.abs(weights[n_pushing:]).max(initial=0.0) > MIN_COMPLIANCE else 0.0
         return IDLE
 
     def _apply_impulses(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Apply the impulses at closed stops to the velocities; return which of these stops would hardly open."""
-        touching, slide, tangents = self.friction.rows(near.tolist(), self.t, self.q, self.v, self.speeds)
+        touching, slide, tangents = self.friction.contact_rows(near.tolist(), self.t, self.q, self.v, self.speeds)
         tangents = tangents._replace(sign=0 * tangents.sign)  # friction opposes the sliding after the impact
         W = np.vstack([gap.W[near], slide.W])
         X = responses(self.system, self.t, self.q, W)  # dry friction of joints causes no impulse
         D, n = W @ X, len(near)
         before, u = self.v, np.append(gap.u[near], slide.u)
         u[np.abs(u) <= ROUNDING * (np.abs(W) @ self.speeds)] = 0.0
-        P = impulses(D, u, self.e[near], tangents)
+        P = impulses(D, u, self.restitution[near], tangents)
         v = before + X @ P
-        slow = self._hardly_rebound(near, v)
-        if (slow & (P[:n] > 0.0) & (self.e[near] > 0.0)).any():
-            P = impulses(D, u, np.where(slow, 0.0, self.e[near]), tangents)
+        is_slow = self._has_low_rebound(near, v)
+        if (is_slow & (P[:n] > 0.0) & (self.restitution[near] > 0.0)).any():
+            P = impulses(D, u, np.where(is_slow, 0.0, self.restitution[near]), tangents)
             v = before + X @ P
-            slow = self._hardly_rebound(near, v)
+            is_slow = self._has_low_rebound(near, v)
         self.v = v
         if (P[:n] > 0.0).any():
             self._record_impact(before, near, P, touching)
-        return slow
+        return is_slow
 
     def _record_impact(self, before: Array, stops: NDArray[np.int64], P: Array, touching: list[int]) -> None:
         """Record an impact with velocities `self.v` after it; P: impulses of the stops, then of their friction."""
         n = len(stops)
         hit = P[:n] > 0.0
-        rubs = {k: float(x) for k, x in zip(touching, P[n:], strict=True)}
-        friction = np.array([rubs.get(k, 0.0) for k in stops[hit].tolist()])
+        friction_impulses = {k: float(x) for k, x in zip(touching, P[n:], strict=True)}
+        friction = np.array([friction_impulses.get(k, 0.0) for k in stops[hit].tolist()])
         names = tuple(self.stops[k].name for k in stops[hit])
         self.impacts.append(Impact(self.t, names, before.copy(), self.v.copy(), P[:n][hit], friction))
-        self.still, self.released, self.friction.still, self.friction.released = set(), set(), set(), set()
+        self.resting_joints, self.released_joints = set(), set()
+        self.friction.resting_stops, self.friction.released_stops = set(), set()
 
     def _follow_impacts(self, gap: Gap, near: NDArray[np.int64]) -> bool:
         """Follow impacts that come faster than the motion between them can be integrated; return whether any did.
@@ -285,22 +292,25 @@ class Motion:
         Stops that close at once share an impact by Moreau's law. All others are hit in the order in which they close,
         however soon, because another order or a shared impact would result in other velocities.
         """
-        rounding = LEAST_RATE * np.abs(gap.W).sum(axis=1) * float(self.speeds.max())
-        at_rest = AT_REST * (np.abs(gap.W) @ self.speeds) + rounding
-        reach = np.flatnonzero((gap.g <= MAX_GAP * self.low) | np.isin(np.arange(len(gap.g)), near))
+        rounding = MIN_RATE_RATIO * np.abs(gap.W).sum(axis=1) * float(self.speeds.max())
+        at_rest = REST_RATE * (np.abs(gap.W) @ self.speeds) + rounding
+        reach = np.flatnonzero((gap.g <= MAX_GAP * self.rebound_height) | np.isin(np.arange(len(gap.g)), near))
         first = near[gap.u[near] < -at_rest[near]]
         if len(reach) < 2 or not first.size:
             return False
-        touching, slide, tangents = self.friction.rows(reach.tolist(), self.t, self.q, self.v, self.speeds)
+        touching, slide, tangents = self.friction.contact_rows(reach.tolist(), self.t, self.q, self.v, self.speeds)
         W = np.vstack([gap.W[reach], slide.W])
         X = responses(self.system, self.t, self.q, W)
         u = np.append(np.where(np.abs(gap.u) <= at_rest, 0.0, gap.u)[reach], slide.u)
-        impacts = Impacts(W @ X, self.e[reach], tangents, self.noise, rounding[reach])
+        impacts = Impacts(W @ X, self.restitution[reach], tangents, self.noise, rounding[reach])
         a = self._free_accelerations(*self._sliding_directions(self.v), self.v)[0]
-        fast, pull = float(np.abs(self.v).max()), float(np.abs(a).max())
-        limit = min(MAX_DISPLACEMENT * self.low / max(fast, 1e-300), np.sqrt(2.0 * self.low / max(pull, 1e-300)))
+        largest_v, largest_a = float(np.abs(self.v).max()), float(np.abs(a).max())
+        limit = min(
+            MAX_DISPLACEMENT * self.rebound_height / max(largest_v, 1e-300),
+            np.sqrt(2.0 * self.rebound_height / max(largest_a, 1e-300)),
+        )
         g, together = gap.g[reach].copy(), self.law != "sequential"
-        tied = np.flatnonzero(np.isin(reach, first) & (g <= max(self.noise, TIED_GAPS * self.low)))
+        tied = np.flatnonzero(np.isin(reach, first) & (g <= max(self.noise, TIED_GAPS * self.rebound_height)))
 
         def differ(order_a: Sequence, order_b: Sequence) -> bool:
             change = np.abs(X @ (order_a.impulses - order_b.impulses)).max()
@@ -317,46 +327,52 @@ class Motion:
             ambiguous = any(differ(order, orders[0]) for order in orders)
             if ambiguous:
                 g[tied] = 0.0
-        course = impacts.follow(g, u, limit, together)
-        P, before, n = course.impulses, self.v, len(reach)
+        sequence = impacts.follow(g, u, limit, together)
+        P, before, n = sequence.impulses, self.v, len(reach)
         names = [self.stops[k].name for k in reach[P[:n] > 0.0]]
-        if not course.ended:
-            self.unfinished.append((self.t, names))
-        touch = (g <= self.noise) & (u[: len(g)] <= 0.0)
-        if self.law is None and course.shared and (ambiguous or differ(impacts.follow(g, u, limit, False), course)):
+        if not sequence.is_complete:
+            self.unfinished_sequences.append((self.t, names))
+        is_touching = (g <= self.noise) & (u[: len(g)] <= 0.0)
+        if (
+            self.law is None
+            and sequence.has_shared_impacts
+            and (ambiguous or differ(impacts.follow(g, u, limit, False), sequence))
+        ):
             event = "stops close at once, in an order within the tolerance" if ambiguous else TOUCHING_EVENT
-            self.depends.append((self.t, [self.stops[k].name for k in reach[g <= self.noise]] or names, event))
-        at_once = {int(k) for k in reach[touch]}
-        if len(course.steps) <= 1 and set(near.tolist()) <= at_once:
+            self.law_dependent_impacts.append(
+                (self.t, [self.stops[k].name for k in reach[g <= self.noise]] or names, event)
+            )
+        at_once = {int(k) for k in reach[is_touching]}
+        if len(sequence.impact_impulses) <= 1 and set(near.tolist()) <= at_once:
             return False  # a single impact, which all of these stops share
-        self.q = self.q + before * course.duration + X @ course.drift
-        for step in course.steps if len(course.steps) <= MAX_LISTED else [P]:
+        self.q = self.q + before * sequence.duration + X @ sequence.drift
+        for step in sequence.impact_impulses if len(sequence.impact_impulses) <= MAX_LISTED else [P]:
             self.v = self.v + X @ step
             self._record_impact(before, reach, step, touching)
             before = self.v
         return True
 
-    def _hardly_rebound(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
+    def _has_low_rebound(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
         """Return which stops, pressed together by the others, would rebound by less than REBOUND_HEIGHT."""
         signs, resting_joints = self._sliding_directions(v)
         a, c_joints = self._free_accelerations(signs, resting_joints, v)
         gap = self.gaps.at(self.t, self.q, v)
         u, c = gap.u[near], gap.W[near] @ a + gap.bias[near]
         rounding = ROUNDING * np.abs(v).max() ** 2
-        touching = u * np.abs(u) <= CLOSED * self.low * np.abs(c).max() + rounding
+        touching = u * np.abs(u) <= PRESSED_RATIO * self.rebound_height * np.abs(c).max() + rounding
         W = np.vstack([gap.W[near[touching]], self.modes.gradients(self.q)[resting_joints]])
         D, n = W @ responses(self.system, self.t, self.q, W), int(touching.sum())
         force = holding_forces(D, np.append(c[touching], c_joints), n, self._available_friction(resting_joints))
         pressure = np.zeros(len(near))
         pressure[touching] = (D.diagonal() * force)[:n]
-        return np.asarray(u * np.abs(u) <= 2.0 * self.low * pressure + rounding, dtype=bool)
+        return np.asarray(u * np.abs(u) <= 2.0 * self.rebound_height * pressure + rounding, dtype=bool)
 
     def _sliding_directions(self, v: Array) -> tuple[Signs, list[int]]:
         """Return the sliding direction of each joint, and the joints at rest."""
         W = self.modes.gradients(self.q)
         u = W @ v
-        moves = np.abs(u) > AT_REST * (np.abs(W) @ self.speeds)
-        slow = [k for k in range(len(u)) if k in self.still or k in self.released or not moves[k]]
+        moves = np.abs(u) > REST_RATE * (np.abs(W) @ self.speeds)
+        slow = [k for k in range(len(u)) if k in self.resting_joints or k in self.released_joints or not moves[k]]
         return [0 if k in slow else int(np.sign(u[k])) for k in range(len(u))], slow
 
     def _free_accelerations(self, signs: Signs, resting_joints: list[int], v: Array) -> tuple[Array, Array]:
@@ -372,35 +388,36 @@ class Motion:
             self._acceleration_cache[id(system)] = system, accelerations
         return accelerations
 
-    def _with_contacts(self, system: ConstrainedSystem, mode: Mode, cached: bool) -> ConstrainedSystem:
+    def _contact_system(self, system: ConstrainedSystem, mode: Mode, cached: bool) -> ConstrainedSystem:
         """Return the system with the closed stops of a mode as constraints."""
-        resting, friction = mode.resting, self.friction
+        resting, friction = mode.closed_stops, self.friction
         if not resting:
             return system
-        key = id(system), resting, tuple(mode.slips.items())
+        key = id(system), resting, tuple(mode.sliding_stops.items())
         if cached and key in self._contact_systems:
             return self._contact_systems[key][1]
-        sticking = {k for group in mode.sticks.values() for k in group}
+        sticking = {k for group in mode.sticking_groups.values() for k in group}
         names = ", ".join(f"{self.stops[k].name}{' (sticks)' if k in sticking else ''}" for k in resting)
         displacements = friction.slides.at(self.t, self.q, self.v).g
-        sticks = {friction.place[k]: float(displacements[friction.place[k]]) for k in mode.sticks}
-        slips = [
-            (resting.index(k), friction.place[k], sign * friction.coefficient(k)) for k, sign in mode.slips.items()
+        sticks = {friction.slide_index[k]: float(displacements[friction.slide_index[k]]) for k in mode.sticking_groups}
+        sliding_stops = [
+            (resting.index(k), friction.slide_index[k], sign * friction.coefficient(k))
+            for k, sign in mode.sliding_stops.items()
         ]
-        extended = ContactSystem(system, self.gaps, friction.slides, list(resting), sticks, slips).build(names)
+        extended = ContactSystem(system, self.gaps, friction.slides, list(resting), sticks, sliding_stops).build(names)
         if cached:
             self._contact_systems[key] = system, extended
         return extended
 
     def _run_arc(self, mode: Mode, t1: float) -> None:
         """Integrate until a gap closes or opens, or a joint or a stop with friction comes to rest or is released."""
-        signs, resting = mode.signs, mode.resting
+        signs, resting = mode.signs, mode.closed_stops
         # rows of the extended system: C, the gaps of the resting stops, then the rows of sticking joints and stops
-        free, rows = self.modes.system_of(signs, self.t, self.q)
+        free_system, rows = self.modes.mode_system(signs, self.t, self.q)
         # a system with sticking parts cannot be cached: its rows depend on where these stick
-        cacheable = not {STICKS, IDLE} & set(signs) and not mode.sticks
-        system = self._with_contacts(free, mode, cacheable)
-        if system.n_c and (resting or self.modes.n):
+        cacheable = not {STICKS, IDLE} & set(signs) and not mode.sticking_groups
+        system = self._contact_system(free_system, mode, cacheable)
+        if system.n_c and (resting or self.modes.n_joints):
             self._project(system, resting)
         start = self.gaps.at(self.t, self.q, self.v)
         accelerations = self._accelerations(system, cacheable) if resting or STICKS in signs else None
@@ -413,44 +430,46 @@ class Motion:
             return -multiplier(rows[k], t, q, v) * self.modes.row_sign(k, system, rows[k], t, q)
 
         def contact_force(k: int) -> Any:
-            row = free.n_c + resting.index(k)
-            return terminal(lambda t, q, v: -multiplier(row, t, q, v))
+            row = free_system.n_c + resting.index(k)
+            return make_terminal(lambda t, q, v: -multiplier(row, t, q, v))
 
         def friction_balance(row: int, group: list[int], t: float, q: Array, v: Array) -> tuple[float, float]:
-            loads = [(free.n_c + resting.index(k), self.friction.coefficient(k)) for k in group]
+            loads = [(free_system.n_c + resting.index(k), self.friction.coefficient(k)) for k in group]
             return multiplier(row, t, q, v), sum(-mu * multiplier(normal, t, q, v) for normal, mu in loads)
 
         events = [self._joint_event(k, sign, friction) for k, sign in enumerate(signs)]
         events += [contact_force(k) if k in resting else self._gap_event(k, start) for k in range(len(self.stops))]
         n = len(events)
-        events += [terminal(self._stop_rest_event(k, sign)) for k, sign in mode.slips.items()]
-        for row, group in enumerate(mode.sticks.values(), free.n_c + len(resting)):
-            events.append(terminal(self._slip_event(partial(friction_balance, row, group))))
+        events += [make_terminal(self._stop_rest_event(k, sign)) for k, sign in mode.sliding_stops.items()]
+        for row, group in enumerate(mode.sticking_groups.values(), free_system.n_c + len(resting)):
+            events.append(make_terminal(self._slip_event(partial(friction_balance, row, group))))
         for event in events:
             event.every = self.sample_interval
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
-            least_step = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero give no scale for a first step
+            least_step = FIRST_STEP_RATIO * max(1.0, abs(self.t))  # coordinates near zero give no scale for a step
             options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least_step), t1 - self.t)
         if resting:  # the callbacks of an extended system call other callbacks, and cannot be traced
-            options |= untraced(options)
+            options |= options_without_traces(options)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)
         ended = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
-        self.friction.update(mode, {k for i, k in enumerate([*mode.slips, *mode.sticks], n) if i in ended})
+        self.friction.update(
+            mode, {k for i, k in enumerate([*mode.sliding_stops, *mode.sticking_groups], n) if i in ended}
+        )
         n = len(signs)
         if arc.t.size:
             self.speeds = np.abs(arc.v).max(axis=1)
             t_before, self.t = self.t, float(arc.t[-1])
             # if the arc stalled, keep the opened stops: parallel stops would take turns, with forces of rounding size
             if not self._is_stalled(t_before):
-                self.opened = []
+                self.opened_stops = []
             self.q, self.v = arc.q[:, -1].copy(), arc.v[:, -1].copy()
             if any(n + k in ended for k in range(len(self.stops)) if k not in resting):
                 self.v = self._impact_velocities(arc)
-        self.opened += [k for k in resting if n + k in ended]
-        self.released = {k for k in ended if k < n and signs[k] == STICKS}
-        self.still = {k for k in range(n) if (not signs[k]) != (k in ended)}
+        self.opened_stops += [k for k in resting if n + k in ended]
+        self.released_joints = {k for k in ended if k < n and signs[k] == STICKS}
+        self.resting_joints = {k for k in range(n) if (not signs[k]) != (k in ended)}
 
     def _impact_velocities(self, arc: Result) -> Array:
         """Return the velocities at the end of an arc that ends in an impact.
@@ -472,20 +491,20 @@ class Motion:
         """Project the state onto the constraints of a mode, from which it deviates by less than the tolerances."""
         self.q = corrected_positions(system, self.t, self.q)
         if resting:
-            self.q[np.abs(self.q) < ZERO] = 0.0
+            self.q[np.abs(self.q) < NEGLIGIBLE_VALUE] = 0.0
             gap = self.gaps.at(self.t, self.q, self.v)
             W, u = gap.W[list(resting)], gap.u[list(resting)]
             X = responses(self.system, self.t, self.q, W)
             self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE_RATIO)[0]
         rows, violation = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
         self.v = self.v - np.linalg.lstsq(rows, violation, rcond=NEGLIGIBLE_RATIO)[0]
-        self.v[np.abs(self.v) < max(ZERO, 1e-16 * float(self.speeds.max()))] = 0.0
+        self.v[np.abs(self.v) < max(NEGLIGIBLE_VALUE, 1e-16 * float(self.speeds.max()))] = 0.0
 
     def _gap_event(self, k: int, start: Gap) -> Any:
         """Return the event of a gap that is open or about to open; its zero is where the gap has closed again."""
-        g0, u0, t0, low = float(start.g[k]), float(start.u[k]), self.t, self.low
+        g0, u0, t0, low = float(start.g[k]), float(start.u[k]), self.t, self.rebound_height
         opens = u0 > 0.0 and u0 * u0 > low * 1e-6
-        noise, closing = self.noise, u0 < -AT_REST * float(np.abs(start.W[k]) @ self.speeds)
+        noise, closing = self.noise, u0 < -REST_RATE * float(np.abs(start.W[k]) @ self.speeds)
 
         def closes(t: float, q: Array, v: Array) -> float:
             g = float(self.gaps.at(t, q, v).g[k])
@@ -495,38 +514,38 @@ class Motion:
                 return (g - g0) / (t - t0) if t > t0 else u0
             return g - min(g0, 0.0) + low
 
-        event = terminal(closes)
+        event = make_terminal(closes)
         event.gap_rate = lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
         return event
 
     def _joint_event(self, k: int, sign: int | None, friction: Any) -> Any:
         """Return the event that ends the state of a joint: sliding, sticking or idle."""
         if sign is IDLE:
-            return terminal(lambda t, q, v: 1.0)
+            return make_terminal(lambda t, q, v: 1.0)
         if sign != STICKS:
-            return terminal(self._joint_rest_event(k, sign))
-        return terminal(self._slip_event(lambda t, q, v: (friction(k, t, q, v), self.modes.static[k])))
+            return make_terminal(self._joint_rest_event(k, sign))
+        return make_terminal(self._slip_event(lambda t, q, v: (friction(k, t, q, v), self.modes.static_friction[k])))
 
     def _stop_rest_event(self, k: int, sign: int) -> Any:
         """Return the event of a stop that ceases to slide; if sliding has just begun, its rate is zero initially."""
-        slide, slides = self.friction.place[k], self.friction.slides
+        slide, slides = self.friction.slide_index[k], self.friction.slides
         u0 = sign * float(slides.at(self.t, self.q, self.v).u[slide])
-        offset = u0 - self.low if k in self.friction.still | self.friction.released else 0.0
+        offset = u0 - self.rebound_height if k in self.friction.resting_stops | self.friction.released_stops else 0.0
         return lambda t, q, v: sign * float(slides.at(t, q, v).u[slide]) - offset
 
     def _joint_rest_event(self, k: int, sign: int) -> Any:
         """Return the event of a joint that comes to rest; if sliding has just begun, its rate is zero initially."""
         u0 = sign * float(self.modes.gradients(self.q, k) @ self.v)
-        offset = u0 - self.low if k in self.still or k in self.released else 0.0
+        offset = u0 - self.rebound_height if k in self.resting_joints or k in self.released_joints else 0.0
         return lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset
 
     def _slip_event(self, balance: Any) -> Any:
         """Return the event at which the needed friction exceeds the available one, which may be fully used at first."""
         needed, available = balance(self.t, self.q, self.v)
-        if abs(needed) > (1.0 + RELEASED) * available:
+        if abs(needed) > (1.0 + RELEASE_REDUCTION) * available:
             raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {available:.10g}")
-        fully_used = abs(needed) > (1.0 - MARGIN) * available
-        margin = max(1.0, abs(needed) / available) * (1.0 + MARGIN) if fully_used else 1.0
+        fully_used = abs(needed) > (1.0 - STICKING_MARGIN) * available
+        margin = max(1.0, abs(needed) / available) * (1.0 + STICKING_MARGIN) if fully_used else 1.0
 
         def reserve(t: float, q: Array, v: Array) -> float:
             needed, available = balance(t, q, v)
@@ -535,20 +554,20 @@ class Motion:
         return reserve
 
 
-def untraced(options: dict[str, Any]) -> dict[str, Any]:
+def options_without_traces(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options to change for arcs with closed stops, whose callbacks cannot be traced."""
     method = PRESETS["auto"] if isinstance(check_method(options["method"]), Taylor) else options["method"]
     return {"method": method, "compiled": False}
 
 
-def terminal(event: Any) -> Any:
+def make_terminal(event: Any) -> Any:
     """Make an event terminal, at zeros from positive to negative values."""
     event.terminal, event.direction = True, -1
     return event
 
 
-SET_BY_MOTION = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "step_size"}
-SET_BY_MOTION |= {"events", "dense_output", "store"}
+RESERVED_OPTIONS = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "step_size"}
+RESERVED_OPTIONS |= {"events", "dense_output", "store"}
 
 
 def solve_with_stops(
@@ -646,7 +665,7 @@ def checked_options(
     caller: str, options: dict[str, Any], method: str | Method, rtol: float, atol: ArrayLike, n_q: int
 ) -> dict[str, Any]:
     """Return options of runs that include method and tolerances; raise TypeError for unknown options."""
-    names = inspect.signature(solve_dae).parameters.keys() - SET_BY_MOTION
+    names = inspect.signature(solve_dae).parameters.keys() - RESERVED_OPTIONS
     unknown = [name for name in options if name not in names]
     if unknown:
         raise TypeError(f"{caller} has no option {unknown[0]!r}; those of runs are {', '.join(sorted(names))}")

@@ -11,7 +11,7 @@ from twoloop.checks.arguments import Array
 from twoloop.impacts.friction import Tangents, impulses
 
 MAX_HITS = 20_000  # largest number of impacts of a sequence; more than 10,000 occur with mass ratios of 1e8
-COLLAPSED = 1e-11  # relative to the first closing rates: a sequence has died out when its rates are smaller
+MIN_RATE_RATIO = 1e-11  # rates, relative to the fastest closing rate, up to which a sequence has died out
 
 
 class ImpactWarning(UserWarning):
@@ -30,28 +30,28 @@ class Sequence(NamedTuple):
 
     Attributes
     ----------
-    steps : list of ndarray (k + n_tangents,)
+    impact_impulses : list of ndarray (k + n_tangents,)
         Impulses of each impact, of the stops and of their friction.
     drift : ndarray (k + n_tangents,)
         Integral of the impulses over the sequence: the displacement is v t + X drift.
     duration : float
         s.
-    shared : bool
+    has_shared_impacts : bool
         Whether stops that touch shared an impact.
-    ended : bool
+    is_complete : bool
         Whether the sequence ended or died out, within its duration and number of impacts.
     """
 
-    steps: list[Array]
+    impact_impulses: list[Array]
     drift: Array
     duration: float
-    shared: bool
-    ended: bool
+    has_shared_impacts: bool
+    is_complete: bool
 
     @property
     def impulses(self) -> Array:
         """Return the sum of the impulses over the sequence."""
-        return sum(self.steps, 0.0 * self.drift)
+        return sum(self.impact_impulses, 0.0 * self.drift)
 
 
 class Impacts:
@@ -65,26 +65,28 @@ class Impacts:
     tangents : Tangents
     noise : float
         Gaps below this are closed; if several are, they closed at the same time.
-    least : ndarray (k,)
+    min_rates : ndarray (k,)
         Smallest rates; smaller ones are rounding errors.
     """
 
-    def __init__(self, D: Array, restitution: Array, tangents: Tangents, noise: float, least: Array):
+    def __init__(self, D: Array, restitution: Array, tangents: Tangents, noise: float, min_rates: Array):
         self.D, self.restitution, self.tangents = D, restitution, tangents
-        self.noise, self.least, self.n = noise, least, len(restitution)
+        self.noise, self.min_rates, self.n_stops = noise, min_rates, len(restitution)
 
-    def joint(self, stops: NDArray[np.int64], rates: Array, restitution: Array) -> Array:
+    def joint_impulses(self, stops: NDArray[np.int64], rates: Array, restitution: Array) -> Array:
         """Return the impulses of an impact at these stops at once, by Moreau's law."""
         P = np.zeros(len(rates))
-        place = {int(k): i for i, k in enumerate(stops)}
-        rub = [i for i, k in enumerate(self.tangents.normal.tolist()) if k in place]
-        if len(stops) == 1 and not rub:
+        index_of_stop = {int(k): i for i, k in enumerate(stops)}
+        friction_indices = [i for i, k in enumerate(self.tangents.normal.tolist()) if k in index_of_stop]
+        if len(stops) == 1 and not friction_indices:
             k = stops[0]
             P[k] = max(0.0, -(1.0 + restitution[k]) * rates[k] / self.D[k, k])
             return P
-        rows = np.append(stops, [self.n + i for i in rub]).astype(np.int64)
-        normal = np.array([place[int(self.tangents.normal[i])] for i in rub], dtype=np.int64)
-        tangents = Tangents(normal, self.tangents.coefficient[rub], np.zeros(len(rub), dtype=np.int64))
+        rows = np.append(stops, [self.n_stops + i for i in friction_indices]).astype(np.int64)
+        normal = np.array([index_of_stop[int(self.tangents.normal[i])] for i in friction_indices], dtype=np.int64)
+        tangents = Tangents(
+            normal, self.tangents.coefficient[friction_indices], np.zeros(len(friction_indices), dtype=np.int64)
+        )
         P[rows] = impulses(self.D[np.ix_(rows, rows)], rates[rows], restitution[stops], tangents)
         return P
 
@@ -99,42 +101,45 @@ class Impacts:
         together : bool
             Whether stops that touch share an impact by Moreau's law. False: the stop that closes fastest is hit first.
         """
-        n, D = self.n, self.D
+        n, D = self.n_stops, self.D
         g, u = np.maximum(gaps, 0.0), rates.copy()
         total, drift, elapsed = np.zeros(len(u)), np.zeros(len(u)), 0.0
-        steps: list[Array] = []
-        shared = False
-        closing = u[:n] < -self.least
+        impact_impulses: list[Array] = []
+        has_shared_impacts = False
+        closing = u[:n] < -self.min_rates
         # to detect a collapse, rates are compared with the largest closing rate so far
         fastest, involved = float(-u[:n].min(initial=0.0)), np.zeros(n, dtype=bool)
         for _ in range(MAX_HITS):
-            closing = u[:n] < -self.least
+            closing = u[:n] < -self.min_rates
             if not closing.any():
-                return Sequence(steps, drift, elapsed, shared, True)
+                return Sequence(impact_impulses, drift, elapsed, has_shared_impacts, True)
             times = np.full(n, np.inf)
             times[closing] = np.where(g[closing] <= self.noise, 0.0, g[closing] / -u[:n][closing])
-            wait = float(times.min())
-            if elapsed + wait > limit:
-                return Sequence(steps, drift, elapsed, shared, True)
-            drift += total * wait
-            elapsed += wait
-            g = np.maximum(g + wait * u[:n], 0.0)
-            due = closing & (times <= wait)
-            g[due] = 0.0
+            waiting_time = float(times.min())
+            if elapsed + waiting_time > limit:
+                return Sequence(impact_impulses, drift, elapsed, has_shared_impacts, True)
+            drift += total * waiting_time
+            elapsed += waiting_time
+            g = np.maximum(g + waiting_time * u[:n], 0.0)
+            closes_now = closing & (times <= waiting_time)
+            g[closes_now] = 0.0
             if together:
-                stops = np.flatnonzero((g <= self.noise) & (u[:n] <= self.least))
-                shared |= len(stops) > 1
+                stops = np.flatnonzero((g <= self.noise) & (u[:n] <= self.min_rates))
+                has_shared_impacts |= len(stops) > 1
             else:
-                stops = np.array([int(np.flatnonzero(due)[np.argmin(u[:n][due])])])
-            P = self.joint(stops, u, self.restitution)
+                stops = np.array([int(np.flatnonzero(closes_now)[np.argmin(u[:n][closes_now])])])
+            P = self.joint_impulses(stops, u, self.restitution)
             u += D @ P
             total += P
-            steps.append(P)
+            impact_impulses.append(P)
             involved[stops] = True
-            if len(steps) > 2 and np.abs(u[:n][involved & (g <= limit * fastest)]).max() <= COLLAPSED * fastest:
+            if (
+                len(impact_impulses) > 2
+                and np.abs(u[:n][involved & (g <= limit * fastest)]).max() <= MIN_RATE_RATIO * fastest
+            ):
                 break
         else:
-            return Sequence(steps, drift, elapsed, shared, False)
+            return Sequence(impact_impulses, drift, elapsed, has_shared_impacts, False)
         # limit of infinitely many impacts: the remaining closing rates become zero
-        P = self.joint(np.flatnonzero(involved & (g <= limit * fastest)), u, np.zeros(n))
-        return Sequence([*steps, P], drift, elapsed, shared, True)
+        P = self.joint_impulses(np.flatnonzero(involved & (g <= limit * fastest)), u, np.zeros(n))
+        return Sequence([*impact_impulses, P], drift, elapsed, has_shared_impacts, True)
