@@ -480,18 +480,18 @@ def _solve_one(
 
 def _summary(status: Integers, runs: LaneEnsemble, reasons: dict[int, str]) -> str:
     failed, n_runs = int((status < 0).sum()), len(status)
-    reached = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
+    ending_text = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
     by_reason: dict[str, list[int]] = {}
     for run, reason in reasons.items():
         by_reason.setdefault(reason, []).append(run)
     if not runs.methods and FIRST_RUN_REASON not in by_reason:
-        return f"{reached}; none went in lanes: {reasons[0]}."
+        return f"{ending_text}; none went in lanes: {reasons[0]}."
     counts = ((name, int((runs.method_of == k).sum())) for k, name in enumerate(runs.methods))
     in_lanes = "".join(f"{count} in lanes by {name}, " for name, count in counts if count > 0)
     others = "".join(
         f"; {_describe_numbers(runs)}: {reason}" for reason, runs in by_reason.items() if reason != FIRST_RUN_REASON
     )
-    return f"{reached}; {in_lanes}{len(reasons)} made singly: {FIRST_RUN_REASON}{others}."
+    return f"{ending_text}; {in_lanes}{len(reasons)} made singly: {FIRST_RUN_REASON}{others}."
 
 
 def _describe_numbers(runs: list[int]) -> str:

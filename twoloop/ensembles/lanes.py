@@ -67,7 +67,7 @@ class ForceSampling:
 
         q, v : (n_runs, n), one state of each run.
         """
-        short = np.zeros(len(q), dtype=bool)
+        is_short = np.zeros(len(q), dtype=bool)
         size = max(1, BLOCK_VALUES // max(1, len(times) * len(self._program.forms)))
         for begin in range(0, len(q), size):
             rows = slice(begin, begin + size)
@@ -76,8 +76,8 @@ class ForceSampling:
             values = np.empty((len(times), len(q[rows]), len(forces)))
             for k, force in enumerate(forces):
                 values[..., k] = force
-            short[rows] = _are_short(values, rtol)
-        return short
+            is_short[rows] = _are_short(values, rtol)
+        return is_short
 
 
 def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
@@ -102,13 +102,13 @@ def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
         & (MIN_STEEPNESS_RATIO * neighbour < np.abs(change))
         & (local_range > min_range[:, None])
     )
-    short = (is_flank[:-1] & is_flank[1:]).any(axis=(0, 2)) | (is_flank[:-2] & is_flank[2:]).any(axis=(0, 2))
-    return np.asarray(short | ~is_finite)
+    is_short = (is_flank[:-1] & is_flank[1:]).any(axis=(0, 2)) | (is_flank[:-2] & is_flank[2:]).any(axis=(0, 2))
+    return np.asarray(is_short | ~is_finite)
 
 
-# operations of a series per coordinate, from which on "auto" takes DOP853 (measured at 2, 11, 13), and the smallest
-# tolerance for which it does. Lanes need both: at an error of 1e-6, DOP853 takes 1.7 times as long on four-bars, series
-# over twice as long on the spatial slider-crank, where stages in a kernel take 1.5 times as long as generated ones
+# number of operations of a series per coordinate (measured at 2, 11 and 13), and tolerance, from which on "auto" takes
+# DOP853 first. No method is faster on all mechanisms: at an error of 1e-6, DOP853 takes 1.7 times as long as series on
+# four-bars, and series take over twice as long as DOP853 on the spatial slider-crank
 COSTLY_SERIES, SMALLEST_FOR_DOP853 = 6.0, 1e-9
 N_STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # number of stages of the implicit methods
 IN_LANES = ("auto", "Taylor", "DOP853", *N_STAGES)  # presets that can run in lanes
@@ -126,7 +126,7 @@ class LaneMethod:
     order : int
         Argument `order` of the generated functions.
     evaluations : int
-        Number of evaluations in an attempted step, without those that the kernel counts and the one at its end.
+        Number of evaluations in an attempted step that the kernel does not count, without the one at its end.
     options : ndarray
         Numbers that the step kernel reads.
     tableau : tuple of ndarray or None
@@ -305,7 +305,7 @@ class LaneRuns:
         out_v: Array,
         deadline: float = np.inf,
     ) -> tuple[Integers, Integers, Integers, Array]:
-        """Integrate the runs with these numbers; return status (see layout.py), steps, evaluations, and final rows [a, lam].
+        """Integrate the runs with these numbers; return status, step counts, evaluation counts, final [a, lam].
 
         States at `times` are written to `out_q` and `out_v`. Runs stop at the deadline, a time of `time.monotonic`.
         """
@@ -432,7 +432,7 @@ def run_in_blocks(
 
 
 def aligned_zeros(vectors: int, lanes: int) -> Array:
-    """Return zeros at an address that is aligned to the size of a vector of lanes."""
+    """Return vectors * lanes zeros, at an address that is a multiple of the size of a SIMD vector."""
     size = 8 * lanes
     workspace = np.zeros(vectors * lanes + lanes)
     first = -workspace.ctypes.data % size // 8

@@ -46,7 +46,7 @@ class Tangents(NamedTuple):
 
 
 def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
-    """Return the velocity changes (n_q, k) by unit impulses: M X + G^T Y = W^T with G X = 0, for all constraints."""
+    """Return X (n_q, k), changes of velocities by unit impulses along rows W: M X + G^T Y = W^T, with G X = 0."""
     matrix, lengths, _ = scaled_equations(system, t, q)
     right_side = np.vstack([W.T, np.zeros((len(lengths), len(W)))])
     return np.asarray(np.linalg.lstsq(matrix, right_side, rcond=NEGLIGIBLE_RATIO)[0][: system.n_q], dtype=float)
@@ -61,15 +61,15 @@ def solve_complementarity(D: Array, b: Array) -> Array:
         return np.zeros(0)
     x = nnls(*_least_squares_form(D, b))[0]
     # nnls finds the active set; the forces are then computed from D, without the rounding of its square root
-    active = x > 0.0
-    x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE_RATIO)[0]
+    is_active = x > 0.0
+    x[is_active] = np.linalg.lstsq(D[np.ix_(is_active, is_active)], -b[is_active], rcond=NEGLIGIBLE_RATIO)[0]
     return np.maximum(x, 0.0)
 
 
 def solve_bounded(D: Array, c: Array, n: int, limit: Array) -> Array:
     """Return forces that minimise x^T D x / 2 + c^T x subject to bounds: D x + c vanishes where no bound is active.
 
-    The first n, of stops, are non-negative; the others, of friction, are bounded by `limit`. The sum of x^2 / limit is
+    The first n forces, at stops, are non-negative; those of friction are bounded by `limit`. The sum of x^2 / limit is
     added with a small weight, so that a load that could be shared in any proportion is shared evenly.
     """
     tiny = np.finfo(np.float64).tiny
@@ -107,14 +107,14 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     n = len(c) - len(limit) - n_tangents
     tangent_rows = np.arange(len(c) - n_tangents, len(c))
     is_sliding = tangents.sign != 0
-    unknown = np.setdiff1d(np.arange(len(c)), tangent_rows[is_sliding])
+    unknown_rows = np.setdiff1d(np.arange(len(c)), tangent_rows[is_sliding])
     x, tolerance = np.zeros(len(c)), NEGLIGIBLE_RATIO * np.abs(c).max(initial=0.0) / D.diagonal().max(initial=1e-300)
     for _ in range(MAX_LOAD_ITERATIONS):
         new_x, load = np.zeros(len(c)), tangents.coefficient * x[tangents.normal]
         new_x[tangent_rows] = -tangents.sign * load
-        right_side, bounds = (c + D @ new_x)[unknown], np.append(limit, load[~is_sliding])
-        D_kept = D[np.ix_(unknown, unknown)]
-        new_x[unknown] = holding_forces(D_kept, right_side, n, bounds)
+        right_side, bounds = (c + D @ new_x)[unknown_rows], np.append(limit, load[~is_sliding])
+        D_kept = D[np.ix_(unknown_rows, unknown_rows)]
+        new_x[unknown_rows] = holding_forces(D_kept, right_side, n, bounds)
         change, x = np.abs(new_x - x).max(), new_x
         if change <= LOAD_TOLERANCE * np.abs(x).max() + tolerance:
             break
@@ -134,7 +134,7 @@ def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) ->
     """Solve the linear equations of contacts whose states are known; forces of joints remain unchanged."""
     tangent_rows = np.arange(len(c) - len(tangents.normal), len(c))
     is_pushing = np.append(x[:n] > 0.0, np.zeros(len(c) - n, dtype=bool))
-    loads = np.zeros((len(c), len(c)))  # x = loads y, where y are forces of stops and friction at rest
+    loads = np.zeros((len(c), len(c)))  # x = loads @ y; y: forces of stops, and of friction at rest
     loads[is_pushing, is_pushing] = 1.0
     loads[tangent_rows, tangents.normal] = -tangents.sign * tangents.coefficient * is_pushing[tangents.normal]
     is_held = is_pushing.copy()
@@ -143,11 +143,11 @@ def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) ->
     A = (D @ loads)[np.ix_(is_held, is_held)]
     if np.linalg.eigvals(A).real.min(initial=0.0) < -NEGLIGIBLE_RATIO * np.abs(A).max(initial=0.0):
         raise Undetermined("friction of stops is so large that their forces are not unique (P. Painlevé): they may jam")
-    fixed = np.where(is_pushing, 0.0, x)
-    fixed[tangent_rows] = 0.0
+    fixed_forces = np.where(is_pushing, 0.0, x)
+    fixed_forces[tangent_rows] = 0.0
     y = np.zeros(len(c))
-    y[is_held] = np.linalg.lstsq(A, -(c + D @ fixed)[is_held], rcond=NEGLIGIBLE_RATIO)[0]
-    return np.asarray(loads @ y + fixed)
+    y[is_held] = np.linalg.lstsq(A, -(c + D @ fixed_forces)[is_held], rcond=NEGLIGIBLE_RATIO)[0]
+    return np.asarray(loads @ y + fixed_forces)
 
 
 def _least_squares_form(D: Array, b: Array) -> tuple[Array, Array]:
@@ -158,9 +158,9 @@ def _least_squares_form(D: Array, b: Array) -> tuple[Array, Array]:
     """
     values, vectors = np.linalg.eigh(0.5 * (D + D.T))
     components, threshold = vectors.T @ b, NEGLIGIBLE_RATIO * values.max(initial=0.0)
-    significant = (values > threshold) | (np.abs(components) > MAX_OUTSIDE * np.abs(b).max(initial=0.0))
-    roots = np.sqrt(np.maximum(values[significant], threshold))
-    return roots[:, None] * vectors[:, significant].T, -components[significant] / roots
+    is_significant = (values > threshold) | (np.abs(components) > MAX_OUTSIDE * np.abs(b).max(initial=0.0))
+    roots = np.sqrt(np.maximum(values[is_significant], threshold))
+    return roots[:, None] * vectors[:, is_significant].T, -components[is_significant] / roots
 
 
 def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents) -> Array:
@@ -214,7 +214,7 @@ class FrictionModes(Modes):
     ----------
     problem : ModelProblem
 
-    Raises ValueError if a joint cannot slide independently of the others.
+    Raises ValueError if a joint cannot slide independently of the other joints.
     """
 
     def __init__(self, problem: ModelProblem):
@@ -271,7 +271,7 @@ class FrictionModes(Modes):
         if not {STICKS, IDLE} & set(signs):
             return self.sliding_system(signs, t, q), {}
         names = [name for name, sign in zip(self._names, signs, strict=True) if sign == STICKS]
-        # each row of `gauge` holds a displacement at t: its residual at t = 0 measures the present displacement
+        # `gauge` has a row for each sticking joint, whose residual at t = 0 is the displacement of the joint
         gauge, rows = self._build("gauge", signs, dict.fromkeys(names, np.nan), t, q)
         values, quarter = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi)) if names else ((), ())
         positions = {}
@@ -279,8 +279,8 @@ class FrictionModes(Modes):
             if friction.name not in names:
                 continue
             (row,) = rows[friction.name]
-            turns = self._model.dimension == 3 and friction.joint.kind == "revolute"  # its row is A cos t + B sin t
-            positions[friction.name] = float(np.arctan2(-values[row], quarter[row]) if turns else values[row])
+            is_revolute = self._model.dimension == 3 and friction.joint.kind == "revolute"  # row: A cos t + B sin t
+            positions[friction.name] = float(np.arctan2(-values[row], quarter[row]) if is_revolute else values[row])
         suffix = f", {', '.join(names)} sticks" if names else ""
         system, rows = self._build(self._problem.name + suffix, signs, positions, t, q)
         return system, {k: rows[name][0] for k, name in enumerate(self._names) if name in names}

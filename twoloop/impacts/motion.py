@@ -106,7 +106,8 @@ class Motion:
         self.restitution = np.array([stop.restitution for stop in stops])
         self.gaps, self.friction = Gaps("gap", stops, t, q), StopFriction(stops, t, q)
         self.law, self.unfinished_sequences = law, []  # type: ignore[var-annotated]
-        self.law_dependent_impacts: list[tuple[float, list[str], str]] = []  # where the law matters: time, stops, event
+        # impacts whose outcome depends on the law: time, stops, event
+        self.law_dependent_impacts: list[tuple[float, list[str], str]] = []
         self.noise = EQUAL_GAPS * max(1.0, float(np.abs(q).max()))
         self.rebound_height = max(
             REBOUND_HEIGHT * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max()))
@@ -155,7 +156,9 @@ class Motion:
     def _result(self, times: Array | None, stagnated: str = "") -> Result:
         if note := self._law_note():
             warnings.warn(note.strip(), ImpactWarning, stacklevel=5)
-        return join_arcs(self.system, self.arcs, self.impacts, times, stagnated, f"{self._counts}{self._law_note()}")
+        return join_arcs(
+            self.system, self.arcs, self.impacts, times, stagnated, f"{self._counts_text}{self._law_note()}"
+        )
 
     def _is_stalled(self, before: float) -> bool:
         return self.t - before <= MAX_STALLED_TIME * max(1.0, abs(self.t))
@@ -178,7 +181,7 @@ class Motion:
         return note
 
     @property
-    def _counts(self) -> str:
+    def _counts_text(self) -> str:
         changes = f"{len(self.arcs) - 1} changes between sliding and sticking."
         if self.stops and (self.modes.n_joints or self.friction.slide_index):
             return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of sliding, sticking or contact."
@@ -203,39 +206,43 @@ class Motion:
                     break
             # an opened stop has no force
             is_slow = is_slow[: near_stops.size] & ~np.isin(near_stops, self.opened_stops)
-        closing = near_stops[is_slow]
+        closing_stops = near_stops[is_slow]
         signs, resting_joints = self._sliding_directions(self.v)
-        if not closing.size and not resting_joints:
+        if not closing_stops.size and not resting_joints:
             return Mode(signs)
         a, c_joints = self._free_accelerations(signs, resting_joints, self.v)
         gap = self.gaps.at(self.t, self.q, self.v)
-        touching, slide, tangents = self.friction.contact_rows(closing.tolist(), self.t, self.q, self.v, self.speeds)
-        c = np.concatenate([gap.W[closing] @ a + gap.bias[closing], c_joints, slide.W @ a + slide.bias])
-        W = np.vstack([gap.W[closing], self.modes.gradients(self.q)[resting_joints], slide.W])
+        friction_stops, slide, tangents = self.friction.contact_rows(
+            closing_stops.tolist(), self.t, self.q, self.v, self.speeds
+        )
+        c = np.concatenate([gap.W[closing_stops] @ a + gap.bias[closing_stops], c_joints, slide.W @ a + slide.bias])
+        W = np.vstack([gap.W[closing_stops], self.modes.gradients(self.q)[resting_joints], slide.W])
         D = W @ responses(self.system, self.t, self.q, W)
-        n, end = len(closing), len(closing) + len(resting_joints)
+        n, end = len(closing_stops), len(closing_stops) + len(resting_joints)
         reduction = np.array(
-            [(1.0 - RELEASE_REDUCTION) if k in self.friction.released_stops else 1.0 for k in touching]
+            [(1.0 - RELEASE_REDUCTION) if k in self.friction.released_stops else 1.0 for k in friction_stops]
         )
         tangents = tangents._replace(coefficient=tangents.coefficient * reduction)
         force, slides = coulomb_forces(D, c, self._available_friction(resting_joints), tangents)
-        pushes = force[:n] > 0.0
-        base = np.flatnonzero(pushes).tolist()
+        is_pushing = force[:n] > 0.0
+        base = np.flatnonzero(is_pushing).tolist()
         accelerations = (D @ force + c)[n:end]  # accelerations of the joints
         terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:end]
         terms += D.diagonal()[n:end] * self.modes.static_friction[resting_joints]
-        for k, sign, moves, row in zip(
+        for k, sign, is_moving, row in zip(
             resting_joints,
             np.sign(accelerations),
             np.abs(accelerations) > STICKING_MARGIN * terms,
             range(n, end),
             strict=True,
         ):
-            signs[k] = int(sign) if moves else self._stick_or_idle(k, force[row], D, row, base, pushes.sum())
-        rubbing = [(k, end + i, int(slides[i])) for i, k in enumerate(touching) if pushes[tangents.normal[i]]]
-        sticks = self.friction.sticking_groups(D, base, {k: row for k, row, sign in rubbing if not sign})
-        sliding_stops = {k: sign for k, _, sign in rubbing if sign}
-        return Mode(signs, tuple(closing[pushes].tolist()), sliding_stops, sticks)
+            signs[k] = int(sign) if is_moving else self._stick_or_idle(k, force[row], D, row, base, is_pushing.sum())
+        friction_contacts = [
+            (k, end + i, int(slides[i])) for i, k in enumerate(friction_stops) if is_pushing[tangents.normal[i]]
+        ]
+        sticks = self.friction.sticking_groups(D, base, {k: row for k, row, sign in friction_contacts if not sign})
+        sliding_stops = {k: sign for k, _, sign in friction_contacts if sign}
+        return Mode(signs, tuple(closing_stops[is_pushing].tolist()), sliding_stops, sticks)
 
     def _available_friction(self, joints: list[int]) -> Array:
         """Return the friction available to joints at rest; slightly reduced for those just released."""
@@ -255,34 +262,34 @@ class Motion:
         return IDLE
 
     def _apply_impulses(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Apply the impulses at closed stops to the velocities; return which of these stops would hardly open."""
-        touching, slide, tangents = self.friction.contact_rows(near.tolist(), self.t, self.q, self.v, self.speeds)
+        """Apply the impulses at closed stops to the velocities; return a mask of the stops with low rebounds."""
+        friction_stops, slide, tangents = self.friction.contact_rows(near.tolist(), self.t, self.q, self.v, self.speeds)
         tangents = tangents._replace(sign=0 * tangents.sign)  # friction opposes the sliding after the impact
         W = np.vstack([gap.W[near], slide.W])
         X = responses(self.system, self.t, self.q, W)  # dry friction of joints causes no impulse
         D, n = W @ X, len(near)
-        before, u = self.v, np.append(gap.u[near], slide.u)
+        v_before, u = self.v, np.append(gap.u[near], slide.u)
         u[np.abs(u) <= ROUNDING * (np.abs(W) @ self.speeds)] = 0.0
         P = impulses(D, u, self.restitution[near], tangents)
-        v = before + X @ P
+        v = v_before + X @ P
         is_slow = self._has_low_rebound(near, v)
         if (is_slow & (P[:n] > 0.0) & (self.restitution[near] > 0.0)).any():
             P = impulses(D, u, np.where(is_slow, 0.0, self.restitution[near]), tangents)
-            v = before + X @ P
+            v = v_before + X @ P
             is_slow = self._has_low_rebound(near, v)
         self.v = v
         if (P[:n] > 0.0).any():
-            self._record_impact(before, near, P, touching)
+            self._record_impact(v_before, near, P, friction_stops)
         return is_slow
 
-    def _record_impact(self, before: Array, stops: NDArray[np.int64], P: Array, touching: list[int]) -> None:
+    def _record_impact(self, v_before: Array, stops: NDArray[np.int64], P: Array, friction_stops: list[int]) -> None:
         """Record an impact with velocities `self.v` after it; P: impulses of the stops, then of their friction."""
         n = len(stops)
-        hit = P[:n] > 0.0
-        friction_impulses = {k: float(x) for k, x in zip(touching, P[n:], strict=True)}
-        friction = np.array([friction_impulses.get(k, 0.0) for k in stops[hit].tolist()])
-        names = tuple(self.stops[k].name for k in stops[hit])
-        self.impacts.append(Impact(self.t, names, before.copy(), self.v.copy(), P[:n][hit], friction))
+        is_hit = P[:n] > 0.0
+        friction_impulses = {k: float(x) for k, x in zip(friction_stops, P[n:], strict=True)}
+        friction = np.array([friction_impulses.get(k, 0.0) for k in stops[is_hit].tolist()])
+        names = tuple(self.stops[k].name for k in stops[is_hit])
+        self.impacts.append(Impact(self.t, names, v_before.copy(), self.v.copy(), P[:n][is_hit], friction))
         self.resting_joints, self.released_joints = set(), set()
         self.friction.resting_stops, self.friction.released_stops = set(), set()
 
@@ -298,7 +305,9 @@ class Motion:
         first = near[gap.u[near] < -at_rest[near]]
         if len(reach) < 2 or not first.size:
             return False
-        touching, slide, tangents = self.friction.contact_rows(reach.tolist(), self.t, self.q, self.v, self.speeds)
+        friction_stops, slide, tangents = self.friction.contact_rows(
+            reach.tolist(), self.t, self.q, self.v, self.speeds
+        )
         W = np.vstack([gap.W[reach], slide.W])
         X = responses(self.system, self.t, self.q, W)
         u = np.append(np.where(np.abs(gap.u) <= at_rest, 0.0, gap.u)[reach], slide.u)
@@ -310,25 +319,25 @@ class Motion:
             np.sqrt(2.0 * self.rebound_height / max(largest_a, 1e-300)),
         )
         g, together = gap.g[reach].copy(), self.law != "sequential"
-        tied = np.flatnonzero(np.isin(reach, first) & (g <= max(self.noise, TIED_GAPS * self.rebound_height)))
+        tied_stops = np.flatnonzero(np.isin(reach, first) & (g <= max(self.noise, TIED_GAPS * self.rebound_height)))
 
         def differ(order_a: Sequence, order_b: Sequence) -> bool:
             change = np.abs(X @ (order_a.impulses - order_b.impulses)).max()
             return bool(change > MAX_DIFFERENCE * np.abs(X @ order_a.impulses).max())
 
-        ambiguous = False
-        if together and len(tied) > 1:
+        is_ambiguous = False
+        if together and len(tied_stops) > 1:
             orders = []
-            for k in tied:
+            for k in tied_stops:
                 in_order = g.copy()
-                in_order[tied] = np.maximum(g[tied], 2.0 * self.noise)
+                in_order[tied_stops] = np.maximum(g[tied_stops], 2.0 * self.noise)
                 in_order[k] = 0.0
                 orders.append(impacts.follow(in_order, u, limit, together))
-            ambiguous = any(differ(order, orders[0]) for order in orders)
-            if ambiguous:
-                g[tied] = 0.0
+            is_ambiguous = any(differ(order, orders[0]) for order in orders)
+            if is_ambiguous:
+                g[tied_stops] = 0.0
         sequence = impacts.follow(g, u, limit, together)
-        P, before, n = sequence.impulses, self.v, len(reach)
+        P, v_before, n = sequence.impulses, self.v, len(reach)
         names = [self.stops[k].name for k in reach[P[:n] > 0.0]]
         if not sequence.is_complete:
             self.unfinished_sequences.append((self.t, names))
@@ -336,43 +345,43 @@ class Motion:
         if (
             self.law is None
             and sequence.has_shared_impacts
-            and (ambiguous or differ(impacts.follow(g, u, limit, False), sequence))
+            and (is_ambiguous or differ(impacts.follow(g, u, limit, False), sequence))
         ):
-            event = "stops close at once, in an order within the tolerance" if ambiguous else TOUCHING_EVENT
+            event = "stops close at once, in an order within the tolerance" if is_ambiguous else TOUCHING_EVENT
             self.law_dependent_impacts.append(
                 (self.t, [self.stops[k].name for k in reach[g <= self.noise]] or names, event)
             )
         at_once = {int(k) for k in reach[is_touching]}
         if len(sequence.impact_impulses) <= 1 and set(near.tolist()) <= at_once:
             return False  # a single impact, which all of these stops share
-        self.q = self.q + before * sequence.duration + X @ sequence.drift
+        self.q = self.q + v_before * sequence.duration + X @ sequence.drift
         for step in sequence.impact_impulses if len(sequence.impact_impulses) <= MAX_LISTED else [P]:
             self.v = self.v + X @ step
-            self._record_impact(before, reach, step, touching)
-            before = self.v
+            self._record_impact(v_before, reach, step, friction_stops)
+            v_before = self.v
         return True
 
     def _has_low_rebound(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
-        """Return which stops, pressed together by the others, would rebound by less than REBOUND_HEIGHT."""
+        """Return a mask of the stops that rebound by less than `rebound_height`, as other stops press on them."""
         signs, resting_joints = self._sliding_directions(v)
         a, c_joints = self._free_accelerations(signs, resting_joints, v)
         gap = self.gaps.at(self.t, self.q, v)
         u, c = gap.u[near], gap.W[near] @ a + gap.bias[near]
         rounding = ROUNDING * np.abs(v).max() ** 2
-        touching = u * np.abs(u) <= PRESSED_RATIO * self.rebound_height * np.abs(c).max() + rounding
-        W = np.vstack([gap.W[near[touching]], self.modes.gradients(self.q)[resting_joints]])
-        D, n = W @ responses(self.system, self.t, self.q, W), int(touching.sum())
-        force = holding_forces(D, np.append(c[touching], c_joints), n, self._available_friction(resting_joints))
+        is_pressed = u * np.abs(u) <= PRESSED_RATIO * self.rebound_height * np.abs(c).max() + rounding
+        W = np.vstack([gap.W[near[is_pressed]], self.modes.gradients(self.q)[resting_joints]])
+        D, n = W @ responses(self.system, self.t, self.q, W), int(is_pressed.sum())
+        force = holding_forces(D, np.append(c[is_pressed], c_joints), n, self._available_friction(resting_joints))
         pressure = np.zeros(len(near))
-        pressure[touching] = (D.diagonal() * force)[:n]
+        pressure[is_pressed] = (D.diagonal() * force)[:n]
         return np.asarray(u * np.abs(u) <= 2.0 * self.rebound_height * pressure + rounding, dtype=bool)
 
     def _sliding_directions(self, v: Array) -> tuple[Signs, list[int]]:
         """Return the sliding direction of each joint, and the joints at rest."""
         W = self.modes.gradients(self.q)
         u = W @ v
-        moves = np.abs(u) > REST_RATE * (np.abs(W) @ self.speeds)
-        slow = [k for k in range(len(u)) if k in self.resting_joints or k in self.released_joints or not moves[k]]
+        is_moving = np.abs(u) > REST_RATE * (np.abs(W) @ self.speeds)
+        slow = [k for k in range(len(u)) if k in self.resting_joints or k in self.released_joints or not is_moving[k]]
         return [0 if k in slow else int(np.sign(u[k])) for k in range(len(u))], slow
 
     def _free_accelerations(self, signs: Signs, resting_joints: list[int], v: Array) -> tuple[Array, Array]:
@@ -484,8 +493,8 @@ class Motion:
             return v
         assert arc.sol is not None
         middle = arc.sol(float(arc.t[-2]) + 0.5 * h)
-        integrated = arc.v[:, -2] + h / 6.0 * (arc.a[:, -2] + 4.0 * middle.a + arc.a[:, -1])
-        return integrated if tolerance < np.abs(integrated - v).max() <= noise / h else v
+        v_by_simpson = arc.v[:, -2] + h / 6.0 * (arc.a[:, -2] + 4.0 * middle.a + arc.a[:, -1])
+        return v_by_simpson if tolerance < np.abs(v_by_simpson - v).max() <= noise / h else v
 
     def _project(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
         """Project the state onto the constraints of a mode, from which it deviates by less than the tolerances."""
@@ -506,7 +515,7 @@ class Motion:
         opens = u0 > 0.0 and u0 * u0 > low * 1e-6
         noise, closing = self.noise, u0 < -REST_RATE * float(np.abs(start.W[k]) @ self.speeds)
 
-        def closes(t: float, q: Array, v: Array) -> float:
+        def gap_function(t: float, q: Array, v: Array) -> float:
             g = float(self.gaps.at(t, q, v).g[k])
             if g0 > low or (closing and g0 > noise):
                 return g
@@ -514,7 +523,7 @@ class Motion:
                 return (g - g0) / (t - t0) if t > t0 else u0
             return g - min(g0, 0.0) + low
 
-        event = make_terminal(closes)
+        event = make_terminal(gap_function)
         event.gap_rate = lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
         return event
 

@@ -281,8 +281,8 @@ class CachedIntegrator:
             table = StateTable(t.copy(), rows[:, : 3 * system.n_q].copy(), kinds)
             fields["sol"] = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
         if output.times is not None:
-            ends = [0 if time == run.t0 else -1 for time in output.times.tolist()]
-            states = rows[ends] if output.at_ends else self.interpolation.complete_rows(output.times)
+            end_indices = [0 if time == run.t0 else -1 for time in output.times.tolist()]
+            states = rows[end_indices] if output.at_ends else self.interpolation.complete_rows(output.times)
             if states is None:
                 return None
             timed_states = output.times.copy(), states
@@ -448,7 +448,7 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # a choice that also depends on the loss of digits, which kernels do not measure, equals no choice of the kernels
+    # kernels do not measure the loss of digits: a choice that depends on this loss must equal none of the kernels
     index = int(np.searchsorted(-LEAST, -choice.least)) if choice.refined is None else len(LEAST)
     numbers = index, len(choice.rows), len(choice.added), *choice.rows, *choice.added
     return np.array(numbers, dtype=np.int64), choice.scale
@@ -561,8 +561,8 @@ def set_up(
 def _new_entry(run: Run, code: GeneratedCode | None, t1: float, options: Options) -> CacheEntry | None:
     """Return the cache entry of a run at its start, or None if the run cannot be cached."""
     system, n = run.system, run.system.n_q
-    trusted = identity(options.method) is not None and all(traced.trusted for traced in run.traced)
-    if not trusted or run.starts_singular or run.work.notes.base.size > MAX_WORKSPACE:
+    is_trusted = identity(options.method) is not None and all(traced.trusted for traced in run.traced)
+    if not is_trusted or run.starts_singular or run.work.notes.base.size > MAX_WORKSPACE:
         return None
     t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
     is_final = code is not None or not may_have_code(

@@ -345,7 +345,7 @@ class Interpolator:
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
-        vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
+        step_arrays = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
         interior_states = {}
         for parts in range(plan.parts, 1, -1):
             if len(intervals) == 0:
@@ -353,7 +353,7 @@ class Interpolator:
             n_states = parts + 1
             out_t, out = np.empty(n_states * len(intervals)), np.empty((n_states * len(intervals), 3 * n))
             entry_point(self.kernels.fill_intervals)(
-                kit, self.work, *vectors, table.t, table.states, intervals, out_t, out
+                kit, self.work, *step_arrays, table.t, table.states, intervals, out_t, out
             )
             times, states = out_t.reshape(-1, n_states), out.reshape(-1, n_states, 3 * n)
             succeeded = np.isfinite(times[:, 0])
@@ -416,10 +416,10 @@ def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
     groups[:, indices.KIND] = table.kinds[intervals]
     groups[:, indices.HIGH] = len(table.t) - 1
     # polynomials across a singular position do not use the states before it, which may have rounding errors
-    across = np.append(False, table.kinds == indices.ACROSS)
-    (begins,) = (across[1:] & ~across[:-1]).nonzero()
+    is_crossing = np.append(False, table.kinds == indices.ACROSS)
+    (begins,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
     if begins.size:
-        is_across = across[intervals + 1]
+        is_across = is_crossing[intervals + 1]
         groups[is_across, indices.LOW] = begins[np.searchsorted(begins, intervals[is_across], side="right") - 1]
     (jumps,) = (table.kinds == indices.JUMP).nonzero()
     if not jumps.size:
@@ -580,11 +580,11 @@ class DenseSolution:
         times = check_real("t", t)
         if times.ndim > 1:
             raise ValueError(f"t must be a number or have shape (n,); given {shaped(times)}")
-        outside = ~((times >= self.t_min) & (times <= self.t_max))  # also true for NaN
-        if outside.any():
+        is_outside = ~((times >= self.t_min) & (times <= self.t_max))  # also true for NaN
+        if is_outside.any():
             raise ValueError(
                 f"t must lie within the run, from {self.t_min!r} to {self.t_max!r}; given "
-                f"{float(np.atleast_1d(times)[np.atleast_1d(outside)][0])!r}"
+                f"{float(np.atleast_1d(times)[np.atleast_1d(is_outside)][0])!r}"
             )
         order = np.argsort(np.atleast_1d(times), kind="stable")
         with signals_of(self.interpolator.system):

@@ -336,7 +336,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
 
 
 def apply_jump(run: Run, t1: float) -> bool:
-    """Store the state after a jump of C_t or b in `run.new_state`, and restart the method; return whether it exists."""
+    """Store the state after a jump of C_t or b in `run.new_state`, restart the method; return False if none exists."""
     a, clock, n = run.a, run.clock, run.system.n_q
     t_after = float(clock[a.JUMP_TO])
     state = state_after_jump(run.system, t_after, run.state[:n], run.state[n : 2 * n])

@@ -257,11 +257,11 @@ class IntegrationLoop:
             if across and n_steps and self.request.between_steps:
                 self.recorder.store_crossing(self.plan.memory)
             self._store_chunk(t, rows, steps, self._interval_kinds(steps, across, over_jump))
-            spent = time.process_time() - began
-            self.cpu_time += spent
+            chunk_time = time.process_time() - began
+            self.cpu_time += chunk_time
             if recorder.end_event is not None:
                 break
-            self._handle_code(steps, across, spent)
+            self._handle_code(steps, across, chunk_time)
             if not is_copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
                 buffers = self._next_buffers()
         if is_copied and buffers[1].size <= MAX_SPARE_FLOATS:
@@ -276,14 +276,14 @@ class IntegrationLoop:
             raise self.callback_error
         return self._build_record(check_derivatives)
 
-    def _handle_code(self, steps: Array, across: bool, spent: float) -> None:
-        """Act on `self.code`; set it to PAUSED if the loop is to continue. `spent`: CPU time of the chunk, s."""
+    def _handle_code(self, steps: Array, across: bool, chunk_time: float) -> None:
+        """Act on `self.code`; set it to PAUSED if the loop is to continue. `chunk_time`: CPU time of the chunk, s."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness_monitor.samples:
                 self.stiffness_monitor.add_steps(steps[:, self.run.a.H])
             self.report(self.t1)
             return
-        self._check_progress(steps, across, spent)
+        self._check_progress(steps, across, chunk_time)
         self._choose_method(across, len(steps))
         self.report(self.run.clock[self.run.a.T])
 
@@ -349,7 +349,7 @@ class IntegrationLoop:
         for name, values in step_fields(steps, self.counts).items():
             self.request.store.add(name, values)
 
-    def _check_progress(self, steps: Array, across: bool, spent: float) -> None:
+    def _check_progress(self, steps: Array, across: bool, chunk_time: float) -> None:
         """Choose the number of attempts of the next chunk; change `self.code` if the run stalls, or has to stop."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
@@ -362,7 +362,7 @@ class IntegrationLoop:
                 self.stiffness_monitor.sample_state(float(run.clock[a.T]), run.state, run.system.n_q)
             if self.stall_detector.is_stalled(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
                 self.code = STAGNATED
-        if spent < CHUNK_TIME:
+        if chunk_time < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
         may_continue = self.code in (a.PAUSED, a.NEEDS_COMPILATION, a.NEEDS_DENSE, a.SWITCH_METHOD, a.NEAR_SINGULAR)
         if may_continue and time.monotonic() > self.deadline:

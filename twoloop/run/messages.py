@@ -151,10 +151,10 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
     by_vibration, by_decay, vibration, decay, h = np.median(samples, axis=0)
     if max(by_vibration, by_decay) < MIN_STABILITY_RATIO:
         return ""
-    motion = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"
+    motion_text = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"
     return (
-        f" The problem looks stiff: steps of {h:.2g} s are about as long as they can be for {motion} to remain stable. "
-        "If these need not be resolved, take method='auto', 'RadauIIA9', or 'TRBDF2' for few digits."
+        f" The problem looks stiff: steps of {h:.2g} s are about as long as they can be for {motion_text} to remain "
+        "stable. If these need not be resolved, take method='auto', 'RadauIIA9', or 'TRBDF2' for few digits."
     )
 
 
@@ -230,20 +230,20 @@ def _describe_jumps_and_crossings(run: "Run") -> str:
     return text + (CROSSINGS_MARK if run.crossings else "")
 
 
-def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: LaterFields | None = None) -> dict[str, Any]:
+def message_of(run: "Run", text: str, system: "ConstrainedSystem", later: LaterFields | None = None) -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} with a function that computes the text when it is read.
 
     The text is computed later if it describes crossings, because that takes longer than many runs. Until then `system`
     must not change; the arrays of the run may. `later`: function that computes other deferred fields by their names.
     """
-    if CROSSINGS_MARK not in words:
-        return {"message": words}
+    if CROSSINGS_MARK not in text:
+        return {"message": text}
     crossings, end_state, rank = run.crossings, (float(run.clock[run.a.T]), run.state.copy()), run.rank
 
     def fields_of(name: str) -> dict[str, Any]:
         if name != "message" and later is not None:
             return later(name)
-        return {"message": words.replace(CROSSINGS_MARK, describe_crossings(system, crossings, end_state, rank))}
+        return {"message": text.replace(CROSSINGS_MARK, describe_crossings(system, crossings, end_state, rank))}
 
     # functions called in Python may depend on variables that change: compute the message now
     return fields_of("message") if system.called_in_python else {"later": fields_of}
@@ -274,12 +274,12 @@ def describe_rounding(run: "Run", places: list[TimedState], end: float) -> str:
         at_singular_start = t == run.t0 and run.starts_singular  # positions and velocities at the start are given
         if t >= end or at_singular_start or surely_above(run.near_threshold, system.rows(t, q), run.rank):
             continue
-        excess = _velocity_error_ratio(run, t, q, v)
-        if excess > MAX_LASTING_ERROR:
+        error_ratio = _velocity_error_ratio(run, t, q, v)
+        if error_ratio > MAX_LASTING_ERROR:
             return (
                 f"Not to be trusted beyond t = {t:.10g}: steps went on from there, where the constraints nearly lose "
                 f"rank ({_ratio_text(run, t, q)}), and rounding of positions had changed velocities by about "
-                f"{excess:.1g} times what rtol and atol allow. Take another method, or end t_span before."
+                f"{error_ratio:.1g} times what rtol and atol allow. Take another method, or end t_span before."
             )
     return ""
 
@@ -296,7 +296,7 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
         arrival = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
         return Status.REACHED_END, arrival + _describe_jumps_and_crossings(run) + warn_of_singular_end(run)
     stopped = f"Stopped at t = {t:.10g}"
-    failure = int(run.clock[a.FAILURE_CODE])
+    failure_code = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:
         return Status.INTERRUPTED, ""
     if code == a.MAX_STEPS_REACHED:
@@ -320,9 +320,9 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
         )
     if code == a.ROWS_VIOLATED:
         return Status.ROWS_CONTRADICT, _describe_contradiction(run)
-    if failure == indices.NOT_FINITE:
-        return (Status.NOT_FINITE, f"{stopped}: {describe_not_finite(run)}. The result holds what was computed before.")
-    if code == a.RANK_LOST or failure == indices.SINGULAR:
+    if failure_code == indices.NOT_FINITE:
+        return Status.NOT_FINITE, f"{stopped}: {describe_not_finite(run)}. The result holds what was computed before."
+    if code == a.RANK_LOST or failure_code == indices.SINGULAR:
         rows = dependent_rows(run.system, t, run.state[: run.system.n_q])
         return (
             Status.RANK_LOST,
@@ -330,14 +330,14 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
             f"coordinates exists at this singular position, and no step led across: {_REMEDIES}."
             f"{_describe_near_end(run, t1)}",
         )
-    if failure == indices.GAMMA_INACCURATE:
+    if failure_code == indices.GAMMA_INACCURATE:
         reached, required = run.work.notes[indices.GAMMA_ACCURACY], run.work.notes[indices.GAMMA_REQUIRED]
         return (
             Status.NOT_CONVERGED,
             f"{stopped}: gamma by differences of C_q and C_t is good to a relative error of {reached:.1g} there, "
             f"and rtol asks for {required:.1g}. Give gamma, or loosen rtol.",
         )
-    reason = _FAILURE_REASONS[failure]
+    reason = _FAILURE_REASONS[failure_code]
     if code == a.FIXED_STEP_FAILED:
         return (
             Status.NOT_CONVERGED,
@@ -402,12 +402,12 @@ def warn_of_singular_end(run: "Run") -> str:
             "velocities and accelerations there. End t_span a little before, or beyond"
         )
     else:
-        excess = _velocity_error_ratio(run, t, q, v)
-        if excess <= indices.REPORTED_ERROR:
+        error_ratio = _velocity_error_ratio(run, t, q, v)
+        if error_ratio <= indices.REPORTED_ERROR:
             return ""
         text = (
             f"the run ends where the constraints nearly lose rank ({_ratio_text(run, t, q)}): rounding of positions "
-            f"changes velocities there {_format_excess(excess)}, and accelerations by more. "
+            f"changes velocities there {_format_excess(error_ratio)}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
     return warn_user(text)
@@ -418,14 +418,14 @@ def warn_of_passage_by_ordinary_steps(run: "Run") -> str:
     ratio = float(run.clock[run.a.PIVOT_PASSED])
     if ratio == 0.0:
         return ""
-    excess = EPS / ratio**3 / float(run.tolerances[indices.LEAST])
-    if excess <= MAX_LASTING_ERROR:
+    error_ratio = EPS / ratio**3 / float(run.tolerances[indices.LEAST])
+    if error_ratio <= MAX_LASTING_ERROR:
         return ""
     return warn_user(
         f"no step led across a singular position, and the run went on with steps within which the smallest pivot of "
         f"the constraint Jacobian came down to {ratio:.1g} of its largest: rounding of accelerations there may be "
-        f"about {excess:.1g} times what rtol and atol allow. Loosen rtol and atol, take another method, or change the "
-        "geometry slightly"
+        f"about {error_ratio:.1g} times what rtol and atol allow. Loosen rtol and atol, take another method, or change "
+        "the geometry slightly"
     )
 
 

@@ -81,18 +81,18 @@ def options_of(
     compiled: Any,
 ) -> Options:
     """Return the validated options of a call; arguments that are the objects of the last call are not checked again."""
-    last, options = system.shared.get("options", NO_OPTIONS)
-    m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last
+    last_arguments, options = system.shared.get("options", NO_OPTIONS)
+    m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last_arguments
     # written out, because a loop or a tuple would take a tenth of the time of a short repeated call
     same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
     same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
     if same and checks is check_derivatives and code is compiled:
         return options  # type: ignore[no-any-return]
-    last = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
-    last = *last, check_derivatives, compiled
-    options = check_options(system, *last)
+    last_arguments = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
+    last_arguments = *last_arguments, check_derivatives, compiled
+    options = check_options(system, *last_arguments)
     if type(atol) is float and is_preset(method):  # the caller may change objects of other types
-        system.shared["options"] = last, options
+        system.shared["options"] = last_arguments, options
     return options
 
 
@@ -117,7 +117,7 @@ def check_options(
         check_flag("progress", progress)
     compiled = check_compiled(compiled)
     check_flag("check_derivatives", check_derivatives)
-    chosen = check_method(method)
+    method_object = check_method(method)
     check_positive("rtol", rtol)
     atol = check_tolerance("atol", atol, system.n_q)
     if max(rtol, atol.min()) < SMALLEST_TOLERANCE:
@@ -140,7 +140,7 @@ def check_options(
     if time_limit is not None:
         check_positive("time_limit", time_limit)
     step_options = first_step, float(max_step), max_steps, step_size
-    return Options(chosen, float(rtol), atol, *step_options, compiled, bool(check_derivatives))
+    return Options(method_object, float(rtol), atol, *step_options, compiled, bool(check_derivatives))
 
 
 def check_method(method: str | Method) -> Method:

@@ -47,7 +47,8 @@ class SharedSetup:
     Raises
     ------
     ValueError
-        If the system is large, a callback may branch on parameters, or numbers differ from their traced expressions.
+        If setup cannot be shared: because the system is large, because a callback may branch on its parameters, or
+        because numbers in the plan of `run` differ from the values of their traced expressions.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -65,8 +66,8 @@ class SharedSetup:
         )
         self.exact_derivatives = exact_derivatives(symbolic)
         self.has_definite_mass = has_definite_mass(system, t, q)
-        untraced = system.given.keys() - cache.traced
-        cache.traced |= {kind for kind in untraced if runs_on_symbols(system, kind, cache.parameters)}
+        untraced_kinds = system.given.keys() - cache.traced
+        cache.traced |= {kind for kind in untraced_kinds if runs_on_symbols(system, kind, cache.parameters)}
         share_checked_bounds(system)
         if not cache.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
@@ -75,7 +76,7 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region in which runs, `with_derivatives` or without, have compared callbacks so far."""
+        """Return the region of compared callbacks of runs that check derivatives (True), or of all others (False)."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
@@ -137,8 +138,8 @@ class ParametricRun:
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
-            structure = self.shared.has_definite_mass, bool(run.kit.flags[DIAGONAL_MASS])
-            self._mass_agrees = structure == (has_definite_mass(system, t0, q), is_diagonal(mass))
+            mass_structure = self.shared.has_definite_mass, bool(run.kit.flags[DIAGONAL_MASS])
+            self._mass_agrees = mass_structure == (has_definite_mass(system, t0, q), is_diagonal(mass))
         try:
             if with_derivatives:
                 check_derivatives(system, t0, q, lambda: exact_near(system, t0, q, v))

@@ -343,9 +343,9 @@ def _projected_position(
         why = f"max|C| stays at {_format_largest(violation.values)}"
         raise ValueError(_describe_no_freedom(system, t, scaled, free, kept, why))
     position, excess, iterations = _gauss_newton(system, t, guess, free)
-    redundant = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
-    cutoff = REDUNDANT_CUTOFF if redundant else LSTSQ_CUTOFF
-    if redundant:  # beside the constraints, redundant rows are only nearly dependent
+    has_redundant_rows = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
+    cutoff = REDUNDANT_CUTOFF if has_redundant_rows else LSTSQ_CUTOFF
+    if has_redundant_rows:  # beside the constraints, redundant rows are only nearly dependent
         position, excess, iterations = _gauss_newton(system, t, guess, free, cutoff)
     if position is None or not excess <= 1.0:
         has_diverged = position is None

@@ -127,9 +127,9 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays in a folder by name; arrays with one row per state or per step are cut to equal lengths."""
     arrays = {path.stem: memory_map(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), STEP_ARRAYS, ("sol_t", "sol_states")):
-        present = [name for name in group if name in arrays]
-        n = min((len(arrays[name]) for name in present), default=0)
-        arrays |= {name: arrays[name][:n] for name in present}
+        available = [name for name in group if name in arrays]
+        n = min((len(arrays[name]) for name in available), default=0)
+        arrays |= {name: arrays[name][:n] for name in available}
     return arrays
 
 

@@ -261,7 +261,7 @@ class IndependentRerun:
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK_ATTEMPTS
-        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run checked the accuracy of gamma by differences
+        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the original run has checked gamma by differences
         n_rows = max(2, min(CHUNK_ATTEMPTS, MAX_BUFFER_SIZE // len(self.run.state)))
         rows = (np.empty(n_rows), np.empty((n_rows, len(self.run.state))))
         self.buffers, self.n_filled = (*rows, np.empty((CHUNK_ATTEMPTS, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)

@@ -187,8 +187,8 @@ class Run:
         clock[:] = 0.0
         clock[a.T] = clock[a.T_START] = t
         clock[[a.JUMP_FROM, a.JUMP_TO, a.PIVOT_AT_OUTPUT, a.SHORTEST_CHANGE]] = np.inf
-        sampled = a.ROUGH_TO, a.SAMPLED_TO, a.MOTION_SAMPLED_TO, a.COMPARED
-        clock[[*sampled, a.DISCONTINUITY, a.DISCONTINUITY_OF_MOTION, a.LAST_CHANGE]] = -np.inf
+        sample_times = a.ROUGH_TO, a.SAMPLED_TO, a.MOTION_SAMPLED_TO, a.COMPARED
+        clock[[*sample_times, a.DISCONTINUITY, a.DISCONTINUITY_OF_MOTION, a.LAST_CHANGE]] = -np.inf
         clock[a.H_LIMIT] = self.plan.limit_start
 
     def advance(

@@ -21,7 +21,7 @@ SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr
 
 
 class SignalHandlers:
-    """Substitutes for the user's signal handlers, which they call at safe points, and whose exceptions they re-raise.
+    """Replacement of the user's signal handlers: calls them at safe points, and raises their exceptions again.
 
     Python calls a handler at its next instruction, which may be one of numba. In Python code called by machine code, an
     exception becomes a `SystemError`; during compilation, it breaks numba for the rest of the process. So the call of a

@@ -153,11 +153,11 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
     """Return the largest |a_j|, without the rows' singular values below `min_ratio` times the largest one."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
-    kept = values > min_ratio * values[0]
+    is_kept = values > min_ratio * values[0]
     dt = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / max(np.abs(v).max(), DISPLACEMENT)
     rates = [system.velocity_constraint(t + step, q + step * v, v) / norms for step in (-dt, dt)]
-    gamma = (left.T @ (rates[0] - rates[1]))[kept] / (2.0 * dt * values[kept])
-    equations = np.block([[mass, right[kept].T], [right[kept], np.zeros((int(kept.sum()),) * 2)]])
+    gamma = (left.T @ (rates[0] - rates[1]))[is_kept] / (2.0 * dt * values[is_kept])
+    equations = np.block([[mass, right[is_kept].T], [right[is_kept], np.zeros((int(is_kept.sum()),) * 2)]])
     solution = np.linalg.lstsq(equations, np.append(units * system.force(t, q, v), gamma), rcond=None)[0]
     return float(np.abs(units * solution[: len(q)]).max())
 
@@ -221,10 +221,10 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
         if value == 0.0:
             return np.full(len(q), np.inf)
         step = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(direction).max()
-        beside = [q + side * step * direction for side in (1.0, -1.0)]
+        displaced = [q + side * step * direction for side in (1.0, -1.0)]
         try:
-            slope = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
-            row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in beside)))
+            slope = np.subtract(*(system.velocity_constraint(t, each, v) for each in displaced)) / (2.0 * step)
+            row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
         # a row may be small at this position only: use rows beside it for the rounding errors of the constraints

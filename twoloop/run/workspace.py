@@ -184,13 +184,13 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
     if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
         return None
     bodies = _coordinates_of_bodies(system, mass)
-    stiff = _stiff_rows(system, t0, q0, mass, jacobian, bodies)
-    program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff)
+    stiff_rows = _stiff_rows(system, t0, q0, mass, jacobian, bodies)
+    program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff_rows)
     if program is None or program[N_UPDATES] > MAX_STATIC_SHARE * _dense_cost(system.n_q, system.n_c):
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF_DIAGONAL] + 1)
     static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
-    return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, bodies, stiff))
+    return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, bodies, stiff_rows))
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
