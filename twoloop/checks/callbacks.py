@@ -90,7 +90,7 @@ def _index_error(
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
                 is_own = wrap is _in_python and is_twoloop(function.__module__ or "")
-                copy = _own_in_python(function) if is_own else FunctionCopier(wrap).value(function)
+                copy = _own_in_python(function) if is_own else FunctionCopier(wrap).replacement_of(function)
                 copy(t, *given, *(np.zeros(array.shape) for array in out))
         except IndexError as error:
             return error
@@ -111,7 +111,7 @@ def _in_python(function: types.FunctionType, _: Any) -> Any:
 @lru_cache(256)
 def _own_in_python(function: Dispatcher) -> Any:
     """Copy a callback of twoloop once for all systems: the globals that it names never change."""
-    return FunctionCopier(_in_python).value(function)
+    return FunctionCopier(_in_python).replacement_of(function)
 
 
 def _with_bounds_checked(function: types.FunctionType, _: Any) -> Any:

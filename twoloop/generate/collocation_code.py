@@ -745,7 +745,7 @@ def _compiled(shared: SharedCode) -> Collocation:
     def write() -> tuple[list[str], str]:
         module = Module(divided=is_split)
         for name, emit in writers.items():
-            llvm_code.write(module, name, KIT.llvm_type(name), emit, partial(LaneEmitter, lanes=LANES))
+            llvm_code.write(module, name, KIT.llvm_signature(name), emit, partial(LaneEmitter, lanes=LANES))
         # with coefficients that were added while writing, the functions would read beyond the end of the array
         assert len(code.numbers.values) == len(numbers)
         return list(writers), str(module)

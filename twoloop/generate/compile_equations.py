@@ -450,11 +450,11 @@ class SharedCode:
         equations = self.equations
         module = Module(divided=True)
         for name, program in self.outputs.items():
-            write_function(module, name, KIT.llvm_type(name), program, self.numbers)
-        parts = [] if self.parts is None else self.parts.write(module, KIT.llvm_type)
+            write_function(module, name, KIT.llvm_signature(name), program, self.numbers)
+        parts = [] if self.parts is None else self.parts.write(module, KIT.llvm_signature)
         name = "own_accelerate"
         if name not in parts:
-            write_acceleration_function(module, name, KIT.llvm_type(name), equations, self.numbers)
+            write_acceleration_function(module, name, KIT.llvm_signature(name), equations, self.numbers)
             parts.append(name)
         return [*self.outputs, *parts], str(module)
 

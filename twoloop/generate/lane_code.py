@@ -778,7 +778,7 @@ class GeneratedLanes(Generic[Code]):
     def _module_text(self) -> tuple[list[str], str]:
         module = Module()
         for name in self.code.tasks:
-            llvm_code.write(module, name, CODE.llvm_type(name), getattr(self.code, name), LaneEmitter)
+            llvm_code.write(module, name, CODE.llvm_signature(name), getattr(self.code, name), LaneEmitter)
         return list(self.code.tasks), str(module)
 
     @property

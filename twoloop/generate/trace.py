@@ -105,14 +105,14 @@ class _CallbackCopier(FunctionCopier):
         """Return a copy of a callback, which may be an object with a method `__call__`."""
         method = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
         if isinstance(method, types.FunctionType) and not isinstance(function, Dispatcher):
-            return types.MethodType(self.value(method), function)
-        return self.value(function)
+            return types.MethodType(self.replacement_of(method), function)
+        return self.replacement_of(function)
 
-    def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
+    def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
         if isinstance(value, types.MethodType):
-            return types.MethodType(self.value(value.__func__), value.__self__)
+            return types.MethodType(self.replacement_of(value.__func__), value.__self__)
         if isinstance(value, functools.partial):
-            return functools.partial(self.value(value.func), *value.args, **value.keywords)
+            return functools.partial(self.replacement_of(value.func), *value.args, **value.keywords)
         if isinstance(value, types.ModuleType) and value in (math, np):
             return _Mathematics(value)
         name = getattr(value, "__name__", "")
@@ -122,7 +122,7 @@ class _CallbackCopier(FunctionCopier):
                     return getattr(_Mathematics(module), name)
             if is_library(getattr(value, "__module__", None) or ""):
                 return value
-        return super().value(value, names)
+        return super().replacement_of(value, names)
 
     def _add_copy(self, helper: Any) -> None:
         super()._add_copy(helper)

@@ -62,7 +62,7 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import (
     accelerations,
     adopt_midpoint_partition,
-    check_redundant,
+    check_redundant_rows,
     find_tangents,
     prepare_mass,
     renew_partition,
@@ -353,7 +353,10 @@ def advance(
             if end_code != at.CONTINUE:
                 return end_code
             continue
-        if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
+        if (
+            w.rows_v.size < w.Rate.size
+            and check_redundant_rows(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE
+        ):
             clock[at.H_FAILED] = size
             return at.ROWS_VIOLATED
         count_step(w, tolerances, control, clock, size, out_steps[filled[1]])

@@ -20,7 +20,7 @@ from twoloop.kernels.data.indices import (
     RTOL,
     SINGULAR,
 )
-from twoloop.kernels.evaluation.inner_loop import accelerations, find_tangents, renew_partition, restore
+from twoloop.kernels.evaluation.inner_loop import accelerations, find_tangents, renew_partition, restore_constraints
 from twoloop.kernels.evaluation.partition import min_pivot_ratio, partition_is_poor
 from twoloop.kernels.linalg.dense import copy, largest_of
 
@@ -181,7 +181,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
             copy(v, v_0)
             code = DONE if has_partition else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
-                code = restore(f, w, times[p], q, v, tolerance)
+                code = restore_constraints(f, w, times[p], q, v, tolerance)
             has_partition = (
                 code == DONE
                 and not (has_D and partition_is_poor(w))
@@ -192,7 +192,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
                 copy(v_0, v)
                 code = renew_partition(f, w, times[p], q)
                 if code == DONE:
-                    code = restore(f, w, times[p], q, v, tolerance)
+                    code = restore_constraints(f, w, times[p], q, v, tolerance)
                 change = _velocity_change(tolerances, v_0, v) if code == DONE else 0.0
                 if not change <= REPORTED_ERROR and _is_singular(f, w, t, states, i, last, times[p], q, change):
                     code = SINGULAR
@@ -288,12 +288,12 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
             copy(rows[0], rows[2])
             code = DONE if k > 0 else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
-                code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
+                code = restore_constraints(f, w, time, rows[2, :n], rows[2, n:], tolerance)
             if code != DONE:
                 copy(rows[0], rows[2])
                 code = renew_partition(f, w, time, q)
                 if code == DONE:
-                    code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
+                    code = restore_constraints(f, w, time, rows[2, :n], rows[2, n:], tolerance)
             if code == DONE:
                 out[g] = max(out[g], _max_difference(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
                 code = accelerations(f, w, time, rows[2, :n], rows[2, n:], q_1, w.lam)

@@ -353,14 +353,14 @@ class FunctionCopier:
         self.wrap = wrap
         self.copies: dict[Any, Any] = {}
 
-    def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
+    def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
         """Return the replacement of a value, or the value itself; `names`: which attributes of modules are replaced."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
             return self.copies[id(value)]
         if type(value) is tuple:
-            return tuple(self.value(each, names) for each in value)
+            return tuple(self.replacement_of(each, names) for each in value)
         if isinstance(value, types.ModuleType) and not is_library(value.__name__):
             return self._copy_module(value, names)
         return value
@@ -375,7 +375,9 @@ class FunctionCopier:
         if key not in self.copies:
             self.copies[key] = copy = types.ModuleType(module.__name__)
             vars(copy).update(vars(module))
-            vars(copy).update({name: self.value(vars(module)[name], names) for name in names & set(vars(module))})
+            vars(copy).update(
+                {name: self.replacement_of(vars(module)[name], names) for name in names & set(vars(module))}
+            )
         return self.copies[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
@@ -393,8 +395,8 @@ class FunctionCopier:
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
         self.copies[id(helper)] = self.wrap(copy, helper)  # its values, replaced below, may include the helper itself
         for name in used_names & set(own_globals):
-            own_globals[name] = self.value(own_globals[name], names)
+            own_globals[name] = self.replacement_of(own_globals[name], names)
         if function.__defaults__ is not None:
-            copy.__defaults__ = self.value(function.__defaults__, names)
+            copy.__defaults__ = self.replacement_of(function.__defaults__, names)
         for cell, original in zip(cells, function.__closure__ or (), strict=True):
-            cell.cell_contents = self.value(original.cell_contents, names)
+            cell.cell_contents = self.replacement_of(original.cell_contents, names)

@@ -361,7 +361,7 @@ def entry_point(function: Dispatcher) -> Any:
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 
-def machine_code(function: Dispatcher, signature: Any) -> int:
+def machine_code_address(function: Dispatcher, signature: Any) -> int:
     """Return the address of the machine code of a compiled function, which uses numba's calling convention."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)

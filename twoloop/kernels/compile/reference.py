@@ -20,7 +20,7 @@ from numba.np.arrayobj import make_array
 from numba.np.numpy_support import as_dtype
 
 from twoloop.kernels.compile.caches import BoundedCache
-from twoloop.kernels.compile.linking import machine_code
+from twoloop.kernels.compile.linking import machine_code_address
 
 _REFERENCES: dict[str, Any] = {}  # all types `Reference`, by name
 
@@ -54,7 +54,7 @@ class Reference(types.Type):
         self.llvm_functions: set[str] = set()  # names of the generated functions among `functions`
         self.offsets: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = BoundedCache()  # addresses by tuples of functions, because `machine_code` is slow
+        self._addresses: Any = BoundedCache()  # addresses by tuples of functions: `machine_code_address` is slow
         for field, kind in self.arrays.items():
             self.offsets[field] = self.n_words
             self.n_words += 1 + kind.ndim
@@ -89,8 +89,8 @@ class Reference(types.Type):
             self.n_words += 1
             _define_llvm_call(self, field, signature)
 
-    def llvm_type(self, field: str) -> tuple[str, list[str]]:
-        """Return the type of the result and the types of the arguments of a generated function, as LLVM's text."""
+    def llvm_signature(self, field: str) -> tuple[str, list[str]]:
+        """Return the LLVM types, as text, of the result and of the arguments of a generated function."""
         signature = self.functions[field]
         return str(_llvm_type(signature.return_type)), [str(_llvm_type(kind)) for kind in signature.args]
 
@@ -118,7 +118,7 @@ class Reference(types.Type):
         """Return the address of the machine code of a function, or 0 if the function is missing."""
         if field in self.llvm_functions:
             return int(function)
-        return 0 if function is None else machine_code(function, self.functions[field])
+        return 0 if function is None else machine_code_address(function, self.functions[field])
 
 
 register_model(Reference)(models.OpaqueModel)

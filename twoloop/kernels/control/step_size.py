@@ -54,7 +54,7 @@ from twoloop.kernels.data.indices import (
     WIDEST_GAP,
 )
 from twoloop.kernels.evaluation.constraints import representable_step
-from twoloop.kernels.evaluation.inner_loop import evaluate, restore
+from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
@@ -203,7 +203,7 @@ def departure(w, tolerances, h, q, v, q1):
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
     """Project (q1, v1), predicted by a step of size h from (q, v), onto the constraints; return code and departure."""
     store_prediction(w, q1)
-    code = restore(f, w, t, q1, v1, inner_tol)
+    code = restore_constraints(f, w, t, q1, v1, inner_tol)
     return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0
 
 

@@ -255,7 +255,7 @@ def _record_entries(rows, pattern):
 
 
 @exact
-def _record_entries_near(f, t, q, shifts, position, rows, n_c, pattern):
+def _record_entries_at_displacements(f, t, q, shifts, position, rows, n_c, pattern):
     """Set `pattern` to 1 where C_q or A is nonzero at one of the positions q + max|q| shifts[k]; keep other entries.
 
     `position` and `rows` are scratch.
@@ -346,7 +346,9 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
             result_flags |= INDEFINITE
     _record_entries(rows, pattern)
     rows_nearby = results[end : end + n_rows * n].reshape((n_rows, n))
-    _record_entries_near(f, t, q, shifts, results[end + n_rows * n : end + n_rows * n + n], rows_nearby, n_c, pattern)
+    _record_entries_at_displacements(
+        f, t, q, shifts, results[end + n_rows * n : end + n_rows * n + n], rows_nearby, n_c, pattern
+    )
     return result_flags
 
 
@@ -388,15 +390,17 @@ def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, tolerance, ro
     f.jacobian(t, q, f.p, separate_rows)
     f.constraint_rate(t, q, f.p, separate[1])
     f.gamma(t, q, v, f.p, separate[2])
-    agree = _is_close(fused_rows, separate_rows, tolerance, rounding_errors)
+    is_close = _is_close(fused_rows, separate_rows, tolerance, rounding_errors)
     for k in range(1, 3):
-        agree = agree and _is_close(
+        is_close = is_close and _is_close(
             fused[k : k + 1].reshape((n_c, 1)), separate[k : k + 1].reshape((n_c, 1)), tolerance, rounding_errors
         )
     for i in range(n_c):
         for j in range(n):
             rounding_errors[i] += rounding * abs(separate_rows[i, j]) * abs(q[j])
-    return agree and _is_close(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, rounding_errors)
+    return is_close and _is_close(
+        fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, rounding_errors
+    )
 
 
 VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors

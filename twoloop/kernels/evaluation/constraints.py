@@ -113,7 +113,7 @@ ENLARGE_STEP_BELOW = 1e-11
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 # step of one-sided differences, relative to that of central differences, whose order is higher, 4 instead of 2
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0
-# rounding error of Gamma if terms of the sum G v cancel, relative to the largest term over largest_difference_step
+# rounding error of Gamma if terms of the sum G v cancel, relative to the ratio of the largest term to the largest step
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this times the required accuracy
 

@@ -55,7 +55,7 @@ from twoloop.kernels.evaluation.partition import (
     MAX_ITERATIONS,
     MIN_CORRECTION,
     ROUNDING_OF_CORRECTIONS,
-    check_redundant_rows,
+    check_all_rows,
     choose_oriented_partition,
     evaluate_and_factor_columns,
     factor_dependent_columns,
@@ -289,7 +289,7 @@ def _do_other_task(f, w, task, t, q, v):
         return partition_of_midpoint(f, w, t, q, v)
     if task == tasks.VERIFY_PATTERN:
         return _verify_pattern(w)
-    return check_redundant_rows(f, w, t, q, v)
+    return check_all_rows(f, w, t, q, v)
 
 
 @kernel(INNER)
@@ -297,9 +297,10 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """Do `task`, a number of tasks.py, at (t, q, v); return a code. The functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
         return _do_other_task(f, w, task, t, q, v)
-    if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN) and w.notes[TIME_IS_UP] == 1.0:
+    if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION) and w.notes[TIME_IS_UP] == 1.0:
         return STOPPED
-    if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT are for methods that integrate all coordinates
+    # methods that integrate all coordinates call the tasks EVALUATE_WITHOUT_PROJECTION and PROJECT
+    if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         return compute_accelerations_at(f, w, t, q, v, a)
     if task == tasks.PROJECT:
         return project_state(f, w, t, q, v, tolerance, a, lam)
@@ -341,9 +342,9 @@ def evaluate_state(f, w, t, q, v, tolerance, a, lam):
 
 
 @merged
-def evaluate_as_given(f, w, t, q, v, a):
+def evaluate_without_projection(f, w, t, q, v, a):
     """Store in `a` the accelerations at (q, v), a state that may be off the constraints; return a code."""
-    return f.inner(f, w, tasks.EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
+    return f.inner(f, w, tasks.EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
 
 
 @merged
@@ -356,14 +357,14 @@ def project(f, w, t, q, v, theta, a, lam):
 
 
 @merged
-def restore(f, w, t, q, v, tolerance):
+def restore_constraints(f, w, t, q, v, tolerance):
     """Compute the dependent entries of q and v from the independent ones, up to rounding; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Store the accelerations `a` and multipliers lam at the state (q, v) that `restore` stored; return a code."""
+    """Store `a` and lam, accelerations and multipliers at a state from `restore_constraints`; return a code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
@@ -398,7 +399,7 @@ def adopt_midpoint_partition(f, w, t_mid, state, new_state):
 
 
 @merged
-def check_redundant(f, w, t, q, v):
+def check_redundant_rows(f, w, t, q, v):
     """Return DONE if the accepted state (q, v) satisfies the redundant rows, else ROWS_CONTRADICT."""
     return f.inner(f, w, tasks.CHECK_REDUNDANT, t, q, v, 0.0, w.x, w.lam)
 
@@ -412,7 +413,7 @@ def rounding_floor(q):
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
     """Do a task by the code generated for the mechanism or, if it fails, by the general inner loop; return a code."""
-    if task == tasks.EVALUATE_AS_GIVEN:
+    if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         w.counters[N_EVALUATIONS] += 1
         w.counters[N_FACTORIZATIONS] += 1
         if f.own_accelerate(t, q, v, f.numbers, a):

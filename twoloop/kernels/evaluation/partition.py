@@ -41,7 +41,7 @@ from twoloop.kernels.evaluation.constraints import (
     kinematics,
     row_residual,
 )
-from twoloop.kernels.linalg.dense import contains, copy_matrix, largest_of, note_pattern
+from twoloop.kernels.linalg.dense import contains, copy_matrix, largest_of, update_pattern
 from twoloop.kernels.linalg.markowitz_lu import (
     SIZE,
     columns_of,
@@ -255,7 +255,7 @@ def _record_columns_of_entries(w):
 @compiled
 def record_entries(w):
     """Set w.pattern to 1 where w.G is not zero; return whether this changes w.pattern: then rewrite the programs."""
-    if not note_pattern(w.G, w.pattern):
+    if not update_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
     return True
@@ -499,7 +499,7 @@ def find_null_space(f, w, t, q):
 def restore_velocities(f, w, t, q, v, reuse_limit):
     """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, with rows and factors in w.
 
-    If no velocity changes by more than `reuse_limit`, w.Gamma by the fused callback stays valid (KNOWN).
+    If no velocity changes by more than `reuse_limit`, KNOWN stays set: w.Gamma, by the fused callback, is still valid.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size
@@ -528,7 +528,7 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
 
 
 @compiled
-def check_redundant_rows(f, w, t, q, v):
+def check_all_rows(f, w, t, q, v):
     """Return DONE if the accepted state (q, v), with its rows in w.G, satisfies all rows, else ROWS_CONTRADICT."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)

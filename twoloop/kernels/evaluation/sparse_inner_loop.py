@@ -538,7 +538,7 @@ def _do_other_task(f, w, task, t, q, v, a, lam):
 @kernel(INNER)
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """Do `task` at (t, q, v), see inner_loop.py; return a code. For SOLVE, q and v are the right-hand side."""
-    if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN):
+    if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
         code = STOPPED if w.notes[TIME_IS_UP] == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
             code = _project(f, w, t, q, v, tolerance)

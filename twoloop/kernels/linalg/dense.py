@@ -200,7 +200,7 @@ def has_new_entries(G, pattern):
 
 
 @compiled
-def note_pattern(G, pattern):
+def update_pattern(G, pattern):
     """Set `pattern` to 1 where G is not zero; return whether an entry of `pattern` changes."""
     if not has_new_entries(G, pattern):
         return False

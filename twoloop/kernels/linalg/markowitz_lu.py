@@ -79,25 +79,25 @@ def pivots_of(index):
 
 
 @merged
-def begin_upper(r):
+def index_of_upper_begins(r):
     """Return the position in `index` of the list of the first entries of the rows of U."""
     return N_HEAD + 3 * r
 
 
 @merged
-def end_upper(r):
+def index_of_upper_ends(r):
     """Return the position in `index` of the list of the ends of the rows of U."""
     return N_HEAD + 4 * r
 
 
 @merged
-def begin_lower(r):
+def index_of_lower_begins(r):
     """Return the position in `index` of the list of the first entries of the rows of L; it ends with the end of L."""
     return N_HEAD + 5 * r
 
 
 @merged
-def begin_entries(r):
+def index_of_entries(r):
     """Return the position in `index` of the lists of rows, columns and sources of the entries."""
     return N_HEAD + 6 * r + 1
 
@@ -289,18 +289,18 @@ def _store_program(index, counts, lists):
         r > MAX_SPARSE_ROWS and subtractions > MAX_SPARSE_RATIO * n_dense
     ):
         return False
-    row_list, column_list = begin_entries(r), begin_entries(r) + n_slots
+    row_list, column_list = index_of_entries(r), index_of_entries(r) + n_slots
     source, target = column_list + n_slots, column_list + 2 * n_slots
     slot = r
     for k in range(r - 1, -1, -1):
-        index[begin_upper(r) + k] = slot
+        index[index_of_upper_begins(r) + k] = slot
         slot += counts[ACTIVE_ROW_SIZE, k]
-        index[end_upper(r) + k] = slot
+        index[index_of_upper_ends(r) + k] = slot
     index[N_SLOTS], index[FIRST_LOWER] = n_slots, slot
     for k in range(r):
         i = rows[k]
-        index[begin_lower(r) + k] = slot
-        next_upper = index[begin_upper(r) + k]
+        index[index_of_lower_begins(r) + k] = slot
+        next_upper = index[index_of_upper_begins(r) + k]
         for n in range(counts[ROW_SIZE, i]):
             j = counts[COLUMN_POSITION, lists[COLUMNS, i, n]]
             entry = k
@@ -312,12 +312,12 @@ def _store_program(index, counts, lists):
                 next_upper += 1
             counts[LOOKUP, j] = entry
             index[row_list + entry], index[column_list + entry], index[source + entry] = k, j, lists[SOURCES, i, n]
-        for entry in range(index[begin_lower(r) + k], slot):
+        for entry in range(index[index_of_lower_begins(r) + k], slot):
             j = index[column_list + entry]
-            for u in range(index[begin_upper(r) + j], index[end_upper(r) + j]):
+            for u in range(index[index_of_upper_begins(r) + j], index[index_of_upper_ends(r) + j]):
                 index[target] = counts[LOOKUP, index[column_list + u]]
                 target += 1
-    index[begin_lower(r) + r] = slot
+    index[index_of_lower_begins(r) + r] = slot
     return True
 
 
@@ -370,7 +370,7 @@ def factor(entries, index, values):
             for k in range(r):
                 A[i, k] = entries[rows[i] * index[WIDTH] + columns[k]]
         return lu_factor(A, pivots_of(index))
-    source = begin_entries(r) + 2 * index[N_SLOTS]
+    source = index_of_entries(r) + 2 * index[N_SLOTS]
     for s in range(index[N_SLOTS]):
         values[s] = entries[index[source + s]]
     return run_program(index, values)
@@ -383,9 +383,9 @@ def run_program(index, values):
     The result is negative in the cases that `factor` describes.
     """
     r, n_slots = index[SIZE], index[N_SLOTS]
-    column_list = begin_entries(r) + n_slots
+    column_list = index_of_entries(r) + n_slots
     target = column_list + 2 * n_slots
-    upper, end, lower = begin_upper(r), end_upper(r), begin_lower(r)
+    upper, end, lower = index_of_upper_begins(r), index_of_upper_ends(r), index_of_lower_begins(r)
     smallest, largest, largest_multiplier = 1e300, 0.0, 0.0
     for i in range(r):
         for s in range(index[lower + i], index[lower + i + 1]):
@@ -404,7 +404,7 @@ def run_program(index, values):
         values[i] = 1.0 / values[i]
     if not largest_multiplier <= MAX_MULTIPLIER:
         return -1.0
-    row_list = begin_entries(r)
+    row_list = index_of_entries(r)
     for u in range(r, index[FIRST_LOWER]):  # divide the rows of U by the diagonal, which makes solutions faster
         values[u] *= values[index[row_list + u]]
     return smallest / largest if r > 0 else 1.0
@@ -430,7 +430,7 @@ def solve(index, values, x):
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), pivots_of(index), x)
         return
-    row_list, column_list = begin_entries(r), begin_entries(r) + n_slots
+    row_list, column_list = index_of_entries(r), index_of_entries(r) + n_slots
     for s in range(first_lower, n_slots):
         x[index[row_list + s]] -= values[s] * x[index[column_list + s]]
     for i in range(r):
@@ -465,7 +465,7 @@ def solve_transposed(index, values, x):
                 x[k], x[pivot_row] = x[pivot_row], x[k]
         return
     n_slots, first_lower = index[N_SLOTS], index[FIRST_LOWER]
-    row_list, column_list = begin_entries(r), begin_entries(r) + n_slots
+    row_list, column_list = index_of_entries(r), index_of_entries(r) + n_slots
     for s in range(first_lower - 1, r - 1, -1):
         x[index[column_list + s]] -= values[s] * x[index[row_list + s]]
     for i in range(r):

@@ -35,14 +35,14 @@ from twoloop.kernels.linalg.dense import (
     invert_definite,
     ldl_factor,
     ldl_solve,
-    note_pattern,
+    update_pattern,
 )
 from twoloop.kernels.linalg.markowitz_lu import (
-    begin_entries,
     choose_order,
     clear_lists,
     columns_of,
     determinant_sign,
+    index_of_entries,
     put_entry,
     rows_of,
     run_program,
@@ -276,7 +276,7 @@ def _largest_entry(A):
 def _write_augmented_program(w):
     """Store in w.index_a the program that factors the augmented matrix [M G^T; G 0]; return choose_order's code."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
-    note_pattern(w.M, w.mass_pattern)
+    update_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
     matrix = views_of_lists(index, values)
     scale = 2.0 ** np.round(np.log2(_largest_entry(w.G) / _largest_entry(w.M))) if rows.size > 0 else 1.0
@@ -299,7 +299,7 @@ def _write_augmented_program(w):
 def _run_augmented_program(w):
     """Store the factors of the augmented matrix in w.values_a; return False if the program does not suit it."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
-    source = begin_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
+    source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
         entry = index[source + s]
         values[s] = w.augmented[entry] * (scale if entry >= first_of_mass else 1.0)
@@ -310,7 +310,7 @@ def _run_augmented_program(w):
 def factor_augmented(f, w):
     """Factor the augmented matrix; if its factors are not sparse, set f.flags[FORM] to a dense form; return a code."""
     w.counters[N_FACTORIZATIONS] += 1
-    has_new_entry = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
+    has_new_entry = f.flags[CONSTANT_MASS] == 0 and update_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or has_new_entry or not _run_augmented_program(w):
         if not finite(w.M):
             return NOT_FINITE

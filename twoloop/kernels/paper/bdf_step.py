@@ -326,10 +326,10 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[NEXT_ORDER] = min(memory[ORDER] + 1.0, options[HIGHEST])
     else:
         error, factor = _choose_order(options, memory, tolerances, trial, y, y1, d)
-        distance = departure(w, tolerances, h, y[:n], y[n:], y1[:n])
-        if distance > 0.0:
-            factor = min(factor, max(SAFETY / distance, MIN_STEP_FACTOR))
-        error = max(error, distance)
+        departure_error = departure(w, tolerances, h, y[:n], y[n:], y1[:n])
+        if departure_error > 0.0:
+            factor = min(factor, max(SAFETY / departure_error, MIN_STEP_FACTOR))
+        error = max(error, departure_error)
     memory[HAS_TRIAL] = 1.0
     _update_differences(memory, trial, y1, d)
     return Attempt(DONE, error, factor)

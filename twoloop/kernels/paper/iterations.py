@@ -12,7 +12,7 @@ import numpy as np
 from twoloop.kernels.control.step_size import project_prediction
 from twoloop.kernels.data.common import compiled, exact, inlined, merged
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL
-from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_floor
+from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
@@ -227,7 +227,7 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
                 sum_v += b[k] * A_stage[k, m]
             q1[m] = q[m] + h * sum_q
             v1[m] = v[m] + h * sum_v
-        code = restore(f, w, t + h, q1, v1, tolerance)
+        code = restore_constraints(f, w, t + h, q1, v1, tolerance)
         if code != DONE:
             return code
         change = _largest_change(w.independent, q1, v1, q_old, v_old)
@@ -275,4 +275,4 @@ def estimate_and_extrapolate(f, w, factor, inner_tol, t, tolerances, q, v, q_ful
     for m in range(q.size):
         q1[m] += factor * (q1[m] - q_full[m])
         v1[m] += factor * (v1[m] - v_full[m])
-    return restore(f, w, t, q1, v1, inner_tol), error
+    return restore_constraints(f, w, t, q1, v1, inner_tol), error

@@ -18,7 +18,7 @@ import numpy as np
 from twoloop.kernels.control.step_size import departure, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, N_OUTER, RTOL
-from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
+from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 
 HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES is exact up to order 13
 N_TERMS = HIGHEST + 2  # number of stored differences phi_i, of coefficients g_i and of coefficients G_i
@@ -303,7 +303,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _compute_coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
     memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # the order of the next attempt if an evaluation fails in this attempt
-    code = evaluate_as_given(f, w, t + h, q1, v1, a1)
+    code = evaluate_without_projection(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     weight_v, weight_q = _scratch_rows(memory, n)

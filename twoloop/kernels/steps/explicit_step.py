@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.kernels.control.step_size import commit_nothing, departure, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, gap_ratio, inlined, kernel
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, N_OUTER, NEARLY_SINGULAR, RTOL
-from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, evaluate_state, project
+from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
 from twoloop.kernels.linalg.dense import copy
 
 # indices of the scalars in `options`, for arguments of options_array. After the scalars, `options` contains A (s, s),
@@ -181,7 +181,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if is_free:
-            code = evaluate_as_given(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
+            code = evaluate_without_projection(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
         else:
             code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
         if code != DONE:

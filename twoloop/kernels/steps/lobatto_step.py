@@ -56,7 +56,7 @@ from twoloop.kernels.data.indices import (
     SINGULAR,
     UNSUITED,
 )
-from twoloop.kernels.evaluation.inner_loop import check_redundant, project, renew_partition
+from twoloop.kernels.evaluation.inner_loop import check_redundant_rows, project, renew_partition
 from twoloop.kernels.evaluation.partition import MIN_CORRECTION
 from twoloop.kernels.linalg.dense import copy
 
@@ -300,7 +300,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
         row[3 * n + i] = data[lam + LANES * i + k]
     if w.rows_v.size < w.Rate.size:
         w.notes[BY_GENERAL] = 0.0
-        if check_redundant(f, w, t, row[:n], row[n : 2 * n]) != DONE:
+        if check_redundant_rows(f, w, t, row[:n], row[n : 2 * n]) != DONE:
             return False
     copy(row, state)
     return True

@@ -50,8 +50,8 @@ from twoloop.kernels.data.indices import (
     STRAIGHT,
 )
 from twoloop.kernels.evaluation import operations as op
-from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
-from twoloop.kernels.evaluation.tasks import EVALUATE_AS_GIVEN, SOLVE
+from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
+from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 
@@ -393,7 +393,7 @@ def _compute_series(f, w, options, memory, t, state, unit, which):
     memory[TARGET] = which
     if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # generated code leaves no factors in w
         q, v, a = state[:n], state[n : 2 * n], series_accelerations(memory, n)
-        code = f.general(f, w, EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
+        code = f.general(f, w, EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
         if code != DONE:
             return code
     return compute_coefficients(f, w, options, memory, t, state, unit)
@@ -458,7 +458,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
     """Return the defect at t + s h, relative to the allowed defect (infinity if evaluation fails); q, v, a: scratch."""
     series_a = series_accelerations(memory, q.size)
     _evaluate_series(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
-    if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
+    if evaluate_without_projection(f, w, t + s * h, q, v, a) != DONE:
         return np.inf
     return defect_ratio(tolerances, h, order, series_a, a, q, v)
 
