@@ -111,7 +111,7 @@ def reason_to_distrust(folder: Path) -> str:
             continue
         except OSError as error:
             return f"{each} cannot be examined ({error.strerror})"
-        # in a sticky folder, only its owner can replace a file or folder
+        # in a sticky folder, a file or folder can be replaced only by the user who owns the file or folder
         is_sticky = each != real_path and status.st_mode & stat.S_ISVTX
         reason = _reason_of_owner(status) if is_sticky else _reason_of_mode(status)
         if reason:
@@ -412,7 +412,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         digests = digests_of(function)
         dispatcher = njit(**options)(with_unique_name(function, digests))
         if digests is not None:
-            # so that a callback that uses this function as a closure variable does not compile the function again
+            # a callback that uses this function as a closure variable need not compile the function again
             _COMPILED_DIGESTS[dispatcher] = digests
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _CompiledFunctionCache(dispatcher.py_func, *digests, "")

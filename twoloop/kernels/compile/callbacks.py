@@ -116,7 +116,7 @@ VECTOR = numba.types.float64[::1]
 READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # its memory layout is that of VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
-# sizes of the vectors that callbacks receive, except p: names of attributes of a system; lam: multipliers of C only
+# size of each vector that callbacks receive, as the name of an attribute of a system; lam: the multipliers of C
 STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 

@@ -24,7 +24,7 @@ from numba.core.types import Type
 
 from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, options_of
 
-# libraries whose functions are hashed by name only; for other versions of numba or numpy, all digests change anyway
+# libraries whose functions are hashed by name only; files of machine code also record the versions of numba and numpy
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
 # largest number of code objects whose loaded names are cached: runs create new functions with the same code, and to

@@ -1,4 +1,4 @@
-"""Compile kernels together with their helpers, for which no separate machine code is emitted.
+"""Compile each kernel together with its helpers; no machine code is emitted for helpers alone.
 
 By default, numba optimises each function together with all functions that it calls, and emits its machine code. So a
 helper at depth five is optimised six times, and the machine code emitted for the helper alone is never called. Here,
@@ -116,7 +116,7 @@ def _element_address(
 
 _numba_call_type: Any = BaseFunction.get_call_type
 _call_signatures: dict[Any, tuple[Any, Any]] = {}
-# options of numba and their texts, by the id of the options; storing the options prevents that their id is reused
+# options of numba and their texts, by the id of the options; while they are stored, no other object gets their id
 _option_texts: dict[int, tuple[Any, str]] = {}
 
 

@@ -176,7 +176,7 @@ class _FieldTypes(AttributeTemplate):
 @lower_getattr_generic(Reference)
 def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
     """Emit code that returns the value of a field: numba's structure of an array or, for a function, the pointer."""
-    if field in typ.functions:  # `call` below loads the address of the function from the table
+    if field in typ.functions:  # `lower_call` loads the address of the function from the table
         return pointer
     kind, offset = typ.arrays[field], typ.offsets[field]
     item_type = context.get_data_type(kind.dtype)

@@ -26,7 +26,7 @@ from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.operations import result_of_operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
-NO_ENTRY = 1e-12  # largest entry of C_q, relative to the largest one in its row, that counts as zero, rounded
+NO_ENTRY = 1e-12  # largest entry of C_q, relative to the largest one in its row, that counts as a rounding error
 MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares in column_units
 NEGLIGIBLE = 1e-6  # largest coordinate, relative to the largest one of its row, that linear_ranges leaves out
 
@@ -298,7 +298,8 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
     - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results, and scratch
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
-    force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # ends of the parts of `results`
+    # ends of the force, of C, of the rates (C_t, b) and of Gamma in `results`
+    force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows
     f.mass(t, q, f.p, mass)
     f.force(t, q, v, f.p, results[:force])
     f.constraint(t, q, f.p, results[force:C])
@@ -364,7 +365,7 @@ def rows_at_positions(f, t, positions, n_c, rows):
 
 @exact
 def _is_close(fused, separate, tolerance, rounding_errors):
-    """Return whether rows i of both matrices differ by at most tolerance * max|separate| + rounding_errors[i]."""
+    """Return whether entries (i, j) of both matrices differ by up to tolerance * max|separate| + rounding_errors[i]."""
     largest = 0.0
     for i in range(separate.shape[0]):
         for j in range(separate.shape[1]):

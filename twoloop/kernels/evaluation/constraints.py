@@ -105,11 +105,11 @@ def gather_independent_columns(G, rate, rows, independent, D):
 # to max|q|. MIN_STEP_RATIO: smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
-ROUNDING_DISAGREEMENT = 1e-9  # largest difference between the two values of Gamma, relative, that rounding may cause
-# the step of the finite differences is doubled if the values of Gamma with e and 2 e differ by less than this,
-# relative: a larger step reduces rounding errors
+ROUNDING_DISAGREEMENT = 1e-9  # largest relative difference of Gamma with the steps e and 2 e that rounding may cause
+# the step e is doubled if the relative difference of Gamma with the steps e and 2 e is smaller than this, because
+# rounding errors are smaller with a larger step
 ENLARGE_STEP_BELOW = 1e-11
-# weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2: with the step e, and with the step 2 e
+# weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 # step of one-sided differences, relative to that of central differences, whose order is higher, 4 instead of 2
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0
@@ -138,7 +138,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(notes, t, e):
-    """Return 1 for differences after t, or -1 for differences before t, if C_t or b jumps near t; else 0, for both."""
+    """Return 0 for central differences or, if C_t or b jumps near t, 1 for differences after t, -1 for before t."""
     since_jump, until_jump = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0

@@ -336,7 +336,7 @@ def evaluate(f, w, t, q, v, tolerance, a):
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
     """Compute the dependent entries of q and v, the accelerations `a` and the multipliers lam; return a code.
 
-    The errors are rounding errors, as a state that may be accepted requires; for other states `evaluate` is faster.
+    Dependent entries are accurate up to rounding, as accepted states must be; for other states `evaluate` is faster.
     """
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 

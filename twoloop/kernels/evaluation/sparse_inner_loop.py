@@ -439,7 +439,7 @@ def _is_on_constraints(f, w, q):
 
 
 @compiled
-def _project(f, w, t, q, v, theta):
+def _project_state(f, w, t, q, v, theta):
     """Project (q, v) onto the constraints in place; return a code.
 
     On return, the factors in w are those at q before the last correction.
@@ -541,7 +541,7 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
         code = STOPPED if w.notes[TIME_IS_UP] == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
-            code = _project(f, w, t, q, v, tolerance)
+            code = _project_state(f, w, t, q, v, tolerance)
         if code == DONE:
             code = factor_equations_at(f, w, t, q)
         return _compute_accelerations(f, w, t, q, v, a) if code == DONE else code
@@ -551,7 +551,7 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
         return _do_other_task(f, w, task, t, q, v, a, lam)
     code = DONE
     if task != tasks.ACCELERATIONS:
-        code = _project(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)
+        code = _project_state(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)
         if code != DONE or task == tasks.RESTORE:
             return code
     code = _compute_accelerations(f, w, t, q, v, a)

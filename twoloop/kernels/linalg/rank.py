@@ -177,7 +177,7 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # largest amount, relative to a bound of pivots, by which a pivot may be below the bound
+BOUND_ROUNDING = 1e-12  # largest amount, relative to a bound of pivots, by which rounding may put a pivot below it
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
 # smallest ratio of the smallest to the largest eigenvalue of M at which pivots above a bound show that all rows are

@@ -140,7 +140,7 @@ def elimination_order(
         if i not in early_row_set:
             rows_by_joint.setdefault(frozenset(bodies), []).append(i)
     joints = list(rows_by_joint)
-    joints_of: list[list[int]] = [[] for _ in range(n_q)]  # for each body: indices of its joints
+    joints_of: list[list[int]] = [[] for _ in range(n_q)]  # indices of the joints of each body
     for k, joint in enumerate(joints):
         for body in joint:
             joints_of[body].append(k)
@@ -247,7 +247,7 @@ def _minimum_degree(
 
 Entries = tuple[Integers, Integers]  # row indices and column indices of the nonzero entries of a matrix
 
-# indices of the sizes with which a program begins; the functions below return the sections that follow
+# indices of the sizes with which a program begins; functions at the end of this module return its other sections
 N_COORDINATES, N_PIVOTS, N_OFF_DIAGONAL, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # largest number of updates (multiplications) with which a program is always written
 # largest number of updates of a longer program, relative to n^3 for n pivots: with more, dense factors are faster

@@ -22,7 +22,7 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-SAFETY = 0.9  # safety factor on the step size after a rejected step; smallest step-size ratio after an accepted step
+SAFETY = 0.9  # safety factor on the step size after a rejected step, and smallest ratio after an accepted step
 MIN_STEP_FACTOR = 0.2  # smallest step-size ratio after a rejected step, or after a step far from its prediction
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
 STEP_SIZE_FACTOR = 6.0  # additional factor on the error that determines the next step size, to avoid rejections (VODE)
@@ -218,16 +218,16 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
     # with unequal steps, the interpolation of the history has an error, too; as in DASSL, the larger error counts
-    interpolation = spans[0] / spans[k]
+    interpolation_error = spans[0] / spans[k]
     for j in range(k):
-        interpolation += spans[0] / spans[j] - 1.0 / (j + 1.0)
-    error = norm * max(spans[0] / spans[k], abs(interpolation))
+        interpolation_error += spans[0] / spans[j] - 1.0 / (j + 1.0)
+    error = norm * max(spans[0] / spans[k], abs(interpolation_error))
     here = norm * constants[k]
-    below, above = np.inf, np.inf
+    below, error_above = np.inf, np.inf
     if k > 1:
         below = ERROR_FACTOR * ORDER_FACTOR * constants[k - 1] * _difference_norm(tolerances, y, y1, d, 1.0, trial[k])
     if k < options[HIGHEST] and depth > k:
-        above = (
+        error_above = (
             ERROR_FACTOR * ORDER_FACTOR * constants[k + 1] * _difference_norm(tolerances, y, y1, d, -1.0, trial[k + 1])
         )
     memory[NEXT_ORDER] = k
@@ -237,7 +237,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
         return error, max(SAFETY * error ** (-1.0 / (k + 1)), MIN_STEP_FACTOR)
     factor = (STEP_SIZE_FACTOR * here) ** (-1.0 / (k + 1))
     if memory[AGE] >= k:  # estimates for other orders require k + 1 steps at this order
-        lower, higher = (STEP_SIZE_FACTOR * below) ** (-1.0 / k), (STEP_SIZE_FACTOR * above) ** (-1.0 / (k + 2))
+        lower, higher = (STEP_SIZE_FACTOR * below) ** (-1.0 / k), (STEP_SIZE_FACTOR * error_above) ** (-1.0 / (k + 2))
         if lower > max(factor, higher):
             memory[NEXT_ORDER] = k - 1
         elif higher > factor:
@@ -268,7 +268,7 @@ def _update_differences(memory, trial, y1, d):
 
 @compiled
 def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
-    """Compute a step of the Gauss method of order 6, to fill the history with fixed step size; return a code."""
+    """Compute a step of the Gauss method of order 6, to fill the history if the step size is fixed; return a code."""
     s, n = STARTER_STAGES, w.Q.size
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     A_stage = scratch[: s * n].reshape((s, n))
