@@ -133,9 +133,10 @@ def _is_within_bounds(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Fill `h` with step sizes (s), `changes` with changes of counters, and `used_newton` (Newton's method was used).
+    """Fill `h` with step sizes (s), `changes` with changes of counters, and `used_newton` with flags of Newton steps.
 
-    `steps`: rows of out_steps; `counts`: numbers of rejections and partitions, before (on return: after) these steps.
+    `steps`: rows of out_steps; `counts`: numbers of rejections and partitions, before the steps on entry, after them on
+    return.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -357,15 +358,15 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
 
     The run has n_rows states after the first, and n_steps steps; `region` contains the bounds for IN_CHECKED_REGION.
     """
-    jumped = n_rows > 0 and _has_velocity_jump(b, n_rows, w.Q.size)
+    has_jumped = n_rows > 0 and _has_velocity_jump(b, n_rows, w.Q.size)
     is_inside = region.shape[1] > 0 and _is_within_bounds(b.t[: 1 + n_rows], b.states, region)
-    near_singular = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
-    undersampled = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
-    nothing_to_check, width = not (jumped or near_singular or undersampled), b.steps.shape[1]
+    is_near_singular = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
+    is_undersampled = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
+    nothing_to_check, width = not (has_jumped or is_near_singular or is_undersampled), b.steps.shape[1]
     begin = b.report.size - N_HEAD - 1 - n_rows - width * n_steps
     report = b.report[begin:]
     report[N_STATES], report[N_STEPS], report[NOTHING_TO_CHECK] = 1 + n_rows, n_steps, nothing_to_check
-    report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = jumped, is_inside, code, is_new
+    report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = has_jumped, is_inside, code, is_new
     report[DEFECT_KNOWN] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
     report[DEFECT], report[LONGEST_GAP] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
     for k in range(N_COUNTERS):

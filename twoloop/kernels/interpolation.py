@@ -25,8 +25,8 @@ from twoloop.kernels.evaluation.partition import min_pivot_ratio, partition_is_p
 from twoloop.kernels.linalg.dense import copy, largest_of
 
 TABLE = types.int64[:, ::1]
-CHECKED_AT = (0.3, 0.7)  # times at which polynomials are checked, as fractions of an interval
-N_CHECKED = len(CHECKED_AT)
+CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fractions of an interval
+N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
 # v gets its own polynomial if the rounding error of q, divided by the duration of the interval, exceeds this number of
@@ -46,9 +46,7 @@ def _node_range(low, high, i, last):
 
     The states are centred at the interval, and between `low` and `high`.
     """
-    if (
-        last > i + 1
-    ):  # `fill_intervals` has computed interior states of the interval: the polynomial interpolates no others
+    if last > i + 1:  # the interval has interior states from `fill_intervals`, the only ones that are interpolated
         return i, last
     n_states = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - n_states // 2, high + 1 - n_states))
@@ -252,7 +250,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
       about equal distances, and have no node inside the interval;
     - else, with more than two nodes, the change by the last node, if it is at most 1 or if the kind is VELOCITIES,
       because accelerations then contain the noise of stiff modes;
-    - else the difference of positions, velocities and accelerations at CHECKED_AT from the constraints and the
+    - else the difference of positions, velocities and accelerations at CHECKED_FRACTIONS from the constraints and the
       equations of motion; that of accelerations, times h over the number of coefficients, counts as one of velocities.
     """
     n = w.Q.size
@@ -271,8 +269,8 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
         if kind < kinds.ACCELERATIONS and last == i + 1 and hi - lo > 1 and _has_similar_gaps(t, lo, hi):
             continue
         if hi - lo > 1:
-            for k in range(N_CHECKED):
-                s = CHECKED_AT[k]
+            for k in range(N_CHECKED_TIMES):
+                s = CHECKED_FRACTIONS[k]
                 _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
                 shorter_size = size_v - 2 if kind == kinds.APART else 0
                 _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter_size, q_1, v_1)
@@ -280,8 +278,8 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
             if out[g] <= 1.0 or kind == kinds.VELOCITIES:
                 continue
         out[g] = 0.0
-        for k in range(N_CHECKED):
-            s = CHECKED_AT[k]
+        for k in range(N_CHECKED_TIMES):
+            s = CHECKED_FRACTIONS[k]
             time = t[i] + s * h
             _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
             _evaluate_accelerations(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)

@@ -100,9 +100,8 @@ def keep_unused_workspace(work: Work) -> None:
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
-    _unused_workspaces[work.sizes] = (
-        unused  # insert at the end, so that the dictionary begins with the sizes used longest ago
-    )
+    # insert at the end of the dictionary, which then begins with the sizes that were used longest ago
+    _unused_workspaces[work.sizes] = unused
     for oldest in list(_unused_workspaces)[:-1]:
         if sum(map(len, list(_unused_workspaces.values()))) <= MAX_UNUSED:
             break

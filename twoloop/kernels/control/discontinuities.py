@@ -8,7 +8,7 @@ b are sampled ahead of the step, which costs less than evaluations of the equati
   second differences as large as the range. The step then ends at the change, as it does where a value is not finite.
 - If forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples
   follow the motion: the parabola of the present position, velocity and acceleration. One set of samples is taken for
-  one long step, or for all short steps that end within LEAST_DISTANCE spacings.
+  one long step, or for all short steps that end within MIN_TIME_AHEAD spacings.
 - All other samples are samples in time alone, at the state at which the step begins. Their spacing is also limited to a
   fraction of the step size.
 - The shortest time between two changes, and the shortest duration of a change within a short step, are recorded. If the
@@ -159,7 +159,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 
 N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
-LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
+MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
 # ratio of second difference to range of the samples above which a change is sudden, as in a pulse four spacings wide
 SUDDEN_RATIO = 0.1
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
@@ -233,8 +233,8 @@ def _find_sudden_bend(values, n, slope, least, within):
     limit = SUDDEN_RATIO * (high - low)
     if high - low > least:
         for k in range(1, n):
-            second = values[k + 1] - 2.0 * values[k] + values[k - 1]
-            if abs(second) > limit and not (within and _is_smooth_bend(values, k, n)):
+            second_difference = values[k + 1] - 2.0 * values[k] + values[k - 1]
+            if abs(second_difference) > limit and not (within and _is_smooth_bend(values, k, n)):
                 return k, limit
     return 0, limit
 
@@ -293,11 +293,11 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
     difference of two samples above `limit` may be a sudden change.
     """
     values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
-    soonest = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
+    first_recorded_time = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
     for k in range(index - 1, index + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
         is_recorded = low - margin <= clock[at.LAST_CHANGE] <= high + margin
-        if is_recorded or k + 2 > n or low - spacing < soonest:  # a change needs samples on both sides
+        if is_recorded or k + 2 > n or low - spacing < first_recorded_time:  # a change needs samples on both sides
             continue
         if k == 0:
             _sample_forces(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE_ROW])
@@ -366,9 +366,9 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
             high = max(max(values[0], values[1]), max(values[3], values[4]))
             excess = max(values[2] - high, low - values[2])
             if excess > max(MIN_STEEPNESS_RATIO * (high - low), min_force_range if j < q.size else min_rate_range):
-                first = _locate_change(f, w, max(t - spacing, begin), time, 1, j, q, v, a)
-                second = _locate_change(f, w, time, end + spacing, 2, j, q, v, a)
-                clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], second - first)
+                t_first = _locate_change(f, w, max(t - spacing, begin), time, 1, j, q, v, a)
+                t_second = _locate_change(f, w, time, end + spacing, 2, j, q, v, a)
+                clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], t_second - t_first)
 
 
 @compiled
@@ -398,18 +398,18 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
     """Store the time of the next sudden change along the motion in `clock`.
 
-    The motion is sampled over the step size, or over LEAST_DISTANCE spacings of samples if that is longer.
+    The motion is sampled over the step size, or over MIN_TIME_AHEAD spacings of samples if that is longer.
     """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
-    duration = min(max(size, LEAST_DISTANCE * spacing), last - t)
+    duration = min(max(size, MIN_TIME_AHEAD * spacing), last - t)
     clock[at.SAMPLES_MOTION] = 1.0
-    first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
+    t_first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
         f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, a
     )
-    if first < np.inf and not _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
+    if t_first < np.inf and not _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
         A[:] = 0.0
-        first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
+        t_first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
@@ -419,9 +419,9 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
         if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
             clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], duration / N_SAMPLES
-            clock[at.DISCONTINUITY] = first
-    if first < clock[at.DISCONTINUITY_OF_MOTION] or clock[at.DISCONTINUITY_OF_MOTION] <= t + CHANGE_MARGIN * spacing:
-        clock[at.DISCONTINUITY_OF_MOTION] = first
+            clock[at.DISCONTINUITY] = t_first
+    if t_first < clock[at.DISCONTINUITY_OF_MOTION] or clock[at.DISCONTINUITY_OF_MOTION] <= t + CHANGE_MARGIN * spacing:
+        clock[at.DISCONTINUITY_OF_MOTION] = t_first
 
 
 @compiled
@@ -434,12 +434,15 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # the next samples must find the same change again
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # the next samples must find the same change again
     while begin < min(t + size, last, next_change):
-        present_spacing, at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if at_change else max_spacing, False
+        present_spacing, is_at_change = (
+            min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing,
+            False,
+        )
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], present_spacing)
-        first, begin = first_discontinuity(f, w, tolerances, clock, t, begin, present_spacing, last, 0.0, q, v, a)
-        next_change = min(next_change, first)
+        t_first, begin = first_discontinuity(f, w, tolerances, clock, t, begin, present_spacing, last, 0.0, q, v, a)
+        next_change = min(next_change, t_first)
         clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = begin, present_spacing
     return next_change
 
@@ -450,18 +453,18 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-    shortest = (1.0 if control[at.BY_STATE] == 1.0 else LEAST_DISTANCE) * spacing
-    if control[at.SAMPLE_MOTION] == 1.0 and shortest < size < (N_SAMPLES + CHANGE_MARGIN) * spacing:
+    min_size = (1.0 if control[at.BY_STATE] == 1.0 else MIN_TIME_AHEAD) * spacing
+    if control[at.SAMPLE_MOTION] == 1.0 and min_size < size < (N_SAMPLES + CHANGE_MARGIN) * spacing:
         _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A)
     t_near = t + CHANGE_MARGIN * min(spacing, size / MIN_SAMPLES_IN_STEP)
     next_change = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > t_near else np.inf
-    next_of_motion = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > t_near else np.inf
-    at_change = next_change == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
+    next_change_of_motion = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > t_near else np.inf
+    is_at_change = next_change == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
     # do not sample again near the end of a run: samples of ever shorter spans would find the same change again
-    if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + CHANGE_MARGIN) * clock[at.SAMPLED_EVERY]):
+    if control[at.BY_TIME] == 1.0 and not (is_at_change and size <= (1.0 + CHANGE_MARGIN) * clock[at.SAMPLED_EVERY]):
         next_change = _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = next_change
-    size = min(size, representable_step(t, min(next_change, next_of_motion) - t))
+    size = min(size, representable_step(t, min(next_change, next_change_of_motion) - t))
     is_short = size < SHORT_STEP * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.APART]
     if control[at.BY_TIME] == 1.0 and is_short and size < control[at.APART] and clock[at.COMPARED] < t:
         _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a)

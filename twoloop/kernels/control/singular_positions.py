@@ -22,7 +22,9 @@ from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a singular position is suspected
-COLLAPSED = 0.2  # step size, relative to the longest of the last steps, below which pivots of C_q are computed anew
+COLLAPSED_STEP = (
+    0.2  # step size, relative to the longest of the last steps, below which pivots of C_q are computed anew
+)
 # ratio of the smallest pivot of C_q to its largest value so far below which a singular position is near
 SINGULAR_PIVOT = 0.2
 STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
@@ -79,8 +81,8 @@ def ends_at_singular(f, w, control, clock):
 @merged
 def fails_at_singular(f, clock, size):
     """Return whether a failed step of the static form, near a singular position, is too short to be repeated."""
-    near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
-    return f.flags[FORM] == STATIC and near and size < GIVE_UP_BELOW * clock[at.H_LONG]
+    is_near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
+    return f.flags[FORM] == STATIC and is_near and size < GIVE_UP_BELOW * clock[at.H_LONG]
 
 
 @merged
@@ -90,8 +92,8 @@ def retry_projected(f, w, control, clock, size):
     Near a singular position, accelerations of stages off the constraints have large errors. A long step that ends well
     beyond the position may succeed where shorter steps fail: the first repetition has at least the size H_LONG.
     """
-    near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
-    if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
+    is_near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
+    if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not is_near:
         return False
     clock[at.H_NEXT] = SHRINKAGE * size
     if w.notes[NEARLY_SINGULAR] == 0.0:
@@ -181,14 +183,14 @@ def check_partition(f, w, control, clock, size, at_output, state):
             w.notes[NEARLY_SINGULAR] = 0.0
         return at.CONTINUE
     n = w.Q.size
-    straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
+    uses_generated_code = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
     interval = 1
     if f.flags[FORM] == AUGMENTED:
         interval += w.independent_v.size // FREEDOMS_PER_CHECK
-    if straight:
+    if uses_generated_code:
         interval = CHECK_INTERVAL
     is_checked = w.counters[N_ACCEPTED] % interval == 0
-    if is_checked and (straight or f.flags[FORM] != NULL_SPACE):
+    if is_checked and (uses_generated_code or f.flags[FORM] != NULL_SPACE):
         find_tangents(f, w, clock[at.T], state[:n])
     if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
@@ -199,7 +201,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
     w.notes[NEAR_NOW] = 0.0
     if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
         w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
-    if size < COLLAPSED * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[at.BRIDGE] == 1.0:
+    if size < COLLAPSED_STEP * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[at.BRIDGE] == 1.0:
         # the pivots of an old partition may not show that the motion approaches a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST

@@ -64,7 +64,10 @@ KEEP_BELOW_RATIO = 1.2
 
 @compiled
 def step_size_ratio(rule, past, h, error):
-    """Return the ratio of the next step size to h by `rule` and history `past`; `error` of the step: in tolerances."""
+    """Return the ratio of the next step size to h, by the step-size `rule`, from `error` (in tolerances) and `past`.
+
+    `past` is the history of step-size control: size and error of the last accepted step.
+    """
     if not error > 0.0:
         return rule[FACTOR_MAX]
     uses_trend = error <= 1.0 and rule[LEAST_ERROR] > 0.0

@@ -251,7 +251,10 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _has_small_vibrations(w, tolerances, state, rate):
-    """Return whether a vibration of angular frequency `rate` (1/s) has velocities up to QUIET_FACTOR tolerances."""
+    """Return whether vibrations with the present accelerations have velocities of at most QUIET_FACTOR tolerances.
+
+    `rate` is the angular frequency (1/s) of the vibrations.
+    """
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
@@ -373,8 +376,8 @@ def settle_switching(f, w, options, memory, tolerances, accepted):
     if accepted:
         memory[STEPS] += 1.0
         memory[MAY_ESTIMATE] = 1.0
-        past = _history_view(memory)
-        past[H_BEFORE], past[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
+        history = _history_view(memory)
+        history[H_BEFORE], history[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
 
 
 @kernel(ATTEMPT)

@@ -265,9 +265,9 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
             for k in range(LANES):
                 v = work[(begin + n + m) * LANES + k] + work[X * LANES + k] * work[(sums + m) * LANES + k]
                 work[(new + n + m) * LANES + k] = v
-                q_most, v_most = (memory + SCALE_Q) * LANES + k, (memory + SCALE_V) * LANES + k
-                work[q_most] = max(work[q_most], abs(work[(new + m) * LANES + k]))
-                work[v_most] = max(work[v_most], abs(v))
+                index_of_scale_q, index_of_scale_v = (memory + SCALE_Q) * LANES + k, (memory + SCALE_V) * LANES + k
+                work[index_of_scale_q] = max(work[index_of_scale_q], abs(work[(new + m) * LANES + k]))
+                work[index_of_scale_v] = max(work[index_of_scale_v], abs(v))
         for k in range(LANES):
             work[AHEAD * LANES + k] = work[T * LANES + k] + c[j] * work[X * LANES + k]
         code.accelerate(order, control, work)
@@ -356,8 +356,8 @@ def _has_iteration_ended(options, work, memory, iteration, k):
     elif contraction / (1.0 - contraction) * change <= tolerance:
         converged, ended = True, True
     else:
-        too_slow = change * contraction**n_left / (1.0 - contraction) > max(tolerance, rounding_limit)
-        converged, ended = n_left == 0 and not too_slow and change <= rounding_limit, too_slow or n_left == 0
+        is_too_slow = change * contraction**n_left / (1.0 - contraction) > max(tolerance, rounding_limit)
+        converged, ended = n_left == 0 and not is_too_slow and change <= rounding_limit, is_too_slow or n_left == 0
     work[(memory + DONE) * LANES + k] = 1.0 if converged else 0.0
     return ended
 
@@ -485,13 +485,13 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
 
 
 @compiled
-def _velocity_error(control, work, n, error_v, duration, state, new, k):
+def _velocity_error(control, work, n, velocity_error, duration, state, new, k):
     """Return the largest error, in tolerances, that a velocity error of `duration` (s) causes in lane k."""
     error = 0.0
     for j in range(n):
         weight_q = duration / _allowed_error(control, work, state, new, j, j, k)
         weight_v = 1.0 / _allowed_error(control, work, state, new, j, n + j, k)
-        error = max(error, abs(work[(error_v + j) * LANES + k]) * min(weight_q, weight_v))
+        error = max(error, abs(work[(velocity_error + j) * LANES + k]) * min(weight_q, weight_v))
     return error
 
 

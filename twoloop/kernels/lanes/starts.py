@@ -35,7 +35,7 @@ from twoloop.kernels.lanes.layout import (
 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
-MAX_REDUNDANT = 1e-4  # eigenvalue of G G^T below which a combination of rows counts as redundant
+MAX_REDUNDANT_EIGENVALUE = 1e-4  # eigenvalue of G G^T below which a combination of rows counts as redundant
 # number of inverse iterations for each row of Z; few are enough, because the eigenvalues of redundant combinations of
 # rows are much smaller than the others
 N_REDUNDANT_ITERATIONS = 5
@@ -136,7 +136,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store Z, the eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one exceeds MAX_REDUNDANT."""
+    """Store Z, the eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one exceeds MAX_REDUNDANT_EIGENVALUE."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -151,7 +151,9 @@ def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factor
             _remove_redundant_components(work, n_rows, w, Z, z, scratch)
         normalise_vector(work, z, n_rows, scratch)
         for k in range(LANES):
-            if not work[scratch * LANES + k] < MAX_REDUNDANT:  # `scratch` is now the eigenvalue plus ITERATION_SHIFT
+            if (
+                not work[scratch * LANES + k] < MAX_REDUNDANT_EIGENVALUE
+            ):  # `scratch` is now the eigenvalue plus ITERATION_SHIFT
                 work[z * LANES + k] = np.nan
 
 
@@ -209,7 +211,7 @@ def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
 
 @compiled
 def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
-    """Store the smallest d with G d = -x in `change` (n), not finite in lanes with dependent rows; overwrite x."""
+    """Store the d of smallest norm with G d = -x in `change` (n), NaN in lanes with dependent rows; overwrite x."""
     for i in range(n_rows):
         _multiply_vector(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
     solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
@@ -242,8 +244,8 @@ def offsets_in_memory(n, n_rows, n_entries, n_redundant):
     change = x + n_rows
     nearest = change + n
     correction = nearest + n
-    weakest = correction + n
-    displacement = weakest + n
+    weakest_direction = correction + n
+    displacement = weakest_direction + n
     row = displacement + n
     factors_at_nearest = row + n
     n_factors = n_entries + n_rows * (1 + n_rows + n_redundant) + 1
@@ -254,7 +256,7 @@ def offsets_in_memory(n, n_rows, n_entries, n_redundant):
         change,
         nearest,
         correction,
-        weakest,
+        weakest_direction,
         displacement,
         row,
         factors_at_nearest,
@@ -354,8 +356,8 @@ def _project_velocities(code, settings, control, pattern, moves, work):
 
 
 @compiled
-def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
-    """Store the weakest direction in `weakest` (n), scaled to the largest entry of `correction`.
+def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest_direction):
+    """Store the weakest direction in `weakest_direction` (n), scaled to the largest entry of `correction`.
 
     Clear RUNNING in lanes with dependent rows.
     """
@@ -364,15 +366,17 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
         fill_field(work, x + i, 0.5 + (GOLDEN_SECTION * (i + 1)) % 1.0)
     for _ in range(N_WEAKEST_ITERATIONS):
         normalise_vector(work, x, n_rows, scratch)
-        solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest)
+        solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest_direction)
     normalise_vector(work, x, n_rows, scratch)
-    min_eigenvalue = MIN_EIGENVALUE if n_redundant == 0 else MAX_REDUNDANT * n_rows
+    min_eigenvalue = MIN_EIGENVALUE if n_redundant == 0 else MAX_REDUNDANT_EIGENVALUE * n_rows
     for k in range(LANES):
         if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` is now the smallest eigenvalue
             work[RUNNING * LANES + k] = 0.0
-        factor = _largest_value(work, correction, n, k) / max(_largest_value(work, weakest, n, k), DIAGONAL_SHIFT)
+        factor = _largest_value(work, correction, n, k) / max(
+            _largest_value(work, weakest_direction, n, k), DIAGONAL_SHIFT
+        )
         for j in range(n):
-            work[(weakest + j) * LANES + k] *= factor
+            work[(weakest_direction + j) * LANES + k] *= factor
 
 
 @compiled
@@ -380,15 +384,19 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
     """Clear RUNNING in lanes in which another guess has a projection far from its linear prediction by C_q."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
-    _, x, change, nearest, correction, weakest, displacement, _, factors_at_nearest, _, _ = _memory_offsets(
+    _, x, change, nearest, correction, weakest_direction, displacement, _, factors_at_nearest, _, _ = _memory_offsets(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
     x, change, nearest, correction = memory + x, memory + change, memory + nearest, memory + correction
-    weakest, displacement, factors = memory + weakest, memory + displacement, memory + factors_at_nearest
-    _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest)
+    weakest_direction, displacement, factors = (
+        memory + weakest_direction,
+        memory + displacement,
+        memory + factors_at_nearest,
+    )
+    _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest_direction)
     for by_correction, by_weakest in OTHER_GUESSES:
         for j in range(n * LANES):
-            shift = by_correction * work[correction * LANES + j] + by_weakest * work[weakest * LANES + j]
+            shift = by_correction * work[correction * LANES + j] + by_weakest * work[weakest_direction * LANES + j]
             work[displacement * LANES + j], work[new * LANES + j] = shift, work[nearest * LANES + j] + shift
         _gauss_newton(code, settings, control, pattern, moves, work)
         for i in range(n_rows):

@@ -49,7 +49,7 @@ CONVERGED_CHANGE = 0.01
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
 MAX_SWEEPS, FEW_SWEEPS = 40, 12  # largest number of sweeps, and number of sweeps after which more nodes are left out
 DISTANCE_FACTOR = 2.0  # increase of the pivot below which nodes are left out, if FEW_SWEEPS sweeps do not converge
-MAX_LEFT_OUT = 9  # number of left-out nodes above which the step fails
+MAX_LEFT_OUT_NODES = 9  # number of left-out nodes above which the step fails
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of
 # `begin_polynomial`. BEGIN, DURATION, END (s): those of the polynomial of the last converged attempt; END = -inf: none
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
@@ -59,7 +59,9 @@ SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 NODE_GAP = 0.0767
 BACKWARD_FRACTION = 0.4  # duration of the polynomial before the beginning of the step, relative to its whole duration
 ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error in the step size, and factor on the error estimate
-MOVED_WEIGHT = 0.5  # factor on the largest change of a stage by its projection, which counts as an error of the step
+PROJECTION_WEIGHT = (
+    0.5  # factor on the largest change of a stage by its projection, which counts as an error of the step
+)
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning
 # smallest allowed ratio of the pivot at the end of a step to the pivot below which nodes are left out; the pivot may be
@@ -155,10 +157,10 @@ def _estimate_error(tolerances, h, state, legendre, a, n_kept):
             else:
                 late_max = max(late_max, abs(value))
         middle_max = max(middle_max, late_max, TINY)
-        decay, far = late_max / middle_max, late_max / max(early_max, middle_max)
+        decay, distant_decay = late_max / middle_max, late_max / max(early_max, middle_max)
         if n_kept == S:
             decay *= np.sqrt(decay)
-        largest = max(largest, late_max * max(decay, far) * h * _velocity_weight(tolerances, m, n, h, state))
+        largest = max(largest, late_max * max(decay, distant_decay) * h * _velocity_weight(tolerances, m, n, h, state))
     return ERROR_FACTOR * largest
 
 
@@ -201,14 +203,14 @@ def _widest_gap(c, c0, left_out):
 
 
 @merged
-def _choose_partition_at_end(f, w, t, q, pivot, near):
+def _choose_partition_at_end(f, w, t, q, pivot, min_node_pivot):
     """Choose the partition at the end (t, q) of a step; return a code.
 
     The code is SINGULAR if the end is too close to the singular position. `pivot` is the smallest pivot at the
-    beginning of the step; `near` is the pivot below which nodes are left out.
+    beginning of the step; `min_node_pivot` is the pivot below which nodes are left out.
     """
     code = renew_partition(f, w, t, q)
-    if code == DONE and w.notes[PIVOT] < max(MIN_PIVOT_RATIO * pivot, min(END_MARGIN * near, pivot)):
+    if code == DONE and w.notes[PIVOT] < max(MIN_PIVOT_RATIO * pivot, min(END_MARGIN * min_node_pivot, pivot)):
         return SINGULAR
     return code
 
@@ -273,10 +275,10 @@ def _evaluate_polynomial(time, duration, b, c, a, q_0, v_0, weights_v, weights_q
 
 
 @merged
-def _finish_piece(f, w, t, near, options, tolerances, stage, state, new_state):
+def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, new_state):
     """Store `stage`, a state [q, v, a], projected onto the constraints, in `new_state`; return an Attempt.
 
-    The state is not projected if its smallest pivot is below `near`, or if its projection fails and `near` is positive.
+    The state is not projected if its smallest pivot is below `min_node_pivot`, or if its projection fails and `min_node_pivot` is positive.
     """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
@@ -284,12 +286,12 @@ def _finish_piece(f, w, t, near, options, tolerances, stage, state, new_state):
     copy(stage[0], q1)
     copy(stage[1], v1)
     code = renew_partition(f, w, t, q1)
-    is_determined = code == DONE and w.notes[PIVOT] >= near
+    is_determined = code == DONE and w.notes[PIVOT] >= min_node_pivot
     if code == DONE:
         store_prediction(w, q1)
         w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
         code = evaluate_state(f, w, t, q1, v1, options[INNER_TOL], a1, lam1)
-    if near > 0.0 and not (is_determined and code == DONE):
+    if min_node_pivot > 0.0 and not (is_determined and code == DONE):
         if code != DONE:
             copy(state[3 * n :], lam1)
         copy(stage[0], q1)
@@ -337,68 +339,68 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     left_out, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
-    estimated, generated = tolerances[ESTIMATE] == 1.0, f.flags[STRAIGHT] == 1
-    near, duration = MIN_NEAR_RATIO, h
+    is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.flags[STRAIGHT] == 1
+    min_node_pivot, duration = MIN_NEAR_RATIO, h
     q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
-    if estimated:
-        near = near_pivot_ratio(tolerances)
+    if is_estimated:
+        min_node_pivot = near_pivot_ratio(tolerances)
     if t + h <= stored[END] + ROUNDING * stored[DURATION] + 4.0 * np.spacing(abs(t)):
         begin, duration = stored[BEGIN], stored[DURATION]
         _evaluate_polynomial(
             t + h - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage
         )
-        return _finish_piece(f, w, t + h, near * largest_pivot, options, tolerances, stage, state, new_state)
+        return _finish_piece(f, w, t + h, min_node_pivot * largest_pivot, options, tolerances, stage, state, new_state)
     stored[END] = -np.inf
     if time_of_base <= t:
         duration = t + h - time_of_base
     else:
         copy(q, q_base)
         copy(v, v_base)
-        if estimated:
+        if is_estimated:
             duration = h + max(0.0, min(h * BACKWARD_FRACTION / (1.0 - BACKWARD_FRACTION), t - earliest))
     begin, c0 = t + h - duration, (duration - h) / duration
     c_base = 0.0 if time_of_base <= t else c0  # time of the state `base`, as a fraction of the polynomial
     _fill_integral_weights(b, c, c_base, weights_v, weights_q)
-    n_back = 0  # number of nodes before the state `base`
-    while n_back < S and c[n_back] < c_base:
-        n_back += 1
+    n_before_base = 0  # number of nodes before the state `base`
+    while n_before_base < S and c[n_before_base] < c_base:
+        n_before_base += 1
     w.counters[N_OUTER] += 1
     code = renew_partition(f, w, t, q)
     pivot = w.notes[PIVOT] if code == DONE else 0.0
     for j in range(S):
         copy(state[2 * n : 3 * n], a[j])
     left_out[:] = 0.0
-    change_before, converged, moved, n_kept = np.inf, False, 0.0, S
+    previous_change, has_converged, largest_move, n_kept = np.inf, False, 0.0, S
     last_0, last_1, last_2 = -1, -1, -1  # the last evaluated nodes, from which the first sweep extrapolates; -1: none
     for sweep in range(MAX_SWEEPS):
-        change, moved = 0.0, 0.0
+        change, largest_move = 0.0, 0.0
         chooses_nodes = sweep in (0, 2, FEW_SWEEPS)  # whether this sweep decides anew which nodes are left out
-        if estimated and chooses_nodes and sweep == FEW_SWEEPS:
-            near = min(DISTANCE_FACTOR * near, MAX_NEAR_RATIO)
+        if is_estimated and chooses_nodes and sweep == FEW_SWEEPS:
+            min_node_pivot = min(DISTANCE_FACTOR * min_node_pivot, MAX_NEAR_RATIO)
         for i in range(S):
             # nodes in both directions from the state `base`, first backwards in time
-            j = n_back - 1 - i if i < n_back else i
+            j = n_before_base - 1 - i if i < n_before_base else i
             if sweep == 0:
-                if i == n_back:
+                if i == n_before_base:
                     last_0, last_1, last_2 = -1, -1, -1
-                    for k in range(n_back):
+                    for k in range(n_before_base):
                         if left_out[k] == 0.0:
                             last_0, last_1, last_2 = k, last_0, last_1
                 if last_0 >= 0:
                     for k in range(S):
-                        if k >= j if i >= n_back else k <= j or k >= n_back:
+                        if k >= j if i >= n_before_base else k <= j or k >= n_before_base:
                             _extrapolate_node(k, c, (last_0, last_1, last_2), a)
             time = begin + c[j] * duration
             _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
             _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
             code = DONE
-            renews_partition = not generated or chooses_nodes
+            renews_partition = not uses_generated_code or chooses_nodes
             if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
                 left_out[j] = 0.0
                 if code == DONE:  # in a run that begins near a singular position, earlier pivots may all be small
                     largest_pivot = max(largest_pivot, w.notes[PIVOT])
-                if estimated and (code != DONE or w.notes[PIVOT] < near * largest_pivot):
+                if is_estimated and (code != DONE or w.notes[PIVOT] < min_node_pivot * largest_pivot):
                     left_out[j], code = 1.0, DONE
             elif renews_partition and left_out[j] == 0.0:
                 code = renew_partition(f, w, time, q_stage)
@@ -413,7 +415,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                     break
                 # pivots of the generated code were too small, and the general code used the partition of another
                 # stage: repeat the projection with a partition chosen at this stage
-                renews_partition, generated = True, False
+                renews_partition, uses_generated_code = True, False
                 _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
                 code = renew_partition(f, w, time, q_stage)
             if code != DONE:
@@ -422,44 +424,44 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             for m in range(n):
                 weight = _velocity_weight(tolerances, m, n, h, state)
                 change = max(change, h * abs(a_stage[m] - a[j, m]) * weight)
-                moved = max(moved, abs(v1[m] - v_stage[m]) * weight, abs(q1[m] - q_stage[m]) / h * weight)
+                largest_move = max(largest_move, abs(v1[m] - v_stage[m]) * weight, abs(q1[m] - q_stage[m]) / h * weight)
             copy(a_stage, a[j])
             last_0, last_1, last_2 = j, last_0, last_1
         if not np.isfinite(change):
             return Attempt(OUTER_DIVERGED, np.inf, 0.0)
         if chooses_nodes:
             n_kept = S - int(left_out.sum())
-            if n_kept < S - MAX_LEFT_OUT:
+            if n_kept < S - MAX_LEFT_OUT_NODES:
                 return Attempt(SINGULAR, np.inf, 0.0)
-            if estimated and _widest_gap(c, c0, left_out) * duration > tolerances[GAP] * (1.0 + ROUNDING):
+            if is_estimated and _widest_gap(c, c0, left_out) * duration > tolerances[GAP] * (1.0 + ROUNDING):
                 return Attempt(OUTER_DIVERGED, np.inf, 0.0)
             for j in range(S):
                 if left_out[j] == 1.0:
                     _interpolate_node(j, c, left_out, a)
-        elif change <= CONVERGED_CHANGE or (sweep > 3 and STALL_RATIO * change_before <= change <= STALL_CHANGE):
-            converged = True
+        elif change <= CONVERGED_CHANGE or (sweep > 3 and STALL_RATIO * previous_change <= change <= STALL_CHANGE):
+            has_converged = True
             break
         _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
         # test the end of the step early: it is accurate enough after two sweeps, and most failing steps fail here
-        if sweep == 1 and estimated:
+        if sweep == 1 and is_estimated:
             _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
-            code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
+            code = _choose_partition_at_end(f, w, t + h, q1, pivot, min_node_pivot * largest_pivot)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
-        change_before = change
-    if not converged and estimated:
+        previous_change = change
+    if not has_converged and is_estimated:
         return Attempt(OUTER_DIVERGED, np.inf, 0.0)
     error = 0.0
-    if estimated:
-        error = max(_estimate_error(tolerances, h, state, legendre, a, n_kept), MOVED_WEIGHT * moved)
+    if is_estimated:
+        error = max(_estimate_error(tolerances, h, state, legendre, a, n_kept), PROJECTION_WEIGHT * largest_move)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
     _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
-    code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
+    code = _choose_partition_at_end(f, w, t + h, q1, pivot, min_node_pivot * largest_pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    if estimated:  # the next steps are pieces of this polynomial
+    if is_estimated:  # the next steps are pieces of this polynomial
         stored[BEGIN], stored[DURATION], stored[END] = begin, duration, t + h
         return Attempt(DONE, REPEAT_FACTOR, REPEAT_FACTOR)
     copy(q1, q_stage)

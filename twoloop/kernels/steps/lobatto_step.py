@@ -17,7 +17,7 @@ be checked between them. The ends of steps in a row are projected onto the const
 import math
 
 from twoloop.kernels.control import loop_state as at
-from twoloop.kernels.control.singular_positions import COLLAPSED, SHORT_STEP, SINGULAR_PIVOT
+from twoloop.kernels.control.singular_positions import COLLAPSED_STEP, SHORT_STEP, SINGULAR_PIVOT
 from twoloop.kernels.control.step_size import count_step, departure, size_off_grid, store_prediction
 from twoloop.kernels.data import collocation as field
 from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REFUSED, array_offsets
@@ -67,7 +67,7 @@ THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
 START_CONTRACTION = 0.12  # contraction rho for which the first step size is chosen after its first guess is rejected
 MAX_STARTS = 4  # largest number of guesses of the first step size
-DIVERGED_FACTOR = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
+FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
 MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as stiff, and another method takes over
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations count as hardly varying within a step
@@ -114,15 +114,15 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
 
     The stages are stored in `data`. The code is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED. Error: in tolerances.
     """
-    is_first, estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
+    is_first, is_estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[LOOK] / CHECKED_GAP
-    if estimated and h > h_max * (1.0 + SLACK):
+    if is_estimated and h > h_max * (1.0 + SLACK):
         return REFUSED, h / h_max, h_max / h
     data[field.T], data[field.H], data[field.DEFECT] = t, h, -1.0
     data[field.MAY_GUESS] = 0.0
     if is_first:
         data[field.H_BEFORE], data[field.DEGREE], data[field.RHO] = h, 0.0, START_CONTRACTION
-        data[field.MAY_GUESS] = 1.0 if estimated and data[field.STARTS] < MAX_STARTS else 0.0
+        data[field.MAY_GUESS] = 1.0 if is_estimated and data[field.STARTS] < MAX_STARTS else 0.0
     result = int(f.attempt_nodes(data, state, tolerances, f.own_numbers))
     n_sweeps = int(data[field.SWEEPS])
     w.counters[N_OUTER] += n_sweeps
@@ -133,8 +133,8 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         return result, 2.0, min(max(START_CONTRACTION / data[field.RHO], 0.05), 30.0)
     if result != CONVERGED:
         data[field.FAILURES] += 2.0
-        return result, 2.0, DIVERGED_FACTOR
-    if not estimated:
+        return result, 2.0, FACTOR_AFTER_DIVERGENCE
+    if not is_estimated:
         return CONVERGED, 0.0, 1.0
     error = data[field.ERROR]
     if not error <= 1.0:
@@ -147,7 +147,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         w.counters[N_EVALUATIONS] += LANES
         defect = f.audit_nodes(data, state, f.own_numbers)
         if defect < 0.0:
-            return NOT_COMPUTED, 2.0, DIVERGED_FACTOR
+            return NOT_COMPUTED, 2.0, FACTOR_AFTER_DIVERGENCE
         factor_by_defect = 0.9 * data[field.FACTOR_OF_DEFECT]
         if defect > 1.0:
             _reuse_rejected_polynomial(f, data, state)
@@ -310,7 +310,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 def _can_take_next_step(w, data, tolerances, control, clock, h):
     """Return whether another step, of size h, may be taken before the integrator has checked the last step."""
     h_long = clock[at.H_LONG]
-    if h <= control[at.SHORTEST] or h < COLLAPSED * h_long or _must_change_method(w, data, tolerances):
+    if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
     is_near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
     return not (is_near and h < SHORT_STEP * h_long)
@@ -376,7 +376,7 @@ def lobatto_steps(
         if not _adopt_projection(f, w, options, data, tolerances, driven, n, k, out_t[k], out_state[k], state):
             if k == 0:
                 copy(new_state, state)
-            clock[at.H_NEXT], data[field.PREDICTS] = DIVERGED_FACTOR * h, 0.0
+            clock[at.H_NEXT], data[field.PREDICTS] = FACTOR_AFTER_DIVERGENCE * h, 0.0
             return k
         clock[at.T] = out_t[k]
         w.notes[DEFECT], w.notes[ORIENTATION_NEW] = data[field.DEFECTS + k], 0.0

@@ -815,9 +815,8 @@ def factor_systems(f, w, options, memory, s, h):
     code = factor_filter(f, w, options, memory, s, h)
     offset += N_EIGEN_SCALARS + s
     for k in range(n_systems):
-        if code == DONE and (
-            k > 0 or n_real == 0
-        ):  # a first eigenvalue that is real is gamma0, which is factored above
+        # if the first eigenvalue is real, it is gamma0, for which `factor_filter` has computed the factors
+        if code == DONE and (k > 0 or n_real == 0):
             code = _factor_complex_system(f, w, memory, s, k, h * complex(options[offset], options[offset + 1]))
         offset += 2 + 4 * s
     memory[H_FACTORED] = h

@@ -161,18 +161,18 @@ DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
-    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
+    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], tests_velocities: bool
 ) -> NDArray[np.float64]:
     """Return the entries of `options` for Newton's method, which follow those of `options_array`; see N_REAL.
 
-    A must be diagonalizable. `velocities`: whether the error of velocities is tested, too.
+    A must be diagonalizable. `tests_velocities`: whether the error of velocities is tested, too.
     """
     values, T = np.linalg.eig(A)
     inverse = np.linalg.inv(T)
     reals = [k for k in range(len(b)) if values[k].imag == 0.0]
     pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
     gamma0 = float(values[reals[0]].real) if reals else float(np.abs(values).min())
-    parts: list[Any] = [[len(reals), len(pairs), gamma0, float(velocities)], _error_weights(b, c, gamma0)]
+    parts: list[Any] = [[len(reals), len(pairs), gamma0, float(tests_velocities)], _error_weights(b, c, gamma0)]
     for k in reals + pairs:
         row, column = inverse[k], T[:, k]
         parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
@@ -221,7 +221,7 @@ def diagonal_options(
     jump_weights: ArrayLike,
     inner_tol: float,
     outer_tol: float,
-    velocities: bool,
+    tests_velocities: bool,
     embedded: bool,
 ) -> NDArray[np.float64]:
     """Return the array `options` of a diagonally implicit method with the tableau A (s, s), c (s).
@@ -233,7 +233,7 @@ def diagonal_options(
     A, c, weights, jump_weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, jump_weights))
     gamma = A[-1, -1]
     one_stage = options_array([[gamma]], [1.0], [1.0], inner_tol, outer_tol, 0.0)
-    newton = np.array([1.0, 0.0, gamma, float(velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
+    newton = np.array([1.0, 0.0, gamma, float(tests_velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
     return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, jump_weights, [float(embedded)]])
 
 
@@ -287,7 +287,7 @@ def as_matrix(numbers, m):
 
 @inlined
 def system_storage(w, n, k):
-    """Return a complex view (n^2) of the two parts of w.matrices that store the system of eigenvalue number k."""
+    """Return a complex view (n^2) of the two parts of w.matrices that store the linear system for eigenvalue k of A."""
     start = (SYSTEMS + 2 * k) * n * n
     return w.matrices[start : start + 2 * n * n].view(np.complex128)
 

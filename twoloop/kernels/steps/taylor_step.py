@@ -516,7 +516,7 @@ def settle_taylor(f, w, options, memory, tolerances, accepted):
 @kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step of size h by the series about its beginning, and compute the series about its end."""
-    n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
+    n, order, is_estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     w.counters[N_OUTER] += 1
@@ -528,7 +528,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         memory[HAS_SERIES], memory[UNIT] = 1.0, h
-        if estimated:
+        if is_estimated:
             memory[ALLOWED_SIZE] = _allowed_step(
                 tolerances, series_view(memory, order, n, memory[CURRENT]), h, order, n
             )
@@ -537,7 +537,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     series, unit = series_view(memory, order, n, memory[CURRENT]), memory[UNIT]
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
-    if estimated:
+    if is_estimated:
         error = x / memory[ALLOWED_SIZE]  # an upper bound of the error, which is a power of this ratio
         if error > 1.0 + SLACK:
             return Attempt(DONE, error, 1.0 / error)
@@ -585,13 +585,13 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 return Attempt(code, np.inf, 0.0)
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
     series = series_view(memory, order, n, 1.0 - memory[CURRENT])
-    unit = min(memory[ALLOWED_SIZE] * unit, MAX_GROWTH * h) if estimated else h
+    unit = min(memory[ALLOWED_SIZE] * unit, MAX_GROWTH * h) if is_estimated else h
     code = _compute_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[CURRENT])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
     factor = 0.0
-    if estimated:
+    if is_estimated:
         memory[NEXT_ALLOWED_SIZE] = _allowed_step(tolerances, series, unit, order, n)
         distance_factor = memory[DISTANCE_FACTOR] if memory[DISTANCE_FACTOR] > 0.0 else 1.0
         factor = min(distance_factor * memory[NEXT_ALLOWED_SIZE] * unit / h, MAX_GROWTH)
