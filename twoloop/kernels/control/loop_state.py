@@ -72,14 +72,14 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 (
     T,  # present time, s
     H_NEXT,  # size of the next step, s
-    H_LIMIT,  # present upper limit of the step size, which a failed step lowers for a while, s
+    H_LIMIT,  # present upper limit of the step size, s; a failed step lowers it for LIMIT_MEMORY accepted steps
     LIMIT_AGE,  # number of accepted steps since the last failed step
     NEXT_OUTPUT,  # index of the next output time
     T_START,  # start time of the run, s, at which the grid of steps of fixed size begins
     N_FIXED,  # number of completed steps of this grid
     FAILURE_CODE,  # code of the last failed attempt, which explains short steps; DONE: no attempt failed recently
     H_FAILED,  # size of the last failed step, for messages, s
-    H_LONG,  # longest of the last steps, with a weight that decreases from step to step, s
+    H_LONG,  # longest of the last steps, s, which count less the older they are, see H_LONG_DECAY in step_size.py
     LARGEST_PIVOT,  # largest value so far of PIVOT in Work.notes, the smallest pivot of C_q
     JUMP_FROM,  # time at which the next interval in which C_t or b jumps begins, s; infinite if none has been located
     JUMP_TO,  # time at which this interval ends, s

@@ -32,7 +32,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     X,  # time from the beginning of the step to the state to be computed, s
     FINE,  # on entry to a task 1 in lanes in which it has to run; on return 1 in those in which it has succeeded
     DEFECT,  # defect at the end of the step, relative to the allowed defect
-    OFF,  # departure: difference of predicted and projected positions, relative to its limit, see control/step_size.py
+    OFF,  # difference of predicted and projected positions, relative to its limit, see `departure` of step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
     LONGEST,  # largest allowed step size, s
     REQUESTED,  # 1 in lanes that begin a run, or in which a state within the step is to be computed

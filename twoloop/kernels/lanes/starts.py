@@ -136,7 +136,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store Z, the eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one exceeds MAX_REDUNDANT_EIGENVALUE."""
+    """Store Z, eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one of these is too large."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows

@@ -278,7 +278,8 @@ def _evaluate_polynomial(time, duration, b, c, a, q_0, v_0, weights_v, weights_q
 def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, new_state):
     """Store `stage`, a state [q, v, a], projected onto the constraints, in `new_state`; return an Attempt.
 
-    The state is not projected if its smallest pivot is below `min_node_pivot`, or if its projection fails and `min_node_pivot` is positive.
+    The state is not projected if its smallest pivot is below `min_node_pivot`, nor if its projection fails and
+    `min_node_pivot` is positive.
     """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]

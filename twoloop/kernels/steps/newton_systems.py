@@ -262,7 +262,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v in w.matrices; return a code. (t, q, v, a): last evaluated state and its accelerations."""
+    """Store J_q and J_v at (t, q, v) in w.matrices; return a code. a: accelerations at (t, q, v), evaluated last."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
         return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
@@ -435,7 +435,7 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_tangents(f, w, memory, s, t, q, v):
-    """Store K, D (as bands) and the border in w.matrices; return a code. (t, q, v) is the last evaluated state."""
+    """Store the bands of K and D at (t, q, v), the last evaluated state, and the border in w.matrices; return a code."""
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
@@ -771,7 +771,10 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v (dense storage) or K and D in w.matrices; return a code. (t, q, v, a): last evaluated state."""
+    """Store J_q and J_v (dense storage) or K and D (else) in w.matrices; return a code.
+
+    (t, q, v) is the last evaluated state, and a its accelerations.
+    """
     if f.flags[FORM] == STATIC:
         return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.flags[BANDWIDTH] >= 0:

@@ -422,7 +422,7 @@ def _allowed_step(tolerances, series, unit, order, n):
 def _evaluate_series(series, unit, order, x, q, v, a):
     """Set q, v and a (n each) to the values of a series after x units of time, by Horner's scheme.
 
-    Four or two coordinates are evaluated at once. The recurrence for the second derivative yields half of it.
+    Four or two coordinates are evaluated at once. The recurrence for a computes half the second derivative.
     """
     n, per_unit = q.size, 1.0 / unit
     a_factor = 2.0 * per_unit * per_unit
