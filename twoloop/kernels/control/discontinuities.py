@@ -160,7 +160,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-# ratio of a second difference of samples to their range above which a change is sudden, as in a pulse four spacings wide
+# ratio of second differences of samples to their range above which a change is sudden, as in pulses four spacings wide
 SUDDEN_RATIO = 0.1
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
 # smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too

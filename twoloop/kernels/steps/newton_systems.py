@@ -435,7 +435,7 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_tangents(f, w, memory, s, t, q, v):
-    """Store the bands of K and D at (t, q, v), the last evaluated state, and the border in w.matrices; return a code."""
+    """Store the bands of K and D at (t, q, v), evaluated last, and the border in w.matrices; return a code."""
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
