@@ -241,7 +241,8 @@ N_SAMPLES, N_SHORT = 100, 2000
 # limits of the number of runs in a block, whose coefficients are computed together
 MIN_BLOCK_RUNS, MAX_BLOCK_RUNS = 128, 4096
 BLOCKS_PER_THREAD = 3  # number of blocks of runs per thread; with 3, all threads end at about the same time
-# statuses of runs besides those in layout.py: SHORT_FORCE, a short force was found; OUT_OF_TIME, the time limit
+# statuses of runs besides those in layout.py: SHORT_FORCE, a short force was found; OUT_OF_TIME, the time
+# limit ended before the run
 SHORT_FORCE = min(layout.NO_START, layout.UNLIKE) - 1
 OUT_OF_TIME = SHORT_FORCE - 1
 STOP_INTERVAL = 0.01  # time, s, between calls of `stop`, which are repeated as more runs may have begun
@@ -283,7 +284,7 @@ class LaneRuns:
         self.n_gaps = N_SHORT if any(short_forces) else N_SAMPLES * gap  # smallest number of steps in a run
         self.sampling = ForceSampling(system, generic, varying) if short_forces.by_time else None
         choice = PivotChoice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
-        kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # the latest code is cached
+        kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # key of the cached code
 
         def generate() -> GeneratedLanes[LaneCode]:
             from twoloop.generate.lane_code import GeneratedLanes, LaneCode  # loads kernels: at the first ensemble

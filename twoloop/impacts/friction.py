@@ -332,7 +332,7 @@ class StopFriction:
     def contact_rows(
         self, closed: Sequence[int], t: float, q: Array, v: Array, speeds: Array
     ) -> tuple[list[int], Gap, Tangents]:
-        """Return which of the closed stops have friction, their displacements, and how they slide."""
+        """Return those of the closed stops that have friction, the Gap of their displacements, and their Tangents."""
         stops = [k for k in closed if k in self.slide_index]
         slides = Gap(*(part[[self.slide_index[k] for k in stops]] for part in self.slides.at(t, q, v)))
         at_rest = np.array([k in self.resting_stops or k in self.released_stops for k in stops], dtype=bool)
@@ -345,18 +345,18 @@ class StopFriction:
         """Return the coefficient of friction of a stop."""
         return self._stops[k].friction
 
-    def sticking_groups(self, D: Array, base: list[int], rows: dict[int, int]) -> dict[int, list[int]]:
-        """Return stops that stick, in groups with one displacement; D has the rows `base`, and `rows` by stop."""
+    def sticking_groups(self, D: Array, basis: list[int], rows: dict[int, int]) -> dict[int, list[int]]:
+        """Return stops that stick, in groups with one displacement; D has the rows `basis`, and `rows` by stop."""
         groups: dict[int, list[int]] = {}
         first: dict[int, int] = {}  # first stop of a group by its row
         for k, row in rows.items():
-            weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE_RATIO)[0]
-            if D[row, row] - D[row, base] @ weights > MIN_COMPLIANCE * D[row, row]:
-                base.append(row)
+            weights = np.linalg.lstsq(D[np.ix_(basis, basis)], D[basis, row], rcond=NEGLIGIBLE_RATIO)[0]
+            if D[row, row] - D[row, basis] @ weights > MIN_COMPLIANCE * D[row, row]:
+                basis.append(row)
                 groups[k], first[row] = [k], k
                 continue
-            others = [i for i, weight in zip(base, weights, strict=True) if abs(weight) > COUPLING_TOLERANCE]
-            equal = [i for i in others if abs(abs(weights[base.index(i)]) - 1.0) <= COUPLING_TOLERANCE]
+            others = [i for i, weight in zip(basis, weights, strict=True) if abs(weight) > COUPLING_TOLERANCE]
+            equal = [i for i in others if abs(abs(weights[basis.index(i)]) - 1.0) <= COUPLING_TOLERANCE]
             if len(others) != 1 or others != equal or others[0] not in first:
                 raise Undetermined(
                     f"the friction of {self._stops[k].name!r} is not determined: other stops and joints hold it already"

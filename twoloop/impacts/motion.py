@@ -225,7 +225,7 @@ class Motion:
         tangents = tangents._replace(coefficient=tangents.coefficient * reduction)
         force, slides = coulomb_forces(D, c, self._available_friction(resting_joints), tangents)
         is_pushing = force[:n] > 0.0
-        base = np.flatnonzero(is_pushing).tolist()
+        basis = np.flatnonzero(is_pushing).tolist()
         accelerations = (D @ force + c)[n:end]  # accelerations of the joints
         terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:end]
         terms += D.diagonal()[n:end] * self.modes.static_friction[resting_joints]
@@ -236,11 +236,11 @@ class Motion:
             range(n, end),
             strict=True,
         ):
-            signs[k] = int(sign) if is_moving else self._stick_or_idle(k, force[row], D, row, base, is_pushing.sum())
+            signs[k] = int(sign) if is_moving else self._stick_or_idle(k, force[row], D, row, basis, is_pushing.sum())
         friction_contacts = [
             (k, end + i, int(slides[i])) for i, k in enumerate(friction_stops) if is_pushing[tangents.normal[i]]
         ]
-        sticks = self.friction.sticking_groups(D, base, {k: row for k, row, sign in friction_contacts if not sign})
+        sticks = self.friction.sticking_groups(D, basis, {k: row for k, row, sign in friction_contacts if not sign})
         sliding_stops = {k: sign for k, _, sign in friction_contacts if sign}
         return Mode(signs, tuple(closing_stops[is_pushing].tolist()), sliding_stops, sticks)
 
@@ -249,14 +249,14 @@ class Motion:
         reduced = np.minimum(self.modes.kinetic_friction, (1.0 - RELEASE_REDUCTION) * self.modes.static_friction)
         return np.array([(reduced if k in self.released_joints else self.modes.static_friction)[k] for k in joints])
 
-    def _stick_or_idle(self, k: int, force: float, D: Array, row: int, base: list[int], n_pushing: int) -> int | None:
+    def _stick_or_idle(self, k: int, force: float, D: Array, row: int, basis: list[int], n_pushing: int) -> int | None:
         """Return STICKS, or IDLE if pushing stops and sticking joints already hold the joint.
 
         The friction of an idle joint is constant until one of these releases it; it is zero if stops alone hold it.
         """
-        weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE_RATIO)[0]
-        if D[row, row] - D[row, base] @ weights > MIN_COMPLIANCE * D[row, row]:
-            base.append(row)
+        weights = np.linalg.lstsq(D[np.ix_(basis, basis)], D[basis, row], rcond=NEGLIGIBLE_RATIO)[0]
+        if D[row, row] - D[row, basis] @ weights > MIN_COMPLIANCE * D[row, row]:
+            basis.append(row)
             return STICKS
         self.modes.idle_friction[k] = force if np.abs(weights[n_pushing:]).max(initial=0.0) > MIN_COMPLIANCE else 0.0
         return IDLE
@@ -549,7 +549,7 @@ class Motion:
         return lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset
 
     def _slip_event(self, balance: Any) -> Any:
-        """Return the event at which the needed friction exceeds the available one, which may be fully used at first."""
+        """Return the event at which friction slips: (needed, available) = balance(t, q, v), and needed > available."""
         needed, available = balance(self.t, self.q, self.v)
         if abs(needed) > (1.0 + RELEASE_REDUCTION) * available:
             raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {available:.10g}")
@@ -564,7 +564,7 @@ class Motion:
 
 
 def options_without_traces(options: dict[str, Any]) -> dict[str, Any]:
-    """Return the options to change for arcs with closed stops, whose callbacks cannot be traced."""
+    """Return changed options, `method` and `compiled`, for arcs with closed stops: their callbacks cannot be traced."""
     method = PRESETS["auto"] if isinstance(check_method(options["method"]), Taylor) else options["method"]
     return {"method": method, "compiled": False}
 

@@ -64,9 +64,9 @@ class Impacts:
     restitution : ndarray (k,)
     tangents : Tangents
     noise : float
-        Gaps below this are closed; if several are, they closed at the same time.
+        Largest gap that counts as closed; stops with such gaps close at the same time.
     min_rates : ndarray (k,)
-        Smallest rates; smaller ones are rounding errors.
+        Smallest rates of the stops that are not rounding errors.
     """
 
     def __init__(self, D: Array, restitution: Array, tangents: Tangents, noise: float, min_rates: Array):

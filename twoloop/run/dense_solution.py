@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
 
 MAX_DIVIDED_INTERVALS = 512  # largest number of intervals with cached interior states
-MAX_ACCURATE_INTERVALS = 65536  # largest number of intervals cached as accurate without interior states
+MAX_ACCURATE_INTERVALS = 65536  # largest number of cached intervals that need no interior states
 # largest accepted residual of a polynomial in the constraints and the equations of motion, relative to the tolerances;
 # MAX_ERROR_ACROSS in steps across singular positions, where errors of velocities were ten times the residual
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
@@ -174,7 +174,7 @@ class Interpolator:
         out = np.empty((len(times), 2 * self.system.n_q))
         failures = 0
         undivided = []
-        for block in _blocks(groups):
+        for block in _blocks_of_groups(groups):
             self._divide_where_needed(table, block)
             divided, divided_groups, other_groups = self._split_divided(table, block)
             failures += self._interpolate(divided, divided_groups, times, out)
@@ -216,13 +216,13 @@ class Interpolator:
 
     def _divide_where_needed(self, table: StateTable, groups: Groups) -> None:
         """Compute and cache interior states of each interval whose polynomial is not accurate without them."""
-        begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
-        is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in begins])
+        start_times = table.t[groups[:, indices.FIRST_OWN]].tolist()
+        is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in start_times])
         if not self.may_divide or not is_new.any():
             return
         if len(self.interior_states) > MAX_DIVIDED_INTERVALS:
             self.interior_states.clear()
-            is_new = np.array([t not in self.accurate_intervals for t in begins])
+            is_new = np.array([t not in self.accurate_intervals for t in start_times])
         if len(self.accurate_intervals) > MAX_ACCURATE_INTERVALS:
             self.accurate_intervals.clear()
         groups = groups[is_new & (groups[:, indices.KIND] != indices.JUMP)]
@@ -327,10 +327,10 @@ class Interpolator:
         return self.repair_plans[is_stiff]
 
     def _split_divided(self, table: StateTable, groups: Groups) -> tuple[StateTable, Groups, Groups]:
-        """Return a Table of the cached interior states, the groups of its intervals, and the groups without states."""
-        begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
-        is_divided = np.array([t in self.interior_states for t in begins], dtype=bool)
-        pairs = [self.interior_states[t] for t in begins if t in self.interior_states]
+        """Return a StateTable of cached interior states, the groups of its intervals, and the groups without states."""
+        start_times = table.t[groups[:, indices.FIRST_OWN]].tolist()
+        is_divided = np.array([t in self.interior_states for t in start_times], dtype=bool)
+        pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
         own_groups = groups[is_divided]
         if not pairs:
             return StateTable(table.t[:0], table.states[:0], table.kinds), own_groups, groups
@@ -357,8 +357,8 @@ class Interpolator:
             )
             times, states = out_t.reshape(-1, n_states), out.reshape(-1, n_states, 3 * n)
             succeeded = np.isfinite(times[:, 0])
-            begins = times[:, 0].tolist()
-            interior_states.update({begins[k]: (times[k], states[k]) for k in succeeded.nonzero()[0].tolist()})
+            start_times = times[:, 0].tolist()
+            interior_states.update({start_times[k]: (times[k], states[k]) for k in succeeded.nonzero()[0].tolist()})
             intervals = intervals[~succeeded]
         return interior_states
 
@@ -368,10 +368,10 @@ class Interpolator:
         A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q) of m intervals; missing states are NaN.
         """
         groups = _interval_groups(table, np.arange(len(table.t) - 1))
-        for block in _blocks(groups):
+        for block in _blocks_of_groups(groups):
             self._divide_where_needed(table, block)
-            begins = table.t[block[:, indices.FIRST_OWN]].tolist()
-            pairs = [self.interior_states[t] for t in begins if t in self.interior_states]
+            start_times = table.t[block[:, indices.FIRST_OWN]].tolist()
+            pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
             shape = (len(pairs), self.parts + 1)
             t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
             for row, (own_t, own) in enumerate(pairs):
@@ -404,7 +404,7 @@ class Interpolator:
             )
 
 
-def _blocks(groups: Groups) -> list[Groups]:
+def _blocks_of_groups(groups: Groups) -> list[Groups]:
     """Return the groups in blocks of at most MAX_DIVIDED_INTERVALS, whose interior states the cache can contain."""
     return [groups[begin : begin + MAX_DIVIDED_INTERVALS] for begin in range(0, len(groups), MAX_DIVIDED_INTERVALS)]
 
@@ -417,10 +417,10 @@ def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
     groups[:, indices.HIGH] = len(table.t) - 1
     # polynomials across a singular position do not use the states before it, which may have rounding errors
     is_crossing = np.append(False, table.kinds == indices.ACROSS)
-    (begins,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
-    if begins.size:
+    (firsts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
+    if firsts.size:
         is_across = is_crossing[intervals + 1]
-        groups[is_across, indices.LOW] = begins[np.searchsorted(begins, intervals[is_across], side="right") - 1]
+        groups[is_across, indices.LOW] = firsts[np.searchsorted(firsts, intervals[is_across], side="right") - 1]
     (jumps,) = (table.kinds == indices.JUMP).nonzero()
     if not jumps.size:
         return groups

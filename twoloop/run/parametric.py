@@ -76,7 +76,7 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region of compared callbacks of runs that check derivatives (True), or of all others (False)."""
+        """Return the region in which runs have compared callbacks and, if `with_derivatives`, their derivatives."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 

@@ -605,7 +605,7 @@ INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return fields of a record with one row per step; `counts`: see INITIAL_COUNTS, updated to after these steps."""
+    """Return fields of a record with one row per step; `counts`: see INITIAL_COUNTS; updated in place."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)

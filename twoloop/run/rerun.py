@@ -195,9 +195,7 @@ def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[
 
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
-FIRST_STEP_FRACTION = (
-    0.1  # first step size in a piece, relative to the piece's duration, unless the last piece proposes one
-)
+FIRST_FRACTION = 0.1  # first step size in a piece, relative to its duration, unless the last piece proposed one
 TOLERANCE_FACTOR = 0.1  # ratio of the tolerances of a rerun to those of the run
 FINEST = 1e-13  # smallest tolerance of a rerun, relative or absolute: rounding hides smaller errors
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
@@ -274,7 +272,7 @@ class IndependentRerun:
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:
             return None
         t1 = float(times[-1])
-        run.clock[a.H_NEXT] = proposed_step if proposed_step < np.inf else FIRST_STEP_FRACTION * (t1 - t0)
+        run.clock[a.H_NEXT] = proposed_step if proposed_step < np.inf else FIRST_FRACTION * (t1 - t0)
         run.work.notes[indices.KINK_AFTER] = t1
         states: list[Array] = []
         longest, n_total = 0.0, 0

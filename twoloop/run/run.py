@@ -120,7 +120,7 @@ class Run:
         self.mirrored_size = 0.0  # size of a step that ends as far beyond the position as its base is before it, s
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # sizes of steps that are still to be tried, s
-        self.larger_sizes: list[float] = []  # larger sizes, s, for too few nodes beyond the position
+        self.larger_sizes: list[float] = []  # larger sizes, s, tried if a step has too few nodes beyond it
         self.crossing_size = 0.0  # size of the last attempted step across a singular position, s
         self.piece_ends: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
         self.origins: list[Any] = []  # `Origin`s of polynomials across the position that are still to be tried
@@ -362,8 +362,8 @@ class Run:
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
-        independent = set(self.work.rows_v.tolist())
-        redundant = [i for i in range(n_rows) if i not in independent]
+        independent_rows = set(self.work.rows_v.tolist())
+        redundant = [i for i in range(n_rows) if i not in independent_rows]
         rows = self._rows_at_start() if rows is None else rows
         violated = self.violated_rows(rows).tolist()
         if violated:

@@ -24,7 +24,7 @@ N_POSITIONS = 33  # number of positions between two states at which a ratio of s
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DISPLACEMENT = 1e-6
-MIN_ROW_NORM = 0.1  # lower bound of the norm by which a row is divided, over the norm expected from its derivative
+MIN_ROW_NORM = 0.1  # smallest divisor of a row, relative to the norm that its derivative lets expect
 # velocities turned if they changed by more than TURN_RATIO times the change that accelerations explain, and by more
 # than MIN_TURN times the tolerances
 TURN_RATIO, MIN_TURN = 3.0, 10.0
@@ -150,7 +150,7 @@ def _v_slice(n: int) -> slice:
 
 
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
-    """Return the largest |a_j|, without the rows' singular values below `min_ratio` times the largest one."""
+    """Return max|a_j|, computed without singular values of the rows below `min_ratio` times the largest."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     is_kept = values > min_ratio * values[0]

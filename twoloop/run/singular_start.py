@@ -25,9 +25,9 @@ CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for
 # weights of five samples in f' and f''
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
 MAX_DIFFERENCE_ERROR = 1e-8  # largest relative error of a derivative by finite differences; smaller ones count as 0
-MIN_RANK_DERIVATIVE = 1e-6  # relative derivative of the rows from which on the rank rises; allowed errors of v0: 1e-8
-# factor by which derivatives of the rows must exceed the derivatives along velocities as small as the tolerances
-MIN_CERTAINTY = 10.0
+MIN_RANK_DERIVATIVE = 1e-6  # smallest relative derivative of the rows with which the rank rises
+# smallest derivative of the rows along v that counts, relative to that along a velocity of the size of its tolerance
+MIN_CLARITY = 10.0
 # relative change of the rows: up to the state beside the start; within the first step that is tried
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
 # number of states beside the start that are tried; largest correction of such a state, relative to its displacement
@@ -91,7 +91,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
         return None
     distance = step * float(np.abs(direction).max())  # largest displacement of a finite difference
     uncertainty = np.linalg.norm(derivative_of_rows(allowed * signs(len(q)), distance / float(allowed.max())))
-    is_certain = slopes > max(MIN_CERTAINTY * float(uncertainty) / speed, MIN_RANK_DERIVATIVE * norm)
+    is_certain = slopes > max(MIN_CLARITY * float(uncertainty) / speed, MIN_RANK_DERIVATIVE * norm)
     if not v.any() or slopes[~is_certain].max(initial=0.0) > MIN_RANK_DERIVATIVE * norm:
         return False
     right_side = -np.append(derivative_of_constraints(1), lost @ derivative_of_constraints(2) / (3.0 * speed))

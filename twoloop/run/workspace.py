@@ -112,7 +112,7 @@ def _derivative_entries(
 MASSLESS_RATIO = 1e-10  # eigenvalue of a body's M, relative to the largest, up to which its eigenvector has no mass
 # norm of a row's component along the massless directions of a body, relative to the row's norm, above which the row is
 # used to give one of these directions a mass
-MIN_FRACTION_ALONG = 1e-3
+MIN_MASSLESS_FRACTION = 1e-3
 MIN_SIZE_NEWTON = 1.6  # number of coordinates, relative to LARGE, from which on Newton's matrix has sparse factors
 # largest number of entries, and of operations, of the static form, relative to those of dense factors
 MAX_STATIC_SHARE = 0.05
@@ -241,7 +241,7 @@ def _stiff_rows(
             for j, value in own:
                 row[index_in_body[j]] += value
             component = massless[body] @ row
-            if np.linalg.norm(component) > MIN_FRACTION_ALONG * np.linalg.norm(row):
+            if np.linalg.norm(component) > MIN_MASSLESS_FRACTION * np.linalg.norm(row):
                 stiff_rows.append(i)
                 massless[body] = np.linalg.svd(component[None, :])[2][1:] @ massless[body]
     return stiff_rows
