@@ -417,10 +417,10 @@ def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
     groups[:, indices.HIGH] = len(table.t) - 1
     # polynomials across a singular position do not use the states before it, which may have rounding errors
     is_crossing = np.append(False, table.kinds == indices.ACROSS)
-    (firsts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
-    if firsts.size:
+    (crossing_starts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
+    if crossing_starts.size:
         is_across = is_crossing[intervals + 1]
-        groups[is_across, indices.LOW] = firsts[np.searchsorted(firsts, intervals[is_across], side="right") - 1]
+        groups[is_across, indices.LOW] = crossing_starts[np.searchsorted(crossing_starts, intervals[is_across], side="right") - 1]
     (jumps,) = (table.kinds == indices.JUMP).nonzero()
     if not jumps.size:
         return groups
