@@ -102,7 +102,7 @@ def is_inconsistent(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArr
 def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
     """Return generic parameters, and the indices of those that vary between runs.
 
-    Generic parameters are random averages over runs: relations that hold in some runs only do not hold between them.
+    Generic parameters are random averages over runs: they satisfy no relations that hold only in some of the runs.
     """
     is_varying = (parameters != parameters[:1]).any(axis=0)
     if not is_varying.any():

@@ -346,7 +346,10 @@ class StopFriction:
         return self._stops[k].friction
 
     def sticking_groups(self, D: Array, basis: list[int], rows: dict[int, int]) -> dict[int, list[int]]:
-        """Return stops that stick, in groups with one displacement; D has the rows `basis`, and `rows` by stop."""
+        """Return stops that stick, in groups with equal displacements; `rows`: row of D of each stop that sticks.
+
+        `basis`: independent rows of D; the rows of the groups are added.
+        """
         groups: dict[int, list[int]] = {}
         first: dict[int, int] = {}  # first stop of a group by its row
         for k, row in rows.items():

@@ -362,7 +362,7 @@ class Motion:
         return True
 
     def _has_low_rebound(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
-        """Return a mask of the stops that rebound by less than `rebound_height`, as other stops press on them."""
+        """Return a mask of the stops that rebound by less than `rebound_height`, pressed by forces and other stops."""
         signs, resting_joints = self._sliding_directions(v)
         a, c_joints = self._free_accelerations(signs, resting_joints, v)
         gap = self.gaps.at(self.t, self.q, v)

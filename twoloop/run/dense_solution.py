@@ -420,7 +420,8 @@ def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
     (crossing_starts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
     if crossing_starts.size:
         is_across = is_crossing[intervals + 1]
-        groups[is_across, indices.LOW] = crossing_starts[np.searchsorted(crossing_starts, intervals[is_across], side="right") - 1]
+        last_start = np.searchsorted(crossing_starts, intervals[is_across], side="right") - 1
+        groups[is_across, indices.LOW] = crossing_starts[last_start]
     (jumps,) = (table.kinds == indices.JUMP).nonzero()
     if not jumps.size:
         return groups
