@@ -50,10 +50,10 @@ class Code:
         self.equations = self.code.shared.equations
         self.there = on_arrays(self.code.shared.functions.addresses["own_accelerate"])
         self.quick = None
-        if self.equations.reduced is not None:
+        if self.equations.reduced_program is not None:
             module, numbers = Module(), self.code.shared.numbers
             kind = BIT, ["double*"] * 5
-            write_function(module, "quick", kind, self.equations.reduced, numbers)
+            write_function(module, "quick", kind, self.equations.reduced_program, numbers)
             self.quick = function_of(module, "quick", *[ctypes.c_void_p] * 5)
 
     def at(self, t, q, v):
@@ -156,16 +156,17 @@ def test_they_take_fewer_operations(name, most, mass_first):
     problem = getattr(mechanisms, name)()
     equations = generated_code(problem.system, 0.0, problem.q0).shared.equations
     quick_ones, all_of_them = (
-        len(equations.graph.needed_by(outputs.arrays["a"])) for outputs in (equations.reduced, equations.mass_first)
+        len(equations.graph.quantities_for(outputs.arrays["a"]))
+        for outputs in (equations.reduced_program, equations.mass_first_program)
     )
     assert quick_ones <= most < all_of_them <= mass_first
-    assert len(equations.reduced.quantities()) < 0.8 * len(equations.mass_first.quantities())
+    assert len(equations.reduced_program.quantities()) < 0.8 * len(equations.mass_first_program.quantities())
 
 
 @pytest.mark.parametrize("name", ["pendulum", "double_pendulum", "heavy_top", "closed_chain", "rolling_disc"])
 def test_where_few_coordinates_depend_mass_first_stays(name):
     problem = getattr(mechanisms, name)()
-    assert generated_code(problem.system, 0.0, problem.q0).shared.equations.reduced is None
+    assert generated_code(problem.system, 0.0, problem.q0).shared.equations.reduced_program is None
 
 
 @settings(max_examples=50, deadline=None)
@@ -191,7 +192,7 @@ def test_pivots_are_one_for_each_row_and_not_small(m, freedom, seed):
 
 
 def blocks_along(system, known):
-    return [PivotChoice.at(system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
+    return [PivotChoice.for_position(system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
 
 
 def test_neighbouring_starts_have_the_same_code_and_any_start_its_own():
@@ -220,7 +221,7 @@ def test_in_lanes_no_run_depends_on_those_beside_it():
     problem = mechanisms.four_bar()
     system, n = problem.system, problem.system.n_q
     known = solve_dae(system, (0.0, 5.0), problem.q0, problem.v0, t_eval=np.linspace(0.0, 5.0, 801))
-    equations = Elimination(system, PivotChoice.at(system, 0.0, problem.q0))
+    equations = Elimination(system, PivotChoice.for_position(system, 0.0, problem.q0))
     module, numbers = Module(), Coefficients()
     for outputs in equations.accelerations:
         list(numbers.structure(outputs))

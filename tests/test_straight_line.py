@@ -192,7 +192,7 @@ def compute(program, inputs, divided=False):
 
 def machine_code_of(program, numbers, divided=False):
     """What Python calls, on arrays, for a function of LLVM."""
-    module, n = Module(divided), len(program.graph.sizes) + 1 + len(program.arrays)
+    module, n = Module(divided), len(program.graph.input_sizes) + 1 + len(program.arrays)
     write_function(module, "function", ("i1", ["double*"] * n), program, numbers)
     assert ("blockaddress" in str(module)) is divided
     made = GeneratedFunctions(["function"], object_code(str(module)))
@@ -229,7 +229,7 @@ def test_elimination_solves_what_dense_linear_algebra_solves(n, m, seed):
     assert np.allclose(x, np.linalg.solve(matrix, b), rtol=1e-6, atol=1e-9) and len(factors.conditions) == m
     shares = [evaluated(one, known) / evaluated(other, known) for one, other in factors.conditions]
     assert all(0.0 < share < 1.0 + 1e-9 for share in shares)
-    assert all(evaluated(form, known) > 0.0 for form in factors.positive)
+    assert all(evaluated(form, known) > 0.0 for form in factors.mass_pivots)
 
 
 def evaluated(form, known):

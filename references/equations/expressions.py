@@ -14,9 +14,9 @@ import numpy as np
 
 from references.equations.rows import independent_rows
 from references.lines import CannotRun
-from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.trace import Equations, only_quantity
-from twoloop.generate.traced_values import Traced
+from twoloop.generate.traced_values import CallbackTraces
 from twoloop.kernels.data.indices import GAMMA_GIVEN
 from twoloop.kernels.evaluation import operations
 from twoloop.problem.problem import Array
@@ -64,17 +64,17 @@ class Expressions:
         self.added = _rows_for_mass(system.mass(t0, q0), jacobian[self.rows])
         try:
             self._forms(self.traced)
-            Traced(system, self.traced.graph).refuse(system, t0, t0 + 1.0, q0, v0)
+            CallbackTraces(system, self.traced.graph).refuse_if_wrong(system, t0, t0 + 1.0, q0, v0)
             if of_parameters:
                 self.traced = Equations(system)
-                self.traced.parameters = symbols(self.traced.graph.inputs(system.parameters.size, False))
+                self.traced.parameters = symbol_array(self.traced.graph.inputs(system.parameters.size, False))
             self.mass, self.jacobian, self.force, self.gamma = self._forms(self.traced)
         except Untraceable as error:
             raise NotSymbolic(str(error)) from error
 
     def _forms(self, traced: Equations) -> tuple[Any, ...]:
         """Return M, C_q, Q and Q_d of the rows that are kept, as arrays of forms."""
-        mass, jacobian, force, gamma = (traced.of(kind) for kind in ("mass", "jacobian", "force", "gamma"))
+        mass, jacobian, force, gamma = (traced.expressions(kind) for kind in ("mass", "jacobian", "force", "gamma"))
         return mass, jacobian[self.rows], force, gamma[self.rows]
 
     @cached_property
@@ -97,7 +97,7 @@ class Expressions:
         """Return about how many operations the accelerations take by these factors; a division counts for several."""
         graph = self.traced.graph
         accelerations = _substituted(factors, self._right_hand_side(self.force, self.gamma))[: self.system.n_q]
-        kinds = [graph.operations[i] for i in graph.needed_by(accelerations)]
+        kinds = [graph.operations[i] for i in graph.quantities_for(accelerations)]
         terms = sum(len(form.terms) for _, *forms in kinds for form in forms if form is not None)  # type: ignore[misc]
         return terms + DIVISION * sum(kind == operations.RECIPROCAL for kind, *_ in kinds)  # type: ignore[misc]
 
@@ -128,11 +128,11 @@ class Expressions:
         masses, jacobians = _nonzero(self.mass), _nonzero(self.jacobian)
         for unknown in (*self.traced.q, *self.traced.v):
             by = Derivative(graph, {only_quantity(unknown): Affine(graph, 1.0, {})})
-            Q, gamma = (list(map(by.of, forms)) for forms in (self.force, self.gamma))
+            Q, gamma = (list(map(by.differentiate, forms)) for forms in (self.force, self.gamma))
             for i, j in masses:
-                Q[i] = Q[i] - by.of(self.mass[i, j]) * self.solution[j]
+                Q[i] = Q[i] - by.differentiate(self.mass[i, j]) * self.solution[j]
             for k, j in jacobians:
-                Cq = by.of(self.jacobian[k, j])
+                Cq = by.differentiate(self.jacobian[k, j])
                 Q[j] = Q[j] - Cq * self.solution[n + k]
                 gamma[k] = gamma[k] - Cq * self.solution[j]
             yield self._right_hand_side(Q, gamma)
@@ -165,7 +165,7 @@ class Printed:
     def translate(self, forms: Iterable[Affine]) -> list[Any]:
         """Return the expressions of forms; a constant is a float."""
         forms = list(forms)
-        for i in self.graph.needed_by(forms):
+        for i in self.graph.quantities_for(forms):
             if i not in self.known:
                 kind, first, second = self.graph.operations[i]  # type: ignore[misc]
                 self.known[i] = self._operation(kind, first, second)
@@ -290,10 +290,10 @@ def _factored(matrix: dict[tuple[int, int], Affine], order: list[tuple[int, ...]
     blocks: list[Block] = []
     for places in order:
         zero = Affine(next(iter(matrix.values())).graph, 0.0, {})
-        inverse = _inverse([[rows[i].pop(j, zero).value() for j in places] for i in places])
+        inverse = _inverse([[rows[i].pop(j, zero).as_term() for j in places] for i in places])
         columns = dict.fromkeys(j for i in places for j in rows[i])
-        entries = [(j, [rows[i].get(j, zero).value() for i in places]) for j in columns]
-        below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
+        entries = [(j, [rows[i].get(j, zero).as_term() for i in places]) for j in columns]
+        below = [(j, [_dot(row, values).as_term() for row in inverse]) for j, values in entries]
         for j, multiples in below:
             for k, values in entries:
                 change = _dot(multiples, values)
@@ -310,8 +310,8 @@ def _inverse(pivots: list[list[Affine]]) -> list[list[Affine]]:
     if len(pivots) == 1:
         return [[1.0 / a]]
     b, c = pivots[1]
-    inverse = 1.0 / (a * c - b * b).value()
-    return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
+    inverse = 1.0 / (a * c - b * b).as_term()
+    return [[(c * inverse).as_term(), (-b * inverse).as_term()], [(-b * inverse).as_term(), (a * inverse).as_term()]]
 
 
 def _dot(first: Sequence[Affine], second: Sequence[Affine]) -> Affine:
@@ -327,7 +327,7 @@ def _substituted(factors: Sequence[Block], right_side: list[Affine]) -> list[Aff
     owed: list[list[tuple[Affine, Affine]]] = [[] for _ in right_side]
     for places, _, below in factors:
         for i in places:
-            solution[i] = (solution[i] - _sum_of_products(owed[i])).value()
+            solution[i] = (solution[i] - _sum_of_products(owed[i])).as_term()
         for j, multiples in below:
             owed[j] += zip(multiples, [solution[i] for i in places], strict=True)
     for places, inverse, below in reversed(factors):
@@ -335,7 +335,7 @@ def _substituted(factors: Sequence[Block], right_side: list[Affine]) -> list[Aff
         for k, (i, row) in enumerate(zip(places, inverse, strict=True)):
             solution[i] = (
                 _dot(row, pivots) - _sum_of_products([(multiples[k], solution[j]) for j, multiples in below])
-            ).value()
+            ).as_term()
     return solution
 
 
@@ -347,8 +347,8 @@ def _sum_of_products(products: Sequence[tuple[Affine, Affine]]) -> Any:
         if not first.terms:
             total = total + first.constant * second
             continue
-        scale, factor = first.normalised()
+        scale, factor = first.normalized()
         by_factor.setdefault(factor.key, [factor, 0.0])[1] += scale * second
     for factor, second in by_factor.values():
-        total = total + factor * second.value()
+        total = total + factor * second.as_term()
     return total

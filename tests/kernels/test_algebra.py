@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.problems import called, entry
 from twoloop.checks.structure import least_solution
-from twoloop.generate.elimination import BOUNDS, LEAST, RANK, SINGULAR_MASS
+from twoloop.generate.elimination import MIN_PIVOTS, RANK_TOL, SINGULAR_MASS, START_LIMITS
 from twoloop.kernels.lanes import layout
 from twoloop.kernels.lanes.layout import FINE, LANES, N_FIELDS
 from twoloop.kernels.linalg import dense as linalg
@@ -135,13 +135,15 @@ def test_the_least_solution_is_that_of_the_pseudo_inverse(rows):
 def chosen(mass, G):
     """What the kernel says of M and G: the bound that pivots keep, rows that count and that help, and the factor."""
     room, found = np.full(workspace_size(*G.shape), np.nan), np.zeros(2 + 3 * len(G), dtype=np.int64)
-    place = choose_rows(np.ascontiguousarray(mass), np.ascontiguousarray(G), RANK, SINGULAR_MASS, BOUNDS, room, found)
+    place = choose_rows(
+        np.ascontiguousarray(mass), np.ascontiguousarray(G), RANK_TOL, SINGULAR_MASS, START_LIMITS, room, found
+    )
     n_kept, n_added, *places = found.tolist()
     return place, places[:n_kept], places[len(G) : len(G) + n_added], room[0]
 
 
 def least_pivot(mass, G):
-    return LEAST[chosen(mass, G)[0]]
+    return MIN_PIVOTS[chosen(mass, G)[0]]
 
 
 @pytest.mark.parametrize("near", [1.0, 1e-1, 1e-6])
@@ -150,7 +152,7 @@ def test_the_least_pivot_is_the_power_of_ten_below_the_least_eigenvalue(near):
     mass = np.diag(10.0 ** np.linspace(-1.0, 1.0, 8)) + 0.01 * np.ones((8, 8))
     S = G @ np.linalg.solve(mass, G.T)
     size = np.sqrt(np.diag(S))
-    expected = LEAST[int((np.linalg.eigvalsh(S / np.outer(size, size))[0] < BOUNDS).sum())]
+    expected = MIN_PIVOTS[int((np.linalg.eigvalsh(S / np.outer(size, size))[0] < START_LIMITS).sum())]
     assert least_pivot(mass, G) == expected and (near == 1.0 or expected < least_pivot(mass, ROWS[:4]))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.checks.arguments import Array, check_finite, check_real, shown
-from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.program import OperationTable
 from twoloop.generate.trace import convert_to_expressions, trace
 
@@ -42,8 +42,8 @@ class RowFunction:
             results = self.forms(graph, t, q, v)
         except Untraceable as error:
             raise ValueError(f"{self.name} must be made of numpy's functions, without branches: {error}") from None
-        table = OperationTable.of(graph, 1 + 2 * n, dict(enumerate(results)))
-        object.__setattr__(self, "traced", np.array(table.flat()))
+        table = OperationTable.from_results(graph, 1 + 2 * n, dict(enumerate(results)))
+        object.__setattr__(self, "traced", np.array(table.as_floats()))
 
     @property
     def n_results(self) -> int:
@@ -52,14 +52,14 @@ class RowFunction:
 
     def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
         """Return the results as symbols."""
-        value = np.array(trace(lambda _, coordinates: self.function(coordinates), t, symbols(q)), dtype=object)
+        value = np.array(trace(lambda _, coordinates: self.function(coordinates), t, symbol_array(q)), dtype=object)
         if value.shape not in ((), (1,)):
             raise Untraceable(f"on symbols it returns shape {value.shape}")
         row = convert_to_expressions(graph, value.reshape(1))[0]
         unit, inputs = Affine(graph, 1.0, {}), [next(iter(each.terms)) for each in q]
         along = dict(zip(inputs, v, strict=True))
-        bend = Derivative(graph, along).of(Derivative(graph, along).of(row))
-        gradient = [Derivative(graph, {inputs[j]: unit}).of(row) for j in self.columns]
+        bend = Derivative(graph, along).differentiate(Derivative(graph, along).differentiate(row))
+        gradient = [Derivative(graph, {inputs[j]: unit}).differentiate(row) for j in self.columns]
         return [row, Affine(graph, 0.0, {}), bend.times(-1.0), *gradient]
 
     def at(self, t: float, q: Array, v: Array) -> Array:
@@ -82,11 +82,11 @@ class RateFunction(RowFunction):
     def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
         """Return the results as symbols."""
         function: Callable[..., Any] = self.function
-        value = trace(lambda _, coordinates, rates: function(coordinates, rates), t, symbols(q), symbols(v))
+        value = trace(lambda _, coordinates, rates: function(coordinates, rates), t, symbol_array(q), symbol_array(v))
         row, unit = convert_to_expressions(graph, np.array(value, dtype=object).reshape(1))[0], Affine(graph, 1.0, {})
         along = {next(iter(each.terms)): rate for each, rate in zip(q, v, strict=True)}
-        gradient = [Derivative(graph, {next(iter(v[j].terms)): unit}).of(row) for j in self.columns]
-        return [Derivative(graph, along).of(row).times(-1.0), *gradient]
+        gradient = [Derivative(graph, {next(iter(v[j].terms)): unit}).differentiate(row) for j in self.columns]
+        return [Derivative(graph, along).differentiate(row).times(-1.0), *gradient]
 
 
 ARGUMENTS = {1: "(t)", 2: "(length, rate) or (angle, rate)", 3: "(t, q, v)"}
@@ -149,7 +149,7 @@ class Function:
 
     def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
         """Return the results for symbolic arguments; raise Untraceable if that fails."""
-        arguments = self._arguments(t, symbols(q), symbols(v))
+        arguments = self._arguments(t, symbol_array(q), symbol_array(v))
         results: list[Affine] = []
         for each in (self.function, *self.derivatives):
             array = np.array(trace(each, *arguments), dtype=object)
@@ -216,7 +216,7 @@ def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Fun
     function = Function(name, motion, 1, 1, () if rate is None else (rate, acceleration))
     if rate is None:
         try:
-            return replace(function, traced=np.array(program_for([function], 0, True).flat()))
+            return replace(function, traced=np.array(program_for([function], 0, True).as_floats()))
         except Untraceable as error:
             raise ValueError(
                 f"{error}; so it cannot be differentiated exactly. Write it with numpy functions and without "
@@ -231,7 +231,7 @@ def motion_forms(function: Function, graph: Graph, t: Affine) -> list[Affine]:
     if not function.derivatives:
         (place,) = t.terms
         for _ in range(2):
-            results.append(Derivative(graph, {place: Affine(graph, 1.0, {})}).of(results[-1]))
+            results.append(Derivative(graph, {place: Affine(graph, 1.0, {})}).differentiate(results[-1]))
     return results
 
 
@@ -250,7 +250,7 @@ def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: 
                 results += each.forms(graph, t, q_part, v_part)
         except Untraceable as error:
             raise Untraceable(f"{each.name}: {error}") from None
-    return OperationTable.of(graph, 1 + 2 * n, dict(enumerate(results)))
+    return OperationTable.from_results(graph, 1 + 2 * n, dict(enumerate(results)))
 
 
 def is_constant(function: Function | RowFunction) -> bool:

@@ -205,7 +205,7 @@ class Tables:
         programs: list[list[float]] = []
         for functions, motions in ((self.motions, True), (self.functions, False)):
             try:
-                programs.append(program_for(functions, n_q, motions).flat() if functions else [])
+                programs.append(program_for(functions, n_q, motions).as_floats() if functions else [])
             except Untraceable as error:
                 self.untraced = str(error)
                 programs.append([])

@@ -153,7 +153,10 @@ class _LaneProjection:
         )
 
         def project_block(rows: slice) -> None:
-            workspace, numbers = aligned_zeros(n_vectors, layout.LANES), generated.numbers(starts.parameters[rows])
+            workspace, numbers = (
+                aligned_zeros(n_vectors, layout.LANES),
+                generated.coefficients_for(starts.parameters[rows]),
+            )
             inputs = code.pattern, may_change, numbers, q[rows], v[rows]
             kernels.start_lanes(kit, settings, control, *inputs, is_valid[rows], workspace)
 

@@ -18,9 +18,9 @@ from twoloop.ensembles.starts import Starts, generic_parameters, generic_system,
 from twoloop.generate.elimination import PivotChoice
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
-from twoloop.generate.program import Arrays, Program
+from twoloop.generate.program import ArrayAlgebra, Program
 from twoloop.generate.series import series_for
-from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_short, may_be_steep
+from twoloop.generate.time_dependence import TIME_CALLBACKS, TIME_MASK, may_be_short, may_be_steep
 from twoloop.generate.trace import Equations
 from twoloop.kernels.control.discontinuities import LEAST_RANGE, LEAST_VALUE, MIN_STEEPNESS_RATIO, SUDDEN_RATIO
 from twoloop.kernels.control.discontinuities import N_SAMPLES as N_PLACES
@@ -57,9 +57,11 @@ class ForceSampling:
         self._tape = ParameterTape(values.tolist(), varying)
         equations = Equations(system, self._tape.parameters)
         graph = equations.graph
-        expressions = np.concatenate([equations.of(kind).ravel() for kind in BY_TIME if kind in system.given])
+        expressions = np.concatenate(
+            [equations.expressions(kind).ravel() for kind in TIME_CALLBACKS if kind in system.given]
+        )
         self._program = Program(
-            graph, {"": [x for x in expressions if any(graph.inputs_of[i] & TIME for i in x.terms)]}
+            graph, {"": [x for x in expressions if any(graph.input_masks[i] & TIME_MASK for i in x.terms)]}
         )
 
     def has_short_forces(self, times: Array, rtol: float, parameters: Array, q: Array, v: Array) -> NDArray[np.bool_]:
@@ -68,10 +70,10 @@ class ForceSampling:
         q, v : (n_runs, n), one state of each run.
         """
         is_short = np.zeros(len(q), dtype=bool)
-        size = max(1, BLOCK_VALUES // max(1, len(times) * len(self._program.forms)))
+        size = max(1, BLOCK_VALUES // max(1, len(times) * len(self._program.expressions)))
         for begin in range(0, len(q), size):
             rows = slice(begin, begin + size)
-            algebra = Arrays(self._tape, parameters[rows])
+            algebra = ArrayAlgebra(self._tape, parameters[rows])
             (forces,) = self._program.run(algebra, [times[:, None], *q[rows].T, *v[rows].T])
             values = np.empty((len(times), len(q[rows]), len(forces)))
             for k, force in enumerate(forces):
@@ -283,7 +285,7 @@ class LaneRuns:
         gap = 1.0 if may_be_steep(generic_copy, force_was_traced=True) else method.max_gap
         self.n_gaps = N_SHORT if any(short_forces) else N_SAMPLES * gap  # smallest number of steps in a run
         self.sampling = ForceSampling(system, generic, varying) if short_forces.by_time else None
-        choice = PivotChoice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
+        choice = PivotChoice.for_position(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # key of the cached code
 
         def generate() -> GeneratedLanes[LaneCode]:
@@ -344,7 +346,7 @@ class LaneRuns:
 
         starts, code, method = self.starts, self.generated.code, self.method
         n, n_rows = code.n, code.n_rows
-        run_parameters = self.generated.numbers(starts.parameters[numbers])
+        run_parameters = self.generated.coefficients_for(starts.parameters[numbers])
         begin = layout.array_offsets(n, n_rows, code.n_numbers)[-1]
         workspace = aligned_zeros(begin + method.memory(code), layout.LANES)
         kit = layout.LaneKit(self.generated.functions, method.step())

@@ -27,19 +27,19 @@ from twoloop.generate import lane_series, llvm_code
 from twoloop.generate.compile_equations import GeneratedCode, SharedCode, call_accelerations
 from twoloop.generate.lane_series import (
     LaneEmitter,
-    column,
+    gather_lane,
     load_lanes,
     loop_over,
     store_lanes,
     two_sums,
     vector_index,
 )
-from twoloop.generate.llvm_code import Emitter, Lowering, lower
-from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
+from twoloop.generate.llvm_code import Emitter, Lowering, lower_program
+from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, VOID, Module, Value, constant, constants, integer
 from twoloop.generate.program import Program
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import DeferredFunctions, generated_functions
-from twoloop.kernels.data import collocation as at
+from twoloop.kernels.data import collocation as mem
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import ATOL, ESTIMATE, RTOL
 
@@ -127,9 +127,9 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
-MOST_OPERATIONS = 5000  # largest number of operations of the equations: code of this length takes 2 s to compile
-SMALLEST = 1e-300  # smallest divisor, and smallest allowed error, which replaces 0
-FAILED = -1.0  # result of `audit` if the accelerations are invalid (defects are never negative)
+MAX_OPERATIONS = 5000  # largest number of operations of the equations: code of this length takes 2 s to compile
+MIN_DIVISOR = 1e-300  # smallest divisor, and smallest allowed error, which replaces 0
+INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
 # number of further steps that eliminate M first, after a step whose accelerations by the shorter program were invalid
 STEPS_BY_MASS_FIRST = 8.0
@@ -154,14 +154,14 @@ ALLOWED_DEFECT = 16.0
 
 
 def compiles_quickly(shared: SharedCode) -> bool:
-    """Return whether the collocation code of a mechanism compiles within a few seconds, see MOST_OPERATIONS."""
-    return shared.equations.n_operations <= MOST_OPERATIONS
+    """Return whether the collocation code of a mechanism compiles within a few seconds, see MAX_OPERATIONS."""
+    return shared.equations.n_operations <= MAX_OPERATIONS
 
 
 class CollocationCode:
     """Generator of the functions for the collocation steps of one mechanism.
 
-    In the methods, `emit` writes operations on vectors of LANES numbers, `one` on single numbers, `two` on vectors of
+    In the methods, `emit` writes operations on vectors of LANES numbers, `num` on single numbers, `vec2` on vectors of
     two numbers, and `wide` on vectors of coordinates.
 
     Parameters
@@ -171,7 +171,7 @@ class CollocationCode:
 
     Attributes
     ----------
-    iterated : list of int
+    iterated_coordinates : list of int
         Coordinates on whose positions or velocities the accelerations depend.
     numbers : Coefficients
         Coefficients that the functions read.
@@ -180,16 +180,24 @@ class CollocationCode:
     """
 
     def __init__(self, shared: SharedCode):
-        self.equations, self.numbers, self.parts = shared.equations, shared.numbers, shared.parts
+        self.equations, self.numbers, self.split_functions = shared.equations, shared.numbers, shared.split_functions
         self.n, self.n_rows = self.equations.system.n_q, len(self.equations.all_rows)
-        self.iterated = self._iterated()
-        self.others = [i for i in range(self.n) if i not in self.iterated]
+        self.iterated_coordinates = self._find_iterated()
+        self.other_coordinates = [i for i in range(self.n) if i not in self.iterated_coordinates]
         self.has_reduced = len(self.equations.accelerations) > 1
-        self.a, self.q, self.v, self.polynomials, self.spectra, self.ends, self.end_a, self.lam, self.size = (
-            at.array_offsets(self.n, len(self.iterated), self.n_rows)
-        )
+        (
+            self.a_offset,
+            self.q_offset,
+            self.v_offset,
+            self.polynomial_offset,
+            self.spectrum_offset,
+            self.end_offset,
+            self.end_a_offset,
+            self.lam_offset,
+            self.memory_size,
+        ) = mem.array_offsets(self.n, len(self.iterated_coordinates), self.n_rows)
 
-        if self.parts is None:
+        if self.split_functions is None:
             outputs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
         else:  # the digest of `shared` covers the other programs
             outputs = self.equations.accelerations[:1]
@@ -197,24 +205,24 @@ class CollocationCode:
         description = [[each.sizes, *numbers.structure(each)] for each in outputs]
         self.structure = hashlib.sha256(repr([shared.digest, description]).encode()).hexdigest()
 
-    def _iterated(self) -> list[int]:
-        graph, forms = self.equations.graph, []
+    def _find_iterated(self) -> list[int]:
+        graph, exprs = self.equations.graph, []
         for outputs in self.equations.accelerations:
-            forms += outputs.forms
-            forms += [form for i in outputs.quantities() for form in graph.arguments(i)]
-        inputs = {i for form in forms for i in form.terms if graph.operations[i] is None}
+            exprs += outputs.expressions
+            exprs += [expr for i in outputs.quantities() for expr in graph.arguments(i)]
+        inputs = {i for expr in exprs for i in expr.terms if graph.operations[i] is None}
         return sorted({(i - 1) % self.n for i in inputs if i > 0})
 
     # methods that write the functions
 
-    def attempt(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
+    def iterate_step(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
         """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
 
         The accelerations are those of the program with the fewest operations. Its conditions are checked once, after
         the last sweep. If they fail, the iteration is repeated with the elimination that begins with M, which the next
         STEPS_BY_MASS_FIRST steps use, too.
         """
-        builder, one = emit.builder, Emitter(emit.builder)
+        builder, num = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
 
         def iterate_mass_first() -> Value:
@@ -222,37 +230,39 @@ class CollocationCode:
             return builder.call(name, DOUBLE, [work, state, tolerances, numbers])
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
-            if self.parts is not None and not self.has_reduced:
-                return self._caller(emit, work, 0)(inputs)
+            if self.split_functions is not None and not self.has_reduced:
+                return self._evaluator(emit, work, 0)(inputs)
             outputs, lowering = self.equations.accelerations[0], Lowering(emit, self.numbers)
-            (forms,), graph = outputs.arrays.values(), self.equations.graph
+            (exprs,), graph = outputs.arrays.values(), self.equations.graph
             for quantity, value in enumerate(inputs):
                 lowering.define(quantity, value)
 
             def store_accelerations(coordinates: list[int]) -> None:
-                for i, value in zip(coordinates, lowering.forms(graph, [forms[i] for i in coordinates]), strict=True):
-                    store_lanes(emit, value, work, self.a + LANES * i)
+                for i, value in zip(
+                    coordinates, lowering.expressions(graph, [exprs[i] for i in coordinates]), strict=True
+                ):
+                    store_lanes(emit, value, work, self.a_offset + LANES * i)
 
             def store_others() -> Value:
-                store_accelerations(self.others)
-                lowering.forms(graph, [form for pair in outputs.conditions for form in pair])
-                return lowering.holds(outputs, self._accelerations(emit, work))
+                store_accelerations(self.other_coordinates)
+                lowering.expressions(graph, [expr for pair in outputs.conditions for expr in pair])
+                return lowering.is_valid(outputs, self._accelerations(emit, work))
 
-            store_accelerations(self.iterated)
+            store_accelerations(self.iterated_coordinates)
             return store_others
 
         def fallback() -> Value:
             if not self.has_reduced:
-                return constant(DOUBLE, float(at.NOT_COMPUTED))
-            one.store(constant(DOUBLE, STEPS_BY_MASS_FIRST), work, at.CAREFUL)
+                return constant(DOUBLE, float(mem.NOT_COMPUTED))
+            num.store(constant(DOUBLE, STEPS_BY_MASS_FIRST), work, mem.CAREFUL)
             return iterate_mass_first()
 
         if self.has_reduced:
-            n_careful = one.load(work, at.CAREFUL)
+            n_careful = num.load(work, mem.CAREFUL)
             with self._returning_if(emit, builder.compare("fcmp ogt", n_careful, llvm_code.ZERO)):
-                one.store(one.subtract(n_careful, llvm_code.ONE), work, at.CAREFUL)
+                num.store(num.subtract(n_careful, llvm_code.ONE), work, mem.CAREFUL)
                 builder.ret(iterate_mass_first())
-        self._call(emit, "begin_nodes", self._begin_nodes, [work, state, tolerances])
+        self._call(emit, "begin_nodes", self._predict_nodes, [work, state, tolerances])
         return self._iterate(emit, work, state, tolerances, evaluate, fallback)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
@@ -260,26 +270,29 @@ class CollocationCode:
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
-            inner, (work, state, tolerances, numbers) = emit.like(builder), builder.arguments
-            inner.numbers = inner.constants = numbers
-            self._call(inner, "begin_nodes", self._begin_nodes, [work, state, tolerances])
-            mass_first, not_computed = self._caller(inner, work, -1), constant(DOUBLE, float(at.NOT_COMPUTED))
-            builder.ret(self._iterate(inner, work, state, tolerances, mass_first, lambda: not_computed))
+            inner_emit, (work, state, tolerances, numbers) = emit.for_builder(builder), builder.arguments
+            inner_emit.numbers = inner_emit.constants = numbers
+            self._call(inner_emit, "begin_nodes", self._predict_nodes, [work, state, tolerances])
+            mass_first, not_computed = (
+                self._evaluator(inner_emit, work, -1),
+                constant(DOUBLE, float(mem.NOT_COMPUTED)),
+            )
+            builder.ret(self._iterate(inner_emit, work, state, tolerances, mass_first, lambda: not_computed))
         return name
 
-    def _caller(self, emit: LaneEmitter, work: Value, index: int) -> Callable[[list[Value]], Callable[[], Value]]:
+    def _evaluator(self, emit: LaneEmitter, work: Value, index: int) -> Callable[[list[Value]], Callable[[], Value]]:
         """Return the argument `evaluate` of `_iterate` that uses the program `index`, see `call_accelerations`."""
-        accelerations = Emitter(emit.builder).pointer(work, self.a)
+        accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
-            holds = call_accelerations(emit, self.equations, index, inputs, self.numbers, accelerations)
-            return lambda: holds
+            is_valid = call_accelerations(emit, self.equations, index, inputs, self.numbers, accelerations)
+            return lambda: is_valid
 
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, work: Value) -> list[Value]:
         """Return the accelerations at the nodes, loaded again from `work`: values in registers would be spilled."""
-        return [load_lanes(emit, work, self.a + LANES * i) for i in range(self.n)]
+        return [load_lanes(emit, work, self.a_offset + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
@@ -295,68 +308,68 @@ class CollocationCode:
         """Write a call of a function of the module that returns nothing; if it is missing, `write` writes its body."""
         module = emit.builder.module
         if not module.defines(name):
-            builder = module.function(name, NOTHING, [each.type for each in arguments], internal=True)
-            write(emit.like(builder), *builder.arguments)
+            builder = module.function(name, VOID, [each.type for each in arguments], internal=True)
+            write(emit.for_builder(builder), *builder.arguments)
             builder.ret(None)
-        emit.builder.run(name, arguments)
+        emit.builder.call_void(name, arguments)
 
-    def _begin_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
+    def _predict_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
         """Store WEIGHTS, STRICTER, SIZE and POWERS, and predicted positions and velocities at the nodes.
 
         rtol applies to the position (or velocity) at the beginning, or to its change in half a step if that is larger.
         In steps of fixed size, which have no error estimate, rtol = atol = 1.
         """
-        builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        has_fixed_size = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
-        h, rtol = one.load(work, at.H), builder.select(has_fixed_size, llvm_code.ONE, one.load(tolerances, RTOL))
+        builder, num, n = emit.builder, Emitter(emit.builder), self.n
+        has_fixed_size = builder.compare("fcmp oeq", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
+        h, rtol = (num.load(work, mem.H), builder.select(has_fixed_size, llvm_code.ONE, num.load(tolerances, RTOL)))
         wide, begins = self._vector_emitter(emit)
         zero = wide.constant(0.0)
-        length, half, relative = (wide.splat(each) for each in (h, one.multiply(h, constant(DOUBLE, 0.5)), rtol))
+        length, half, relative = (wide.broadcast(each) for each in (h, num.multiply(h, constant(DOUBLE, 0.5)), rtol))
         largest = [zero] * 3
         for begin in begins:
-            q, v, a = (wide.function("fabs", wide.load(one.pointer(state, m * n + begin))) for m in range(3))
-            sizes = wide.larger(q, wide.multiply(half, v)), wide.larger(v, wide.multiply(half, a))
-            atol = wide.load(one.pointer(tolerances, ATOL + begin))
+            q, v, a = (wide.function("fabs", wide.load(num.pointer(state, m * n + begin))) for m in range(3))
+            sizes = wide.maximum(q, wide.multiply(half, v)), wide.maximum(v, wide.multiply(half, a))
+            atol = wide.load(num.pointer(tolerances, ATOL + begin))
             atol = builder.select(has_fixed_size, wide.constant(1.0), atol)
-            of_q, of_v = (wide.fused(relative, each, atol) for each in sizes)
+            of_q, of_v = (wide.fma(relative, each, atol) for each in sizes)
             is_v_stricter = builder.compare("fcmp olt", wide.multiply(of_v, length), of_q)
-            allowed = wide.larger(builder.select(is_v_stricter, of_v, of_q), wide.constant(SMALLEST))
+            allowed = wide.maximum(builder.select(is_v_stricter, of_v, of_q), wide.constant(MIN_DIVISOR))
             weight = wide.divide(builder.select(is_v_stricter, wide.constant(1.0), length), allowed)
-            wide.store(weight, one.pointer(work, at.WEIGHTS + begin))
-            is_iterated = [float(begin + k in self.iterated) for k in range(wide.lanes)]
+            wide.store(weight, num.pointer(work, mem.WEIGHTS + begin))
+            is_iterated = [float(begin + k in self.iterated_coordinates) for k in range(wide.lanes)]
             iterated_weight = wide.multiply(
                 weight, constants(is_iterated) if wide.lanes > 1 else constant(DOUBLE, *is_iterated)
             )
-            scaled_v = wide.multiply(iterated_weight, wide.fused(length, a, v))
-            largest = [wide.larger(*pair) for pair in zip((weight, iterated_weight, scaled_v), largest, strict=True)]
-        of_all, of_iterated, scaled_v = (wide.largest_lane(each) for each in largest)
-        if self.iterated:
-            one.store(one.divide(of_all, of_iterated), work, at.STRICTER)
-            one.store(scaled_v, work, at.SIZE)
-        powers = self._powers(emit, one.divide(h, one.load(work, at.H_BEFORE)))
-        store_lanes(emit, powers, work, at.POWERS)
-        degree = emit.splat(one.load(work, at.DEGREE))
+            scaled_v = wide.multiply(iterated_weight, wide.fma(length, a, v))
+            largest = [wide.maximum(*pair) for pair in zip((weight, iterated_weight, scaled_v), largest, strict=True)]
+        max_weight, max_iterated_weight, scaled_v = (wide.largest_lane(each) for each in largest)
+        if self.iterated_coordinates:
+            num.store(num.divide(max_weight, max_iterated_weight), work, mem.STRICTER)
+            num.store(scaled_v, work, mem.SIZE)
+        powers = self._powers(emit, num.divide(h, num.load(work, mem.H_BEFORE)))
+        store_lanes(emit, powers, work, mem.POWERS)
+        degree = emit.broadcast(num.load(work, mem.DEGREE))
         exponents = constants([float(k) for k in range(LANES)])
         used_powers = builder.select(builder.compare("fcmp olt", exponents, degree), powers, emit.constant(0.0))
-        polynomial = self._polynomial(emit, work, other=False)
+        polynomial = self._polynomial_pointer(emit, work, other=False)
         nodes = np.array(tables().nodes)
         # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
-        with loop_over(emit, self.iterated) as (k, i, _, _):
-            scaled = emit.multiply(load_lanes(emit, one.pointer(polynomial, vector_index(emit, k))), used_powers)
-            store_lanes(emit, scaled, work, at.SCALED)
-            terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(work, at.SCALED + j) for j in range(LANES))]
+        with loop_over(emit, self.iterated_coordinates) as (k, i, _, _):
+            scaled = emit.multiply(load_lanes(emit, num.pointer(polynomial, vector_index(emit, k))), used_powers)
+            store_lanes(emit, scaled, work, mem.SCALED)
+            terms = [num.load(num.pointer(state, i), 2 * n), *(num.load(work, mem.SCALED + j) for j in range(LANES))]
             self._store_stages(
                 emit, work, state, k, i, [self._weighted_sum(emit, each, terms) for each in (velocities, positions)]
             )
 
     def _powers(self, emit: LaneEmitter, x: Value) -> Value:
         """Return the powers 1 to 8 of x, one in each lane."""
-        builder, power = emit.builder, emit.splat(x)
+        builder, power = emit.builder, emit.broadcast(x)
         factors = []
         for bit in (1, 2, 4, 8):
-            has_bit = Value(emit.bit, f"<{', '.join(f'{BIT} {int(bool(k + 1 & bit))}' for k in range(LANES))}>")
+            has_bit = Value(emit.bit_type, f"<{', '.join(f'{BIT} {int(bool(k + 1 & bit))}' for k in range(LANES))}>")
             factors.append(builder.select(has_bit, power, emit.constant(1.0)))
             power = emit.multiply(power, power)
         return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
@@ -375,19 +388,19 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         fallback: Callable[[], Value],
     ) -> Value:
-        """Sweep over the stages until they converge, or the step is rejected; return the code of `attempt`.
+        """Sweep over the stages until they converge, or the step is rejected; return the code of `iterate_step`.
 
         `evaluate` stores the accelerations of the iterated coordinates at [t, q, v]; the function that it returns
         stores the other accelerations, and returns whether all accelerations are valid. If not, `fallback` returns
         the code.
         """
-        builder, one, n = emit.builder, Emitter(emit.builder), self.n
+        builder, num, n = emit.builder, Emitter(emit.builder), self.n
 
         def number(value: float) -> Value:
             return constant(DOUBLE, value)
 
-        has_estimate = builder.compare("fcmp one", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
-        degree, stricter = one.load(work, at.DEGREE), one.load(work, at.STRICTER)
+        has_estimate = builder.compare("fcmp one", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
+        degree, stricter = num.load(work, mem.DEGREE), num.load(work, mem.STRICTER)
         target = builder.select(
             builder.compare("fcmp oge", degree, number(6.0)),
             builder.select(
@@ -395,29 +408,32 @@ class CollocationCode:
             ),
             number(TARGET_SWEEPS),
         )
-        max_sweeps = builder.select(has_estimate, one.add(target, number(EXTRA_SWEEPS)), number(MAX_SWEEPS_OF_FIXED))
+        max_sweeps = builder.select(has_estimate, num.add(target, number(EXTRA_SWEEPS)), number(MAX_SWEEPS_OF_FIXED))
         kappa, noise = (
             builder.select(has_estimate, number(usual), number(fixed))
-            for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (at.MAX_ROUNDING, NOISE_OF_FIXED))
+            for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (mem.MAX_ROUNDING, NOISE_OF_FIXED))
         )
-        noise = one.multiply(noise, one.multiply(one.load(work, at.SIZE), stricter))
-        may_guess = builder.compare("fcmp ogt", one.load(work, at.MAY_GUESS), llvm_code.ZERO)
-        t, h = one.load(work, at.T), one.load(work, at.H)
-        times = emit.fused(constants(tables().nodes), emit.splat(h), emit.splat(t))
-        rho_before = one.load(work, at.RHO)
+        noise = num.multiply(noise, num.multiply(num.load(work, mem.SIZE), stricter))
+        may_guess = builder.compare("fcmp ogt", num.load(work, mem.MAY_GUESS), llvm_code.ZERO)
+        t, h = num.load(work, mem.T), num.load(work, mem.H)
+        times = emit.fma(constants(tables().nodes), emit.broadcast(h), emit.broadcast(t))
+        rho_before = num.load(work, mem.RHO)
         before, loop, after = builder.block, builder.append_block(), builder.append_block()
-        builder.go_to(loop)
+        builder.jump(loop)
         builder.position_at_end(loop)
         carried = [builder.phi(DOUBLE) for _ in range(3)]
         sweeps, change_before, rho = carried
         for phi, value in zip(carried, (llvm_code.ZERO, llvm_code.ONE, rho_before), strict=True):
             phi.add_incoming(value, before)
         q, v = [emit.constant(0.0)] * n, [emit.constant(0.0)] * n
-        for k, i in enumerate(self.iterated):
-            q[i], v[i] = load_lanes(emit, work, self.q + LANES * k), load_lanes(emit, work, self.v + LANES * k)
+        for k, i in enumerate(self.iterated_coordinates):
+            q[i], v[i] = (
+                load_lanes(emit, work, self.q_offset + LANES * k),
+                load_lanes(emit, work, self.v_offset + LANES * k),
+            )
         store_others = evaluate([times, *q, *v])
-        change = one.multiply(stricter, self._integrate(emit, work, state))
-        sweep = one.add(sweeps, llvm_code.ONE)
+        change = num.multiply(stricter, self._integrate(emit, work, state))
+        sweep = num.add(sweeps, llvm_code.ONE)
 
         def compare(name: str, x: Value, y: Value | float) -> Value:
             return builder.compare(f"fcmp {name}", x, y if isinstance(y, Value) else number(y))
@@ -425,24 +441,24 @@ class CollocationCode:
         def either(x: Value, y: Value) -> Value:
             return builder.operation("or", x, y)
 
-        contraction = one.divide(change, one.larger(change_before, number(SMALLEST)))
-        contraction = one.smaller(one.larger(contraction, number(MIN_RHO)), number(MAX_RHO))
+        contraction = num.divide(change, num.maximum(change_before, number(MIN_DIVISOR)))
+        contraction = num.minimum(num.maximum(contraction, number(MIN_RHO)), number(MAX_RHO))
         rho_now = builder.select(compare("ogt", sweep, 1.0), contraction, rho)
         is_out_of_range = either(compare("olt", rho_now, FAST_START), compare("ogt", rho_now, SLOW_START))
-        was_guessed = builder.both(
-            builder.both(may_guess, compare("oeq", sweep, 2.0)),
-            builder.both(is_out_of_range, compare("ogt", change, 0.0)),
+        was_guessed = builder.bitwise_and(
+            builder.bitwise_and(may_guess, compare("oeq", sweep, 2.0)),
+            builder.bitwise_and(is_out_of_range, compare("ogt", change, 0.0)),
         )
-        is_stagnant = builder.both(
+        is_stagnant = builder.bitwise_and(
             compare("ogt", sweep, 2.0),
-            builder.both(
-                compare("oge", change, one.multiply(number(STAGNATION_RATIO), change_before)),
+            builder.bitwise_and(
+                compare("oge", change, num.multiply(number(STAGNATION_RATIO), change_before)),
                 compare("ole", change, noise),
             ),
         )
-        has_converged = either(compare("ole", one.multiply(rho_now, change), kappa), is_stagnant)
-        is_slow = builder.both(
-            builder.both(compare("ogt", sweep, 3.0), has_estimate), compare("oge", rho_now, MAX_CONTRACTION)
+        has_converged = either(compare("ole", num.multiply(rho_now, change), kappa), is_stagnant)
+        is_slow = builder.bitwise_and(
+            builder.bitwise_and(compare("ogt", sweep, 3.0), has_estimate), compare("oge", rho_now, MAX_CONTRACTION)
         )
         is_refused = either(either(is_slow, compare("oge", sweep, max_sweeps)), compare("uge", change, INFINITE))
         stops = builder.operation("or", either(was_guessed, has_converged), is_refused)
@@ -450,14 +466,16 @@ class CollocationCode:
             phi.add_incoming(value, builder.block)
         builder.branch(stops, after, loop)
         builder.position_at_end(after)
-        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [store_others()])
-        with self._returning_if(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
+        all_valid = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [store_others()])
+        with self._returning_if(emit, builder.operation("xor", all_valid, Value(BIT, "true"))):
             builder.ret(fallback())
-        for value, place in ((sweep, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
-            one.store(value, work, place)
-        code = builder.select(has_converged, number(at.CONVERGED), number(at.REFUSED))
-        code = builder.select(was_guessed, number(at.GUESSED), code)
-        with builder.if_then(builder.both(builder.compare("fcmp oeq", code, number(at.CONVERGED)), has_estimate)):
+        for value, place in ((sweep, mem.SWEEPS), (change, mem.CHANGE), (target, mem.TARGETED), (rho_now, mem.RHO)):
+            num.store(value, work, place)
+        code = builder.select(has_converged, number(mem.CONVERGED), number(mem.REFUSED))
+        code = builder.select(was_guessed, number(mem.GUESSED), code)
+        with builder.if_then(
+            builder.bitwise_and(builder.compare("fcmp oeq", code, number(mem.CONVERGED)), has_estimate)
+        ):
             self._call(emit, "judge_nodes", self._estimate_error, [work, state])
         return code
 
@@ -470,247 +488,272 @@ class CollocationCode:
         errors are at most 20 times the estimate. In smooth motion errors are smaller by decades, which costs few steps,
         because the estimate is of order 12.
         """
-        builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        n_sweeps, change, target, rho = (one.load(work, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
-        two = LaneEmitter(builder, 2)
-        error_to_kappa = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
-        error_to_kappa = one.add(error_to_kappa, constant(DOUBLE, LEAST_CHANGE))
-        logs = two.logarithm(two.vector([error_to_kappa, rho]))
-        exponent = one.fused(one.subtract(target, n_sweeps), builder.extract(logs, 1), builder.extract(logs, 0))
-        log_convergence = one.divide(one.add(exponent, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
-        with one.loop(integer(0), integer(n), []) as (i, _, _):
-            a0 = one.load(one.pointer(state, i), 2 * n)
-            values = emit.function("fabs", self._weighted_rows(emit, tables().spectrum, a0, work, i))
-            pairs = emit.larger(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
-            store_lanes(emit, pairs, one.pointer(work, vector_index(emit, i)), self.spectra)
+        builder, num, n = emit.builder, Emitter(emit.builder), self.n
+        n_sweeps, change, target, rho = (
+            num.load(work, place) for place in (mem.SWEEPS, mem.CHANGE, mem.TARGETED, mem.RHO)
+        )
+        vec2 = LaneEmitter(builder, 2)
+        error_to_kappa = num.divide(num.multiply(rho, change), constant(DOUBLE, KAPPA))
+        error_to_kappa = num.add(error_to_kappa, constant(DOUBLE, LEAST_CHANGE))
+        logs = vec2.logarithm(vec2.vector([error_to_kappa, rho]))
+        exponent = num.fma(num.subtract(target, n_sweeps), builder.extract(logs, 1), builder.extract(logs, 0))
+        log_convergence = num.divide(num.add(exponent, llvm_code.ONE), num.add(target, constant(DOUBLE, 2.0)))
+        with num.loop(integer(0), integer(n), []) as (i, _, _):
+            a0 = num.load(num.pointer(state, i), 2 * n)
+            values = emit.function("fabs", self._weighted_accelerations(emit, tables().spectrum, a0, work, i))
+            pairs = emit.maximum(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
+            store_lanes(emit, pairs, num.pointer(work, vector_index(emit, i)), self.spectrum_offset)
         wide, begins = self._vector_emitter(emit)
         error = curved = wide.constant(0.0)
-        smallest = wide.constant(SMALLEST)
+        smallest = wide.constant(MIN_DIVISOR)
         for begin in begins:
-            vectors = [load_lanes(emit, work, self.spectra + LANES * (begin + k)) for k in range(wide.lanes)]
-            largest_34, largest_56, largest_78 = (column(emit, vectors, lane) for lane in (2, 4, 6))
-            weight = wide.load(one.pointer(work, at.WEIGHTS + begin))
-            largest_58 = wide.larger(wide.larger(largest_56, largest_78), smallest)
+            vectors = [load_lanes(emit, work, self.spectrum_offset + LANES * (begin + k)) for k in range(wide.lanes)]
+            largest_34, largest_56, largest_78 = (gather_lane(emit, vectors, lane) for lane in (2, 4, 6))
+            weight = wide.load(num.pointer(work, mem.WEIGHTS + begin))
+            largest_58 = wide.maximum(wide.maximum(largest_56, largest_78), smallest)
             decay = wide.divide(largest_78, largest_58)
-            total_decay = wide.divide(largest_78, wide.larger(largest_34, largest_58))
-            decay = wide.larger(wide.multiply(decay, wide.function("sqrt", decay)), total_decay)
-            error = wide.larger(wide.multiply(wide.multiply(largest_78, weight), decay), error)
-            curved = wide.larger(wide.multiply(largest_56, weight), curved)
-        h = one.load(work, at.H)
-        error = one.multiply(one.multiply(wide.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
-        one.store(error, work, at.ERROR)
-        one.store(one.multiply(wide.largest_lane(curved), h), work, at.CURVED)
-        log_error = one.multiply(builder.extract(two.logarithm(two.splat(error)), 0), constant(DOUBLE, 1.0 / at.ORDER))
-        factors = two.exponential(two.negative(two.vector([log_convergence, log_error])))
-        one.store(builder.extract(factors, 0), work, at.FACTOR)
-        one.store(builder.extract(factors, 1), work, at.FACTOR_OF_ERROR)
+            total_decay = wide.divide(largest_78, wide.maximum(largest_34, largest_58))
+            decay = wide.maximum(wide.multiply(decay, wide.function("sqrt", decay)), total_decay)
+            error = wide.maximum(wide.multiply(wide.multiply(largest_78, weight), decay), error)
+            curved = wide.maximum(wide.multiply(largest_56, weight), curved)
+        h = num.load(work, mem.H)
+        error = num.multiply(num.multiply(wide.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
+        num.store(error, work, mem.ERROR)
+        num.store(num.multiply(wide.largest_lane(curved), h), work, mem.CURVED)
+        log_error = num.multiply(
+            builder.extract(vec2.logarithm(vec2.broadcast(error)), 0), constant(DOUBLE, 1.0 / mem.ORDER)
+        )
+        factors = vec2.exponential(vec2.negate(vec2.vector([log_convergence, log_error])))
+        num.store(builder.extract(factors, 0), work, mem.FACTOR)
+        num.store(builder.extract(factors, 1), work, mem.FACTOR_OF_ERROR)
 
-    def audit(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Return the largest defect between nodes, relative to its limit, or FAILED if accelerations are invalid.
+    def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
+        """Return the largest defect between nodes, relative to its limit, or INVALID if accelerations are invalid.
 
         Store FACTOR_OF_DEFECT, the largest ratio of the next step size to this one that the defect allows.
         """
-        builder, one, n = emit.builder, Emitter(emit.builder), self.n
+        builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
-        t, h = emit.splat(one.load(work, at.T)), emit.splat(one.load(work, at.H))
+        t, h = emit.broadcast(num.load(work, mem.T)), emit.broadcast(num.load(work, mem.H))
         elapsed = emit.multiply(h, constants(tables().between))
         zero = emit.constant(0.0)
         q, v = [zero] * n, [zero] * n
-        for i in self.iterated:
-            q0, v0, a0 = (one.load(state, m * n + i) for m in range(3))
-            of_v = self._weighted_rows(emit, tables().velocities_between, a0, work, integer(i))
-            of_q = self._weighted_rows(emit, tables().positions_between, a0, work, integer(i))
-            v[i] = emit.fused(h, of_v, emit.splat(v0))
-            q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(elapsed, emit.splat(v0), emit.splat(q0)))
-        inputs, accelerations = [emit.add(t, elapsed), *q, *v], builder.room(DOUBLE, LANES * n)
-        holds = call_accelerations(emit, self.equations, -1, inputs, self.numbers, accelerations)
+        for i in self.iterated_coordinates:
+            q0, v0, a0 = (num.load(state, m * n + i) for m in range(3))
+            of_v = self._weighted_accelerations(emit, tables().velocities_between, a0, work, integer(i))
+            of_q = self._weighted_accelerations(emit, tables().positions_between, a0, work, integer(i))
+            v[i] = emit.fma(h, of_v, emit.broadcast(v0))
+            q[i] = emit.fma(emit.multiply(h, h), of_q, emit.fma(elapsed, emit.broadcast(v0), emit.broadcast(q0)))
+        inputs, accelerations = [emit.add(t, elapsed), *q, *v], builder.allocate(DOUBLE, LANES * n)
+        is_valid = call_accelerations(emit, self.equations, -1, inputs, self.numbers, accelerations)
         a = [emit.load(accelerations, i) for i in range(n)]
-        worst = largest = zero
+        max_error = largest = zero
         for i, value in enumerate(a):
-            a0 = one.load(state, 2 * n + i)
-            difference = emit.subtract(value, self._weighted_rows(emit, tables().values_between, a0, work, integer(i)))
-            weight = emit.splat(one.load(work, at.WEIGHTS + i))
-            worst = emit.larger(emit.multiply(emit.function("fabs", difference), weight), worst)
-            largest = emit.larger(emit.multiply(emit.function("fabs", value), weight), largest)
-        beyond_noise = emit.fused(emit.constant(-at.MAX_ROUNDING), largest, worst)
+            a0 = num.load(state, 2 * n + i)
+            difference = emit.subtract(
+                value, self._weighted_accelerations(emit, tables().values_between, a0, work, integer(i))
+            )
+            weight = emit.broadcast(num.load(work, mem.WEIGHTS + i))
+            max_error = emit.maximum(emit.multiply(emit.function("fabs", difference), weight), max_error)
+            largest = emit.maximum(emit.multiply(emit.function("fabs", value), weight), largest)
+        beyond_noise = emit.fma(emit.constant(-mem.MAX_ROUNDING), largest, max_error)
         scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED_DEFECT)))
-        defect = one.larger(emit.largest_lane(scaled), llvm_code.ZERO)
-        two = LaneEmitter(builder, 2)
-        log_factor = two.multiply(
-            two.logarithm(two.splat(one.larger(defect, constant(DOUBLE, 1e-9)))), two.constant(-1.0 / 9)
+        defect = num.maximum(emit.largest_lane(scaled), llvm_code.ZERO)
+        vec2 = LaneEmitter(builder, 2)
+        log_factor = vec2.multiply(
+            vec2.logarithm(vec2.broadcast(num.maximum(defect, constant(DOUBLE, 1e-9)))), vec2.constant(-1.0 / 9)
         )
-        one.store(builder.extract(two.exponential(log_factor), 0), work, at.FACTOR_OF_DEFECT)
-        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds])
-        return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
+        num.store(builder.extract(vec2.exponential(log_factor), 0), work, mem.FACTOR_OF_DEFECT)
+        all_valid = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [is_valid])
+        return builder.select(all_valid, defect, constant(DOUBLE, INVALID))
 
-    def retry(self, emit: LaneEmitter, work: Value, state: Value) -> None:
+    def store_prediction(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Store the polynomial of a rejected step, which predicts the shorter step taken instead."""
-        one, old = Emitter(emit.builder), self._polynomial(emit, work, other=False)
-        with loop_over(emit, self.iterated) as (k, i, _, _):
-            a0 = one.load(one.pointer(state, i), 2 * self.n)
+        num, old_polynomial = Emitter(emit.builder), self._polynomial_pointer(emit, work, other=False)
+        with loop_over(emit, self.iterated_coordinates) as (k, i, _, _):
+            a0 = num.load(num.pointer(state, i), 2 * self.n)
             store_lanes(
-                emit, self._weighted_rows(emit, tables().begin, a0, work, i), one.pointer(old, vector_index(emit, k))
+                emit,
+                self._weighted_accelerations(emit, tables().begin, a0, work, i),
+                num.pointer(old_polynomial, vector_index(emit, k)),
             )
 
-    def end(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
+    def end_step(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
         """Store [q, v, a] at the end of the step in `new_state`, and the polynomial that predicts the next step.
 
         NEXT_DEGREE becomes the degree that would have predicted the end of this step best, see `_choose_degree`.
         """
-        builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        last, h = LANES - 1, one.load(work, at.H)
-        powers, new = load_lanes(emit, work, at.POWERS), self._polynomial(emit, work, other=True)
-        old, zero = self._polynomial(emit, work, other=False), emit.constant(0.0)
-        with loop_over(emit, self.iterated, [zero]) as (k, i, (worst,), carried):
-            stage = one.pointer(work, vector_index(emit, k))
-            target = one.pointer(new_state, i)
+        builder, num, n = emit.builder, Emitter(emit.builder), self.n
+        last, h = LANES - 1, num.load(work, mem.H)
+        powers, new = load_lanes(emit, work, mem.POWERS), self._polynomial_pointer(emit, work, other=True)
+        old_polynomial, zero = self._polynomial_pointer(emit, work, other=False), emit.constant(0.0)
+        with loop_over(emit, self.iterated_coordinates, [zero]) as (k, i, (max_error,), carried):
+            stage = num.pointer(work, vector_index(emit, k))
+            target = num.pointer(new_state, i)
             a0, a1 = (
-                one.load(one.pointer(state, i), 2 * n),
-                one.load(one.pointer(work, vector_index(emit, i)), self.a + last),
+                num.load(num.pointer(state, i), 2 * n),
+                num.load(num.pointer(work, vector_index(emit, i)), self.a_offset + last),
             )
-            for value, begin in ((one.load(stage, self.q + last), 0), (one.load(stage, self.v + last), n), (a1, 2 * n)):
-                one.store(value, target, begin)
-            partial_sums = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), powers)
+            for value, begin in (
+                (num.load(stage, self.q_offset + last), 0),
+                (num.load(stage, self.v_offset + last), n),
+                (a1, 2 * n),
+            ):
+                num.store(value, target, begin)
+            partial_sums = emit.multiply(load_lanes(emit, num.pointer(old_polynomial, vector_index(emit, k))), powers)
             for distance in (1, 2, 4):  # element k becomes the sum of the elements 0 to k
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
                 partial_sums = emit.add(partial_sums, builder.shuffle(partial_sums, zero, shifted))
-            errors = emit.add(partial_sums, emit.splat(one.subtract(a0, a1)))
-            weight = emit.splat(one.load(one.pointer(work, i), at.WEIGHTS))
-            carried.append(emit.larger(emit.multiply(emit.function("fabs", errors), weight), worst))
+            errors = emit.add(partial_sums, emit.broadcast(num.subtract(a0, a1)))
+            weight = emit.broadcast(num.load(num.pointer(work, i), mem.WEIGHTS))
+            carried.append(emit.maximum(emit.multiply(emit.function("fabs", errors), weight), max_error))
             store_lanes(
-                emit, self._weighted_rows(emit, tables().end, a0, work, i), one.pointer(new, vector_index(emit, k))
+                emit,
+                self._weighted_accelerations(emit, tables().end, a0, work, i),
+                num.pointer(new, vector_index(emit, k)),
             )
         self._choose_degree(emit, work, carried[0])
-        if self.others:
+        if self.other_coordinates:
             last_weights = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
             weights_0 = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
-            with loop_over(emit, self.others) as (_, i, _, _):
-                first, target = one.pointer(state, i), one.pointer(new_state, i)
-                a = load_lanes(emit, one.pointer(work, vector_index(emit, i)), self.a)
-                q, v, a0 = (one.load(first, m * n) for m in range(3))
+            with loop_over(emit, self.other_coordinates) as (_, i, _, _):
+                first, target = num.pointer(state, i), num.pointer(new_state, i)
+                a = load_lanes(emit, num.pointer(work, vector_index(emit, i)), self.a_offset)
+                q, v, a0 = (num.load(first, m * n) for m in range(3))
                 of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in last_weights))
-                of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(weights_0, (of_v, of_q), strict=True))
-                displacement = one.multiply(h, one.fused(h, of_q, v))
-                one.store(one.add(q, displacement), target, 0)
-                one.store(one.add(v, one.multiply(h, of_v)), target, n)
-                one.store(builder.extract(a, last), target, 2 * n)
+                of_v, of_q = (num.fma(factor, a0, each) for factor, each in zip(weights_0, (of_v, of_q), strict=True))
+                displacement = num.multiply(h, num.fma(h, of_q, v))
+                num.store(num.add(q, displacement), target, 0)
+                num.store(num.add(v, num.multiply(h, of_v)), target, n)
+                num.store(builder.extract(a, last), target, 2 * n)
 
-    def _choose_degree(self, emit: LaneEmitter, work: Value, worst: Value) -> None:
+    def _choose_degree(self, emit: LaneEmitter, work: Value, max_error: Value) -> None:
         """Store NEXT_DEGREE, at most 2 from DEGREE: the lowest degree with an error of at most 1.2 times the least one.
 
         `worst`: errors of the predictions of degree 1 to 8 at the end of the step.
         """
-        builder, one = emit.builder, Emitter(emit.builder)
-        least = one.negative(emit.largest_lane(emit.negative(worst)))
-        is_good = builder.compare("fcmp ole", worst, emit.splat(one.multiply(least, constant(DOUBLE, 1.2))))
+        builder, num = emit.builder, Emitter(emit.builder)
+        least = num.negate(emit.largest_lane(emit.negate(max_error)))
+        is_good = builder.compare("fcmp ole", max_error, emit.broadcast(num.multiply(least, constant(DOUBLE, 1.2))))
         bits = builder.convert("zext", builder.convert("bitcast", is_good, f"i{LANES}"), INTEGER)
         bits = builder.operation("or", bits, integer(1 << LANES - 1))
         first = builder.call("llvm.cttz.i64", INTEGER, [bits, Value(BIT, "true")])
-        best, before = one.add(one.number(first), llvm_code.ONE), one.load(work, at.DEGREE)
-        lowest, highest = (one.add(before, constant(DOUBLE, each)) for each in (-2.0, 2.0))
-        degree = one.smaller(one.larger(best, one.larger(lowest, constant(DOUBLE, 2.0))), highest)
-        predicts = builder.compare("fcmp one", one.load(work, at.PREDICTS), llvm_code.ZERO)
-        one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, at.NEXT_DEGREE)
+        best, before = num.add(num.to_double(first), llvm_code.ONE), num.load(work, mem.DEGREE)
+        lowest, highest = (num.add(before, constant(DOUBLE, each)) for each in (-2.0, 2.0))
+        degree = num.minimum(num.maximum(best, num.maximum(lowest, constant(DOUBLE, 2.0))), highest)
+        predicts = builder.compare("fcmp one", num.load(work, mem.PREDICTS), llvm_code.ZERO)
+        num.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, mem.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
         """Project positions at the ends of eight steps in place; store FINE (success) and MOVED (largest changes)."""
-        if self.parts is None:
+        if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:
-            self._project_in_parts(emit, work, numbers, self.parts.project_position, ("moved", "q"))
+            self._project_in_parts(emit, work, numbers, self.split_functions.project_position, ("moved", "q"))
 
     def project_states(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
         """Project the states at the ends of eight steps in place; store accelerations, multipliers, FINE and MOVED."""
-        if self.parts is None:
+        if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.projection)
         else:
-            self._project_in_parts(emit, work, numbers, self.parts.project, ("a", "moved", "q", "v", "lam"))
+            self._project_in_parts(emit, work, numbers, self.split_functions.project, ("a", "moved", "q", "v", "lam"))
 
     # methods that write parts of the functions
 
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, outputs: Program) -> None:
         emit.numbers = emit.constants = numbers
-        inputs = [load_lanes(emit, work, self.ends + LANES * k) for k in range(1 + 2 * self.n)]
-        lowering, arrays = lower(emit, outputs, inputs, self.numbers)
+        inputs = [load_lanes(emit, work, self.end_offset + LANES * k) for k in range(1 + 2 * self.n)]
+        lowering, arrays = lower_program(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
-        holds = lowering.holds(outputs, [value for array in arrays for value in array])
-        for name, place in self._places_of_ends().items():
+        is_valid = lowering.is_valid(outputs, [value for array in arrays for value in array])
+        for name, place in self._end_offsets().items():
             for k, value in enumerate(values.get(name, [])):
                 store_lanes(emit, value, work, place + LANES * k)
-        self._store_largest_move(emit, work, values["moved"], holds)
+        self._store_largest_move(emit, work, values["moved"], is_valid)
 
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
         """Project states at the ends of eight steps by `write`, a method of SplitFunctions that fills `names`."""
-        one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
-        places = {name: one.pointer(work, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
-        state = load_lanes(emit, work, self.ends), places["q"], places["v"]
-        holds = write(emit, *state, numbers, *(places[name] for name in names))
-        self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], holds)
+        num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
+        places = {name: num.pointer(work, place) for name, place in self._end_offsets().items()} | {"moved": moved}
+        state = load_lanes(emit, work, self.end_offset), places["q"], places["v"]
+        is_valid = write(emit, *state, numbers, *(places[name] for name in names))
+        self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], is_valid)
 
-    def _places_of_ends(self) -> dict[str, int]:
-        return {"q": self.ends + LANES, "v": self.ends + LANES * (1 + self.n), "a": self.end_a, "lam": self.lam}
+    def _end_offsets(self) -> dict[str, int]:
+        return {
+            "q": self.end_offset + LANES,
+            "v": self.end_offset + LANES * (1 + self.n),
+            "a": self.end_a_offset,
+            "lam": self.lam_offset,
+        }
 
-    def _store_largest_move(self, emit: LaneEmitter, work: Value, values: Sequence[Value], holds: Value) -> None:
+    def _store_largest_move(self, emit: LaneEmitter, work: Value, values: Sequence[Value], is_valid: Value) -> None:
         largest = emit.constant(0.0)
         for value in values:
-            largest = emit.larger(emit.function("fabs", value), largest)
-        store_lanes(emit, largest, work, at.MOVED)
-        before = load_lanes(emit, work, at.FINE)
-        store_lanes(emit, emit.builder.select(holds, before, emit.constant(0.0)), work, at.FINE)
+            largest = emit.maximum(emit.function("fabs", value), largest)
+        store_lanes(emit, largest, work, mem.MOVED)
+        before = load_lanes(emit, work, mem.FINE)
+        store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.FINE)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
         """Store positions and velocities at the nodes; return the largest change of a velocity since the last sweep."""
-        one = Emitter(emit.builder)
-        with loop_over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
-            before = load_lanes(emit, one.pointer(work, vector_index(emit, k)), self.v)
-            terms = self._at_nodes(emit, one.load(one.pointer(state, i), 2 * self.n), work, i)
+        num = Emitter(emit.builder)
+        with loop_over(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
+            before = load_lanes(emit, num.pointer(work, vector_index(emit, k)), self.v_offset)
+            terms = self._node_accelerations(emit, num.load(num.pointer(state, i), 2 * self.n), work, i)
             sums = [self._weighted_sum(emit, table, terms) for table in (tables().velocities, tables().positions)]
             v = self._store_stages(emit, work, state, k, i, sums)
-            weight = emit.splat(one.load(one.pointer(work, i), at.WEIGHTS))
+            weight = emit.broadcast(num.load(num.pointer(work, i), mem.WEIGHTS))
             change = emit.function("fabs", emit.subtract(v, before))
-            new.append(emit.larger(emit.multiply(change, weight), largest))
+            new.append(emit.maximum(emit.multiply(change, weight), largest))
         return emit.largest_lane(new[0])
 
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
         """Store velocities and positions of coordinate i, the k-th iterated one, at nodes; return the velocities."""
-        one = Emitter(emit.builder)
-        h = emit.splat(one.load(work, at.H))
-        place, begin = one.pointer(work, vector_index(emit, k)), one.pointer(state, i)
-        q0, v0 = (emit.splat(one.load(begin, m * self.n)) for m in range(2))
-        v = emit.fused(h, sums[0], v0)
-        displacement_rate = emit.fused(h, sums[1], emit.multiply(constants(tables().nodes), v0))
-        store_lanes(emit, v, place, self.v)
-        store_lanes(emit, emit.fused(h, displacement_rate, q0), place, self.q)
+        num = Emitter(emit.builder)
+        h = emit.broadcast(num.load(work, mem.H))
+        place, begin = num.pointer(work, vector_index(emit, k)), num.pointer(state, i)
+        q0, v0 = (emit.broadcast(num.load(begin, m * self.n)) for m in range(2))
+        v = emit.fma(h, sums[0], v0)
+        displacement_rate = emit.fma(h, sums[1], emit.multiply(constants(tables().nodes), v0))
+        store_lanes(emit, v, place, self.v_offset)
+        store_lanes(emit, emit.fma(h, displacement_rate, q0), place, self.q_offset)
         return v
 
-    def _at_nodes(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
+    def _node_accelerations(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
         """Return the accelerations of coordinate i at all nodes: `first` at the first node, and eight loaded values."""
-        one = Emitter(emit.builder)
-        memory = one.pointer(work, vector_index(emit, i))
-        return [first, *(one.load(memory, self.a + node) for node in range(LANES))]
+        num = Emitter(emit.builder)
+        memory = num.pointer(work, vector_index(emit, i))
+        return [first, *(num.load(memory, self.a_offset + node) for node in range(LANES))]
 
-    def _weighted_rows(self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value) -> Value:
+    def _weighted_accelerations(self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value) -> Value:
         """Return the sum of the rows of a table, multiplied by the accelerations of coordinate i at the nodes."""
-        return self._weighted_sum(emit, table, self._at_nodes(emit, first, work, i))
+        return self._weighted_sum(emit, table, self._node_accelerations(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
         """Return the sum of the rows of a table, multiplied by `terms`; two independent partial sums are faster."""
-        sums = [emit.multiply(emit.splat(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)]
+        sums = [
+            emit.multiply(emit.broadcast(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)
+        ]
         for k, (term, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
-            sums[(k + 1) % 2] = emit.fused(emit.splat(term), constants(row), sums[(k + 1) % 2])
+            sums[(k + 1) % 2] = emit.fma(emit.broadcast(term), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)
 
-    def _polynomial(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
+    def _polynomial_pointer(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
         """Return a pointer to the polynomial of the last accepted step or, if `other`, of the attempted step."""
-        builder, one = emit.builder, Emitter(emit.builder)
-        is_second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(work, at.CURRENT), llvm_code.ZERO)
-        polynomial_size = LANES * len(self.iterated)
-        offset = builder.select(is_second, integer(self.polynomials + polynomial_size), integer(self.polynomials))
-        return one.pointer(work, offset)
+        builder, num = emit.builder, Emitter(emit.builder)
+        is_second = builder.compare(
+            "fcmp one" if not other else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO
+        )
+        polynomial_size = LANES * len(self.iterated_coordinates)
+        offset = builder.select(
+            is_second, integer(self.polynomial_offset + polynomial_size), integer(self.polynomial_offset)
+        )
+        return num.pointer(work, offset)
 
 
 class Collocation(NamedTuple):
@@ -724,26 +767,26 @@ class Collocation(NamedTuple):
 def compiled_collocation(generated: GeneratedCode) -> Collocation:
     """Return the functions of a mechanism and their coefficients; the functions are compiled when first called."""
     code = generated.shared
-    collocation: Collocation = code.cache.remembered(("collocation", code.equations.choice), lambda: _compiled(code))
+    collocation: Collocation = code.cache.remembered(("collocation", code.equations.choice), lambda: _compile(code))
     return collocation._replace(numbers=generated.evaluate(collocation.numbers))
 
 
-def _compiled(shared: SharedCode) -> Collocation:
+def _compile(shared: SharedCode) -> Collocation:
     from twoloop.kernels.data.common import KIT
 
     code = CollocationCode(shared)
     writers: dict[str, Callable[..., Any]] = {
-        "attempt_nodes": code.attempt,
-        "audit_nodes": code.audit,
-        "retry_nodes": code.retry,
-        "end_nodes": code.end,
+        "attempt_nodes": code.iterate_step,
+        "audit_nodes": code.find_defect,
+        "retry_nodes": code.store_prediction,
+        "end_nodes": code.end_step,
         "correct_ends": code.project_positions,
         "project_ends": code.project_states,
     }
-    is_split, numbers = shared.parts is not None, code.numbers.formulas
+    is_split, numbers = shared.split_functions is not None, code.numbers.formulas
 
     def write() -> tuple[list[str], str]:
-        module = Module(divided=is_split)
+        module = Module(splits_blocks=is_split)
         for name, emit in writers.items():
             llvm_code.write(module, name, KIT.llvm_signature(name), emit, partial(LaneEmitter, lanes=LANES))
         # with coefficients that were added while writing, the functions would read beyond the end of the array
@@ -759,4 +802,4 @@ def _compiled(shared: SharedCode) -> Collocation:
 @cache
 def _stamp() -> str:
     """Return a digest of the modules that write only these functions; `SharedCode.digest` covers the other modules."""
-    return digest_of("", __file__, lane_series, at)
+    return digest_of("", __file__, lane_series, mem)

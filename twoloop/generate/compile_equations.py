@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from twoloop.generate import llvm_code
 from twoloop.generate.elimination import Elimination, PivotChoice, Solution
 from twoloop.generate.graph import Graph, Untraceable
-from twoloop.generate.llvm_code import Emitter, Lowering, Place
+from twoloop.generate.llvm_code import Emitter, Location, Lowering
 from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, width_of
 from twoloop.generate.program import Coefficients, Program
 from twoloop.generate.trace import Evaluator, TraceCache, derive_cached
-from twoloop.generate.traced_values import Check, Traced, unchecked
+from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
@@ -87,7 +87,7 @@ def call_accelerations(
     for i, value in enumerate(inputs[1:]):
         emit.store(value, state, i)
     arguments = [inputs[0], state, emit.pointer(state, equations.system.n_q), *_coefficient_pointers(emit), out]
-    return emit.builder.call(_acceleration_function(emit, equations, index, numbers), emit.bit, arguments)
+    return emit.builder.call(_acceleration_function(emit, equations, index, numbers), emit.bit_type, arguments)
 
 
 def _accelerations(
@@ -110,10 +110,10 @@ def _accelerations(
     builder.branch(all_valid, after, fallback)
     builder.position_at_end(fallback)
     name, array = _acceleration_function(emit, equations, -1, lowering.numbers), _stack_array(emit, len(a))
-    fallback_valid = builder.call(name, emit.bit, [*state(), *_coefficient_pointers(emit), array])
+    fallback_valid = builder.call(name, emit.bit_type, [*state(), *_coefficient_pointers(emit), array])
     b = [builder.select(is_valid, value, emit.load(array, i)) for i, value in enumerate(a)]
     fallback_valid, fallback_end = builder.operation("or", is_valid, fallback_valid), builder.block
-    builder.go_to(after)
+    builder.jump(after)
     builder.position_at_end(after)
     merged: list[Value] = []
     for value, alternative in zip([*a, is_valid], [*b, fallback_valid], strict=True):
@@ -129,7 +129,7 @@ def _run_accelerations(
     emit: Emitter, equations: Elimination, lowering: Lowering, program: Program
 ) -> tuple[list[Value], Value]:
     (a,) = program.run(lowering)
-    return a, lowering.holds(program, a)
+    return a, lowering.is_valid(program, a)
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
@@ -138,14 +138,14 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
     module, name = emit.builder.module, f"{'mass_first' if is_mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
         n, pointers = equations.system.n_q, _coefficient_pointers(emit)
-        kinds = [emit.double, DOUBLE_POINTER, DOUBLE_POINTER, *[DOUBLE_POINTER] * len(pointers), DOUBLE_POINTER]
-        builder = module.function(name, emit.bit, kinds, internal=True)
-        inner_emit = emit.like(builder)
+        kinds = [emit.double_type, DOUBLE_POINTER, DOUBLE_POINTER, *[DOUBLE_POINTER] * len(pointers), DOUBLE_POINTER]
+        builder = module.function(name, emit.bit_type, kinds, internal=True)
+        inner_emit = emit.for_builder(builder)
         t, q, v, *coefficients, out = builder.arguments
         for attribute, pointer in zip(("numbers", "constants"), coefficients, strict=False):
             setattr(inner_emit, attribute, pointer)
-        if is_mass_first and equations.parts is not None:
-            builder.ret(equations.parts.accelerations(inner_emit, t, q, v, coefficients[0], out))
+        if is_mass_first and equations.split_functions is not None:
+            builder.ret(equations.split_functions.accelerations(inner_emit, t, q, v, coefficients[0], out))
             return name
         lowering = Lowering(inner_emit, numbers)
         lowering.define(0, t)
@@ -166,7 +166,7 @@ def _coefficient_pointers(emit: Emitter) -> list[Value]:
 
 
 def _stack_array(emit: Emitter, size: int) -> Value:
-    return emit.builder.room(DOUBLE, size * width_of(emit.double))
+    return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
 # numbers of operations above which equations are split into functions, which halves the time to compile. SPLIT_ALL
@@ -186,45 +186,45 @@ class SplitFunctions:
     Attributes
     ----------
     solution : Solution
-        Solution of the linear equations; `solution.stored` lists the quantities that the parts share in memory.
-    at_position, with_factors : dict
-        Programs by names of parts, with inputs t, q, v (`at_position`), or r, c and stored factors (`with_factors`).
+        Solution of the linear equations; its `stored_indices` are those of the quantities that the parts share.
+    position_programs, solution_programs : dict
+        Programs by names of parts. Their inputs are t, q, v (position_programs), or r, c and the stored factors.
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
         self.equations, self.numbers = equations, numbers
-        equations.parts = self
+        equations.split_functions = self
         self.n, self.n_rows = equations.system.n_q, len(equations.all_rows)
-        self.redundant = len(equations.choice.rows) < self.n_rows
-        self.at_position = {
-            "right": equations.right_sides,
-            "off": equations.position_errors,
-            "faster": equations.velocity_errors,
+        self.has_redundant_rows = len(equations.choice.rows) < self.n_rows
+        self.position_programs = {
+            "right_sides": equations.right_sides,
+            "position_errors": equations.position_errors,
+            "velocity_errors": equations.velocity_errors,
         }
-        self.solution = Solution(equations, list(self.at_position.values()))
-        self.with_factors = {"solution": self.solution.solved}
-        if self.redundant:
-            self.with_factors["least"] = self.solution.least
-        self._parts: dict[str, Callable[..., Value]] = {"factors": self._factors}
-        for name, program in self.at_position.items():
-            self._parts[name] = partial(self._part, program, self.solution.stored)
-        for name, program in self.with_factors.items():
-            self._parts[name] = partial(self._part, program, {})
+        self.solution = Solution(equations, list(self.position_programs.values()))
+        self.solution_programs = {"solution": self.solution.solution_program}
+        if self.has_redundant_rows:
+            self.solution_programs["least_norm"] = self.solution.least_norm_program
+        self._part_writers: dict[str, Callable[..., Value]] = {"factors": self._write_factors}
+        for name, program in self.position_programs.items():
+            self._part_writers[name] = partial(self._write_part, program, self.solution.stored_indices)
+        for name, program in self.solution_programs.items():
+            self._part_writers[name] = partial(self._write_part, program, {})
 
     def structure(self) -> Iterable[Any]:
         """Yield everything that the functions depend on, except the values of coefficients."""
         solution, numbers = self.solution, self.numbers
-        yield solution.kept.sizes, list(numbers.structure(solution.kept))
-        for program in self.at_position.values():
-            yield program.sizes, list(numbers.structure(program, solution.stored))
-        for program in self.with_factors.values():
+        yield solution.factor_program.sizes, list(numbers.structure(solution.factor_program))
+        for program in self.position_programs.values():
+            yield program.sizes, list(numbers.structure(program, solution.stored_indices))
+        for program in self.solution_programs.values():
             yield program.sizes, list(numbers.structure(program))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Write the functions that kernels call; return their names. `kinds`: LLVM types of a function, by its name."""
         functions: dict[str, Callable[..., Any]]
         functions = {"own_correct_positions": self.project_position, "own_project": self.project}
-        if self.equations.reduced is None:
+        if self.equations.reduced_program is None:
             functions["own_accelerate"] = self.accelerations
         for name, emit in functions.items():
             llvm_code.write(module, name, kinds(name), emit)
@@ -238,44 +238,44 @@ class SplitFunctions:
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
             if not module.defines(name):
-                builder = module.function(name, emit.bit, [value.type for value in arguments], internal=True)
-                builder.ret(self._parts[part](emit.like(builder), *builder.arguments))
-            valid = emit.builder.call(name, emit.bit, arguments)
-            all_valid = valid if all_valid is None else emit.builder.both(all_valid, valid)
+                builder = module.function(name, emit.bit_type, [value.type for value in arguments], internal=True)
+                builder.ret(self._part_writers[part](emit.for_builder(builder), *builder.arguments))
+            valid = emit.builder.call(name, emit.bit_type, arguments)
+            all_valid = valid if all_valid is None else emit.builder.bitwise_and(all_valid, valid)
         assert all_valid is not None
         return all_valid
 
     def _lowering(
-        self, emit: Emitter, graph: Graph, arguments: Sequence[Value], places: Mapping[int, Place]
+        self, emit: Emitter, graph: Graph, arguments: Sequence[Value], places: Mapping[int, Location]
     ) -> Lowering:
         """Return the Lowering that writes a part; `arguments` begin with the inputs of `graph` and the coefficients."""
         *inputs, emit.numbers = arguments[:4]
-        if width_of(emit.double) > 1:
+        if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]
         lowering = Lowering(emit, self.numbers, places)
         lowering.define_inputs(graph, inputs)
         return lowering
 
-    def _factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that stores the quantities `solution.stored` in arguments[4]; return whether all are valid."""
+    def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
+        """Write the part that stores factors and shared quantities in arguments[4]; return whether all are valid."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
-        places = {i: (stored, place) for i, place in solution.stored.items()}
+        places = {i: (stored, place) for i, place in solution.stored_indices.items()}
         for i, place in places.items():
             if graph.operations[i] is None:  # this entry is t or a coordinate
                 emit.store(lowering.value(i), *place)
-        lowering.run(graph, graph.in_order_of_use(solution.kept.forms), places)
-        return lowering.holds(solution.kept, [])
+        lowering.run(graph, graph.quantities_by_use(solution.factor_program.expressions), places)
+        return lowering.is_valid(solution.factor_program, [])
 
-    def _part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that computes a program with the quantities `stored`; return whether its arrays are valid."""
+    def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
+        """Write the part that computes a program with `stored` quantities; return whether its arrays are valid."""
         places = {i: (arguments[4], place) for i, place in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)
         for array, values in zip(arguments[-len(results) :], results, strict=True):
             for j, value in enumerate(values):
                 emit.store(value, array, j)
-        return lowering.holds(program, results[0])
+        return lowering.is_valid(program, results[0])
 
     # methods that write functions for kernels, or code in SIMD lanes
 
@@ -284,7 +284,7 @@ class SplitFunctions:
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         return self._call(
-            emit, ("factors", inputs), ("right", [*inputs, r, c]), ("solution", [r, c, stored, numbers, a, lam])
+            emit, ("factors", inputs), ("right_sides", [*inputs, r, c]), ("solution", [r, c, stored, numbers, a, lam])
         )
 
     def project_position(
@@ -295,7 +295,10 @@ class SplitFunctions:
         inputs = [t, q, v, numbers, stored]
         _write_zeros(emit, self.n, r)
         is_valid = self._call(
-            emit, ("factors", inputs), ("off", [*inputs, c]), ("solution", [r, c, stored, numbers, moved, lam])
+            emit,
+            ("factors", inputs),
+            ("position_errors", [*inputs, c]),
+            ("solution", [r, c, stored, numbers, moved, lam]),
         )
         _write_return_unless(emit, is_valid)
         _write_sum(emit, self.n, q, moved, out)
@@ -325,18 +328,18 @@ class SplitFunctions:
         corrections_valid = self._call(
             emit,
             ("factors", inputs),
-            *(("off", [*inputs, c]), ("solution", [r, c, stored, numbers, moved, lam])),
-            *(("faster", [*inputs, c]), ("solution", [r, c, stored, numbers, change, lam])),
+            *(("position_errors", [*inputs, c]), ("solution", [r, c, stored, numbers, moved, lam])),
+            *(("velocity_errors", [*inputs, c]), ("solution", [r, c, stored, numbers, change, lam])),
         )
         _write_sum(emit, self.n, v, change, projected_v)
-        independent_lam = c if self.redundant else lam
+        independent_lam = c if self.has_redundant_rows else lam
         is_valid = self._call(
             emit,
-            ("right", [t, q, projected_v, numbers, stored, r, c]),
+            ("right_sides", [t, q, projected_v, numbers, stored, r, c]),
             ("solution", [r, c, stored, numbers, a, independent_lam]),
-            *([("least", [c, c, stored, numbers, lam])] if self.redundant else []),
+            *([("least_norm", [c, c, stored, numbers, lam])] if self.has_redundant_rows else []),
         )
-        is_valid = emit.builder.both(corrections_valid, is_valid)
+        is_valid = emit.builder.bitwise_and(corrections_valid, is_valid)
         _write_return_unless(emit, is_valid)
         _write_sum(emit, self.n, q, moved, new_q)
         _write_sum(emit, self.n, v, change, new_v)
@@ -348,13 +351,13 @@ class SplitFunctions:
         return [self._stack_array(emit, size) for size in sizes]
 
     def _stack_array(self, emit: Emitter, size: int) -> Value:
-        return emit.builder.room(DOUBLE, size * width_of(emit.double))
+        return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
 def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
     """Write an early return for invalid results, so that no argument is changed; write nothing in SIMD lanes."""
     if is_valid.type == BIT:
-        emit.builder.leave_unless(is_valid)
+        emit.builder.return_false_unless(is_valid)
 
 
 def _write_zeros(emit: Emitter, n: int, out: Value) -> None:
@@ -380,12 +383,12 @@ def write_function(
     """
 
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
-        n_inputs = len(program.graph.sizes)
+        n_inputs = len(program.graph.input_sizes)
         inputs, emit.numbers, pointers = arguments[:n_inputs], arguments[n_inputs], arguments[n_inputs + 1 :]
         lowering = Lowering(emit, numbers)
         lowering.define_inputs(program.graph, inputs)
         results = program.run(lowering)
-        is_valid = lowering.holds(program, results[0])
+        is_valid = lowering.is_valid(program, results[0])
         with emit.builder.if_then(is_valid):
             for pointer, array in zip(pointers, results, strict=True):
                 for j, value in enumerate(array):
@@ -413,33 +416,33 @@ class SharedCode:
     """
 
     def __init__(self, equations: Elimination, cache: TraceCache):
-        self.equations, self.cache, self.numbers, self.parts = equations, cache, Coefficients(), None
-        if equations.n_operations > (SPLIT_ALL if equations.reduced is None else SPLIT_PROJECTIONS):
-            self.parts = SplitFunctions(equations, self.numbers)
-        self.outputs = self._programs()
+        self.equations, self.cache, self.numbers, self.split_functions = equations, cache, Coefficients(), None
+        if equations.n_operations > (SPLIT_ALL if equations.reduced_program is None else SPLIT_PROJECTIONS):
+            self.split_functions = SplitFunctions(equations, self.numbers)
+        self.programs = self._programs()
         structure = repr(list(self._structure()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
         # optimization passes of LLVM do not make the code faster, and take up to a quarter of the time to compile
         self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, passes=False)
 
-    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
+    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
         """Return the GeneratedCode of one system, with coefficients for its parameters."""
         return GeneratedCode(
-            self, evaluate(self.numbers.formulas), self.equations.traced.of(system, evaluate), evaluate
+            self, evaluate(self.numbers.formulas), self.equations.traced.for_system(system, evaluate), evaluate
         )
 
     def _programs(self) -> dict[str, Program]:
         """Return the programs of the functions that are not split, by name of function."""
         equations = self.equations
         programs = {"own_redundant": equations.redundant_rows}
-        if self.parts is None:
+        if self.split_functions is None:
             programs |= {"own_correct_positions": equations.position_projection, "own_project": equations.projection}
         return programs
 
     def _structure(self) -> Iterable[Any]:
-        equations, parts, numbers = self.equations, self.parts, self.numbers
-        yield equations.system.n_q, equations.choice.rows, equations.choice.added
-        for program in (*self.outputs.values(), *equations.accelerations[: None if parts is None else -1]):
+        equations, parts, numbers = self.equations, self.split_functions, self.numbers
+        yield equations.system.n_q, equations.choice.rows, equations.choice.added_rows
+        for program in (*self.programs.values(), *equations.accelerations[: None if parts is None else -1]):
             yield program.sizes, list(numbers.structure(program))
         if parts is not None:
             yield from parts.structure()
@@ -448,15 +451,15 @@ class SharedCode:
         from twoloop.kernels.data.common import KIT
 
         equations = self.equations
-        module = Module(divided=True)
-        for name, program in self.outputs.items():
+        module = Module(splits_blocks=True)
+        for name, program in self.programs.items():
             write_function(module, name, KIT.llvm_signature(name), program, self.numbers)
-        parts = [] if self.parts is None else self.parts.write(module, KIT.llvm_signature)
+        parts = [] if self.split_functions is None else self.split_functions.write(module, KIT.llvm_signature)
         name = "own_accelerate"
         if name not in parts:
             write_acceleration_function(module, name, KIT.llvm_signature(name), equations, self.numbers)
             parts.append(name)
-        return [*self.outputs, *parts], str(module)
+        return [*self.programs, *parts], str(module)
 
 
 class GeneratedCode(NamedTuple):
@@ -464,7 +467,7 @@ class GeneratedCode(NamedTuple):
 
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads
-    traced: Traced
+    traced: CallbackTraces
     evaluate: Evaluator  # evaluates arrays of expressions of the trace cache for this system
 
     @property
@@ -475,12 +478,12 @@ class GeneratedCode(NamedTuple):
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
         """Return whether a run from (t0, q0) may use this code: whether it was generated for the PivotChoice there."""
         try:
-            return PivotChoice.at(system, t0, q0) == self.shared.equations.choice
+            return PivotChoice.for_position(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
             return False
 
 
-def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unchecked) -> GeneratedCode:
+def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = accept_traces) -> GeneratedCode:
     """Return the cached code for a system and a start; `check` raises if calls of callbacks differ from their traces.
 
     Raises
@@ -489,7 +492,7 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
         If code for the equations cannot be generated.
     """
     try:
-        choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: PivotChoice.at(system, t0, q0))
+        choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: PivotChoice.for_position(system, t0, q0))
 
         def make(cache: TraceCache) -> SharedCode:
             return SharedCode(Elimination(system, choice, cache.equations(system)), cache)

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from twoloop.checks.derivatives import FIRST_TIME_SCALE
 from twoloop.checks.scales import generic_factors, sizes
-from twoloop.generate.graph import MOST_OPERATIONS, Affine, Untraceable
+from twoloop.generate.graph import MAX_TRACED_OPERATIONS, Affine, Untraceable
 from twoloop.generate.program import OperationTable
-from twoloop.generate.trace import OF_ROWS, Equations, Evaluator, TraceCache, derive_cached
-from twoloop.generate.traced_values import Check, Traced, unchecked
+from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCache, derive_cached
+from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
 # callbacks that are derived if a system does not have them, and the attributes of the system with their numbers of rows
-DERIVABLE = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
+DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
 class DerivedPrograms:
@@ -35,25 +35,25 @@ class DerivedPrograms:
         The traces from which the programs were derived.
     """
 
-    def __init__(self, programs: dict[str, tuple[OperationTable, list[int]]], traced: Traced):
+    def __init__(self, programs: dict[str, tuple[OperationTable, list[int]]], traced: CallbackTraces):
         self.programs, self.traced, self.kinds = programs, traced, traced.kinds
 
-    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
+    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
         """Return a system with these programs in place of its missing callbacks."""
         functions: dict[str, Any] = {}
         for name, (program, indices) in self.programs.items():
-            vectors = program.with_numbers(evaluate).packed(indices)
+            vectors = program.with_coefficients(evaluate).as_arrays(indices)
             functions |= dict(zip((f"{name}_program", f"{name}_numbers"), vectors, strict=True))
         derived = copy.copy(system)
         derived.functions = system.functions._replace(**functions)
-        return DerivedSystem(derived, self.traced.of(system, evaluate))
+        return DerivedSystem(derived, self.traced.for_system(system, evaluate))
 
 
 class DerivedSystem(NamedTuple):
     """Pair of a system with programs for missing callbacks, and the traces from which the programs were derived."""
 
     system: ConstrainedSystem
-    traced: Traced
+    traced: CallbackTraces
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -61,13 +61,15 @@ class DerivedSystem(NamedTuple):
         return self.traced.kinds
 
 
-def with_derived_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[Traced, ...]]:
+def with_derived_callbacks(
+    system: ConstrainedSystem, check: Check
+) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
     """Return a system with programs in place of missing C_q and Gamma, and a tuple with the traces used for them.
 
     If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple: finite
     differences then replace missing callbacks. `check` raises Untraceable if the traces are wrong.
     """
-    missing = [kind for kind, size in DERIVABLE.items() if getattr(system, size) and kind not in system.given]
+    missing = [kind for kind, size in DERIVABLE_CALLBACKS.items() if getattr(system, size) and kind not in system.given]
     if not missing:
         return system, ()
     try:
@@ -82,12 +84,12 @@ def with_derived_callbacks(system: ConstrainedSystem, check: Check) -> tuple[Con
 def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: TraceCache) -> DerivedPrograms:
     equations = cache.equations(system)
     programs = {}
-    for name, forms in _missing_derivatives(equations, missing).items():
-        program = OperationTable.of(equations.graph, 1 + 2 * system.n_q, dict(enumerate(forms.values())))
-        if len(program.rows) > MOST_OPERATIONS:
+    for name, exprs in _missing_derivatives(equations, missing).items():
+        program = OperationTable.from_results(equations.graph, 1 + 2 * system.n_q, dict(enumerate(exprs.values())))
+        if len(program.rows) > MAX_TRACED_OPERATIONS:
             raise Untraceable(f"{name} takes {len(program.rows)} operations")
-        programs[name] = program, list(forms)
-    return DerivedPrograms(programs, Traced(system, equations.graph))
+        programs[name] = program, list(exprs)
+    return DerivedPrograms(programs, CallbackTraces(system, equations.graph))
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
@@ -96,11 +98,11 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
         if kind in missing:
-            gamma |= dict(enumerate(equations.of(kind), first))
+            gamma |= dict(enumerate(equations.expressions(kind), first))
     if "jacobian" not in missing:
         return {"gamma": gamma} if gamma else {}
-    entries = enumerate(equations.of("jacobian").ravel())
-    return {"gamma": gamma, "jacobian": {k: form for k, form in entries if form.terms or form.constant}}
+    entries = enumerate(equations.expressions("jacobian").ravel())
+    return {"gamma": gamma, "jacobian": {k: expr for k, expr in entries if expr.terms or expr.constant}}
 
 
 Array = NDArray[np.float64]
@@ -111,7 +113,7 @@ MAX_ENTRIES = 50_000  # largest number of entries of C_q and A for which callbac
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
-def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Traced | None:
+def exact_derivatives(system: ConstrainedSystem, check: Check = accept_traces) -> CallbackTraces | None:
     """Return the exact derivatives C_q, C_t and Gamma as traces, to be compared with the callbacks for them.
 
     Return None if there are too many entries, callbacks cannot be traced, or `check` raises for the traces.
@@ -119,22 +121,22 @@ def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Tr
     if system.n_q * (system.n_c + system.n_a) > MAX_ENTRIES:
         return None
     try:
-        traced: Traced = derive_cached(system, "derivatives", partial(_trace_derivatives, system), check)
+        traced: CallbackTraces = derive_cached(system, "derivatives", partial(_trace_derivatives, system), check)
     except Untraceable:
         return None
     return traced
 
 
-def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Traced:
+def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> CallbackTraces:
     equations = cache.equations(system)
-    callbacks = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
-    forms = {kind: equations.derived(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
+    callbacks = [kind for kind in ("jacobian", *GAMMA_SOURCES) if kind in system.given]
+    exprs = {kind: equations.derivatives(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
     # the derivatives are those of traces, so these callbacks must agree with their traces
-    forms |= {kind: equations.of(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
-    return Traced(system, equations.graph, forms)
+    exprs |= {kind: equations.expressions(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
+    return CallbackTraces(system, equations.graph, exprs)
 
 
-def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
+def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Return whether callbacks for C_q, C_t and Gamma agree with the exact derivatives at states near a start.
 
     Raises
@@ -145,7 +147,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     direction = generic_factors(len(q)) * sizes(q)
     states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * direction) for displacement in DISPLACEMENTS]
 
-    def check(traced: Traced) -> None:
+    def check(traced: CallbackTraces) -> None:
         try:
             with np.errstate(all="ignore"):
                 difference = traced.difference(system, generic_states([(*state, v) for state in states]))
@@ -164,7 +166,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v that are about as large as theirs."""
+    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v about as large as those of `states`."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

@@ -29,7 +29,7 @@ from twoloop.generate.null_space import (
     Block,
     DependentCoordinates,
     Factors,
-    NotReduced,
+    ReductionFailed,
     loses_digits,
     reduced_accelerations,
     solve,
@@ -38,7 +38,7 @@ from twoloop.generate.null_space import (
 from twoloop.generate.parameter_expressions import elementwise
 from twoloop.generate.program import Program
 from twoloop.generate.trace import Equations, only_quantity, shared_cache
-from twoloop.generate.traced_values import Traced
+from twoloop.generate.traced_values import CallbackTraces
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.evaluation.partition import MAX_VIOLATION
 from twoloop.problem.system import ConstrainedSystem
@@ -46,20 +46,21 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # ratio of the smallest to the largest eigenvalue of M below which rows of G are added to M
-RANK = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
+RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
 RELATIVE_BOUND = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
-# possible values of `PivotChoice.least`, the smallest allowed pivot of a row of G, relative to its pivot without the
-# other rows; with pivots below the last value, rounding errors would dominate
-LEAST = 10.0 ** np.arange(-2, -9, -1)
-# limits of the smallest pivot at the start: LEAST[i] is chosen from BOUNDS[i] on, and LEAST[-1] below BOUNDS[-1]
-BOUNDS = LEAST[:-1] / RELATIVE_BOUND
-N_FEW = 24  # largest number of coordinates for which FEW_FROM applies
-# All rows of G may be added to M if pivots are small: if the index in LEAST is at least FEW_FROM (pivots below 1e-3)
-# with up to N_FEW coordinates, FEW_SINGULAR_FROM if M is singular as well (Euler parameters lose two digits in sound
-# models), or MANY_FROM with more coordinates, for which added rows make the code much longer.
-FEW_FROM, FEW_SINGULAR_FROM, MANY_FROM = 4, 5, 6
+# possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to its pivot without
+# the other rows; with pivots below the last value, rounding errors would dominate
+MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
+# MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] at or below the smallest pivot at the start; if there is
+# none, MIN_PIVOTS[-1] is chosen
+START_LIMITS = MIN_PIVOTS[:-1] / RELATIVE_BOUND
+N_FEW_COORDINATES = 24  # largest number of coordinates for which MIN_INDEX_FEW, not MIN_INDEX_MANY, applies
+# smallest index in MIN_PIVOTS, i.e. largest pivots, at which all rows of G may be added to M:
+# MIN_INDEX_FEW (pivots below 1e-3) with up to N_FEW_COORDINATES coordinates; MIN_INDEX_FEW_SINGULAR if M is singular as
+# well (Euler parameters lose two digits in sound models); MIN_INDEX_MANY with more coordinates: the code gets longer
+MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
-MIN_GAIN = 2  # smallest decrease of the index in LEAST for which rows are added; else pivots are small with any M
+MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number
 # number of rows of G per coordinate from which on dependent coordinates are eliminated; with fewer rows, the linear
 # system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
@@ -75,27 +76,28 @@ class PivotChoice:
     ----------
     rows : tuple of int
         Indices of the independent rows of G.
-    added, scale : tuple of int, float
+    added_rows, scale : tuple of int, float
         Indices of the rows g of G with which M + scale g^T g is definite, and the factor `scale`: a power of two with
         which the added terms are about as large as M.
-    least : float
+    min_pivot : float
         Smallest allowed pivot of a row of G, relative to its pivot without the other rows; a power of ten.
     blocks : tuple of (rows, columns)
         Pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which these
         rows are solved. Empty if expressing dependent coordinates saves no operations, or no pivots are suitable.
-    refined : bool or None
-        Whether solutions are improved by one step of refinement. None: no, as pivots are too large for loss of digits.
+    is_refined : bool or None
+        Whether solutions are improved by one step of refinement. None: no, because pivots are so large that no
+        digits are lost.
     """
 
     rows: tuple[int, ...]
-    added: tuple[int, ...]
+    added_rows: tuple[int, ...]
     scale: float
-    least: float
+    min_pivot: float
     blocks: Blocks = ()
-    refined: bool | None = None
+    is_refined: bool | None = None
 
     @classmethod
-    def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
+    def for_position(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
         """Return the PivotChoice for the values of M and G at time t and position q.
 
         Raises
@@ -104,15 +106,15 @@ class PivotChoice:
             If M is singular on velocities that the constraints allow.
         """
         mass, G = mass_and_rows(system, t, q)
-        choice = PivotChooser(system).choice(mass, G)
-        # larger pivots are not tested: with them random models kept 10 digits; added rows set `refined` in any case
-        if choice.rows and choice.least <= LEAST[-1] and choice.refined is None:
-            choice = replace(choice, refined=loses_digits(mass, G, choice))
+        choice = PivotChooser(system).choose(mass, G)
+        # larger pivots are not tested: with them random models kept 10 digits; added rows set `is_refined` in any case
+        if choice.rows and choice.min_pivot <= MIN_PIVOTS[-1] and choice.is_refined is None:
+            choice = replace(choice, is_refined=loses_digits(mass, G, choice))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
 
 class DependentColumns:
-    """Choice of the dependent coordinates of a system at any position: pivot blocks that solve rows of G for them.
+    """Kernel that chooses dependent coordinates at any position, and the pivot blocks that solve rows of G for them.
 
     Parameters
     ----------
@@ -122,43 +124,43 @@ class DependentColumns:
 
     Attributes
     ----------
-    find : callable or None
+    choose : callable or None
         Function of G and `arguments` that returns the number of blocks, see kernels/linalg/dependent_columns.py. None:
         G has too few rows, or the kinds of its entries are unknown.
     """
 
-    find: Any = None
+    choose: Any = None
 
     def __init__(self, system: ConstrainedSystem, rows: tuple[int, ...]):
-        kinds = _kinds_of_entries(system) if len(rows) >= MIN_ROW_RATIO * system.n_q > 0 else None
+        kinds = _entry_kinds(system) if len(rows) >= MIN_ROW_RATIO * system.n_q > 0 else None
         if kinds is not None:
             from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns, scratch_sizes
 
             numbers, integers = scratch_sizes(len(rows), system.n_q)
             blocks, scratch, work = np.zeros(4 * len(rows), np.int64), np.zeros(numbers), np.zeros(integers, np.int64)
-            self.find, self._blocks = entry_point(choose_dependent_columns), blocks
+            self.choose, self._blocks = entry_point(choose_dependent_columns), blocks
             self.arguments = kinds, np.array(rows, np.int64), len(rows), scratch, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
         """Return the pivot blocks (`PivotChoice.blocks`) for the values of G (n_c + n_a, n_q) at a position."""
-        if self.find is None:
+        if self.choose is None:
             return ()
-        n = self.find(G, *self.arguments)
+        n = self.choose(G, *self.arguments)
         pivots = self._blocks[: 4 * n].reshape(n, 4).tolist()
         return tuple(((i,), (j,)) if i == k else ((i, k), (j, l)) for i, k, j, l in pivots)
 
 
-def _kinds_of_entries(system: ConstrainedSystem) -> Any:
-    """Return the kind of each entry of G, row by row: 0: always zero, 1: constant, 2: varies; None if unknown."""
+def _entry_kinds(system: ConstrainedSystem) -> Any:
+    """Return an array with the kind of each entry of G: 0: always zero, 1: constant, 2: varies; None if unknown."""
     if system.called_in_python:  # a function called in Python may store its arguments: it is traced as late as possible
         return None
 
     def make(equations: Callable[[], Equations]) -> Any:
         try:
-            entries = [*equations().of("jacobian").flat, *equations().of("nonholonomic").flat]
+            entries = [*equations().expressions("jacobian").flat, *equations().expressions("nonholonomic").flat]
         except (Untraceable, ArithmeticError, RecursionError):
             return None
-        return np.array([2 if form.terms else int(form.constant != 0.0) for form in entries], dtype=np.int64)
+        return np.array([2 if expr.terms else int(expr.constant != 0.0) for expr in entries], dtype=np.int64)
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(make, partial(cache.equations, system)))
@@ -174,48 +176,61 @@ class PivotChooser:
         from twoloop.kernels.linalg.rank import choose_rows, workspace_size
 
         n_rows = system.n_c + system.n_a
-        self.system, self._choose = system, entry_point(choose_rows)
-        self._room, self._chosen = np.zeros(workspace_size(n_rows, system.n_q)), np.zeros(2 + 3 * n_rows, np.int64)
-        self._key, self._last = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
+        self.system, self._kernel = system, entry_point(choose_rows)
+        self._scratch, self._row_indices = (
+            np.zeros(workspace_size(n_rows, system.n_q)),
+            np.zeros(2 + 3 * n_rows, np.int64),
+        )
+        self._last_key, self._last_choice = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
 
-    def choice(self, mass: Array, G: Array) -> PivotChoice:
-        """Return the PivotChoice without blocks for M (n_q, n_q) and G (n_c + n_a, n_q); raise as `PivotChoice.at`."""
-        system, scratch, chosen = self.system, self._room, self._chosen
+    def choose(self, mass: Array, G: Array) -> PivotChoice:
+        """Return the PivotChoice, without blocks, for M (n_q, n_q) and G (n_c + n_a, n_q).
+
+        The exceptions are those of `PivotChoice.for_position`.
+        """
+        system, scratch, chosen = self.system, self._scratch, self._row_indices
         is_definite = system.constant_mass and system.derived.get("no weak mass", False)
         scratch[0] = 0.0
-        index = self._choose(mass, G, RANK, 0.0 if is_definite else SINGULAR_MASS, BOUNDS, scratch, chosen)
+        index = self._kernel(mass, G, RANK_TOL, 0.0 if is_definite else SINGULAR_MASS, START_LIMITS, scratch, chosen)
         key = index, chosen.tobytes(), float(scratch[0])
-        if key != self._key:
-            self._last, self._key = self._decode(index), key
-        singular = bool(self._last.added)
-        if index >= ((FEW_SINGULAR_FROM if singular else FEW_FROM) if len(mass) <= N_FEW else MANY_FROM + singular):
+        if key != self._last_key:
+            self._last_choice, self._last_key = self._decode(index), key
+        is_singular = bool(self._last_choice.added_rows)
+        if index >= (
+            (MIN_INDEX_FEW_SINGULAR if is_singular else MIN_INDEX_FEW)
+            if len(mass) <= N_FEW_COORDINATES
+            else MIN_INDEX_MANY + is_singular
+        ):
             return self._with_added_rows(mass, G, index)
-        return self._last
+        return self._last_choice
 
     def _with_added_rows(self, mass: Array, G: Array, index: int) -> PivotChoice:
-        """Return the choice with M + s G^T G instead of M if its smallest pivot is much larger, else `self._last`.
+        """Return the choice for M + s G^T G if its smallest pivot is much larger than for M, else `self._last_choice`.
 
-        G: the independent rows. A body may have little inertia about its joints, as a rod with its mass in the middle.
-        Then the rows are nearly dependent in the metric of M: if the smallest pivot is 10^-k, accelerations lose up to
-        2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times as large as
-        M, k digits are lost, which refinement restores. `index`: index in LEAST of the choice with M.
+        G: here the independent rows. Some bodies have little inertia about their joints, such as a rod with a mass
+        in its middle.
+        Then the rows are nearly dependent in the metric of M: if the smallest pivot is 10^-k, accelerations
+        lose up to 2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times
+        as large as M, k digits are lost, which refinement restores. `index`: index in MIN_PIVOTS of the choice for M.
         """
-        last_choice = self._last
+        last_choice = self._last_choice
         rows = G[list(last_choice.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
-        scratch, chosen = np.zeros_like(self._room), np.zeros_like(self._chosen)
-        new_index = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, scratch, chosen)
+        scratch, chosen = np.zeros_like(self._scratch), np.zeros_like(self._row_indices)
+        new_index = self._kernel(mass + scale * rows.T @ rows, G, RANK_TOL, 0.0, START_LIMITS, scratch, chosen)
         if not 0 <= new_index <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last_choice.rows):
             return last_choice
-        least = float(LEAST[new_index])
-        return replace(last_choice, added=last_choice.rows, scale=float(scale), least=least, refined=True)
+        min_pivot = float(MIN_PIVOTS[new_index])
+        return replace(
+            last_choice, added_rows=last_choice.rows, scale=float(scale), min_pivot=min_pivot, is_refined=True
+        )
 
     def _decode(self, index: int) -> PivotChoice:
-        """Return the choice that the kernel wrote to `self._chosen`; raise Untraceable if `index` is an error code."""
+        """Return the choice that `self._row_indices` describes; raise Untraceable if `index` is an error code."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
-        n_independent, n_added, *indices = self._chosen.tolist()
+        n_independent, n_added, *indices = self._row_indices.tolist()
         if n_independent == 0:
             return PivotChoice((), (), 1.0, 0.0)
         if index < 0:
@@ -224,12 +239,12 @@ class PivotChooser:
         if n_added == 0:
             system.derived["no weak mass"] = True
         added = tuple(indices[n_rows : n_rows + n_added])
-        return PivotChoice(tuple(indices[:n_independent]), added, float(self._room[0]), float(LEAST[index]))
+        return PivotChoice(tuple(indices[:n_independent]), added, float(self._scratch[0]), float(MIN_PIVOTS[index]))
 
 
 MAX_OPERATIONS = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
-# largest cost of the program `reduced`, relative to that of `mass_first`, at which it is used. It is compiled in
-# addition to `mass_first`, which is needed where pivots become small. At 0.68 (four-bar) it saves 5 % of a run.
+# largest cost of `reduced_program`, relative to `mass_first_program`, at which it is used: both are compiled, as the
+# latter is needed where pivots become small. A reduced program of relative cost 0.68 (four-bar) saves 5 % of a run
 MAX_COST_RATIO = 0.75
 
 
@@ -248,9 +263,9 @@ class Elimination:
     ----------
     graph : Graph
         Graph of the operations; its first inputs are t, q and v.
-    mass_first : Program
+    mass_first_program : Program
         Program for "a" (n_q,), the accelerations at a state, by an elimination that begins with M.
-    reduced : Program or None
+    reduced_program : Program or None
         Program for "a" by dependent coordinates, if it takes fewer operations; valid at fewer positions.
     right_sides : Program
         Program for "r" (n_q,), Q, and "c" (n_c + n_a,), the right-hand sides of the rows of G; 0 for unused rows.
@@ -261,16 +276,16 @@ class Elimination:
         Program for "q", "moved", "v" (n_q,), the projected velocity, and "a" (n_q,) and "lam" (n_c + n_a,) at this
         velocity. M, G and Q are evaluated at the position before the step.
     basic_projection : Program
-        As `projection`, but with "lam" 0 for dependent rows.
+        As `projection`, but "lam" is 0 for dependent rows (in `projection` it has the least norm).
     position_errors, velocity_errors : Program
         Programs for "c" (n_c + n_a,), the right-hand sides of the corrections of positions, and of velocities.
     redundant_rows : Program
         Program without arrays, whose conditions are that the redundant constraints are satisfied.
-    parts : SplitFunctions or None
+    split_functions : SplitFunctions or None
         Generator that splits long equations into several functions, set by compile_equations.py.
     n_operations : int
         Number of operations of callbacks and factorization, without the solution with these factors.
-    traced : Traced
+    traced : CallbackTraces
         Traces of the callbacks.
 
     Raises
@@ -279,38 +294,40 @@ class Elimination:
         If the equations cannot be generated; the message says why.
     """
 
-    parts: Any = None
+    split_functions: Any = None
 
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # `_n_reduced`: operations added for `reduced`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # `_n_reduced`: operations of `reduced_program`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
-        self.mass = self._values_of("mass")
-        rows = [self._values_of("jacobian"), self._values_of("nonholonomic")]
-        rates = [self._values_of("constraint_rate"), self._values_of("nonholonomic_rate")]
+        self.mass = self._terms_of("mass")
+        rows = [self._terms_of("jacobian"), self._terms_of("nonholonomic")]
+        rates = [self._terms_of("constraint_rate"), self._terms_of("nonholonomic_rate")]
         self.all_rows, independent = np.vstack(rows), list(choice.rows)
         self.rows, self.rates = self.all_rows[independent], np.concatenate(rates)[independent]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
-        self.conditions = [(pivot, pivot_alone.times(choice.least)) for pivot, pivot_alone in self.factors.conditions]
-        self.conditions += [(pivot, self.zero) for pivot in self.factors.positive if pivot.terms]
+        self.conditions = [
+            (pivot, pivot_alone.times(choice.min_pivot)) for pivot, pivot_alone in self.factors.conditions
+        ]
+        self.conditions += [(pivot, self.zero) for pivot in self.factors.mass_pivots if pivot.terms]
         self.redundant_rows = self._redundant_rows(np.concatenate(rates))
         self._check_length()
         for kind in ("gamma", "nonholonomic_gamma", "force"):
-            self.equations.of(kind)
+            self.equations.expressions(kind)
         self.n_operations = len(self.graph.operations)
-        self.traced = Traced(system, self.graph)
+        self.traced = CallbackTraces(system, self.graph)
 
     def _check_length(self) -> None:
         if len(self.graph.operations) - self._n_reduced > MAX_OPERATIONS:
             raise Untraceable(f"its equations are more than {MAX_OPERATIONS} operations")
 
-    def _values_of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        return elementwise(Affine.value, [self.equations.of(kind, v)])
+    def _terms_of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
+        return elementwise(Affine.as_term, [self.equations.expressions(kind, v)])
 
     def _redundant_rows(self, rates: Any) -> Program:
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
-        violations = self._values_of("constraint")
+        violations = self._terms_of("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
         scale_q, scale_v = (sum((x * x for x in state), unit) for state in (self.q, self.v))
         for k in redundant:
@@ -331,7 +348,7 @@ class Elimination:
                 raise Untraceable(
                     f"mass of {name!r} is not symmetric: its entry {(j, i)} is zero, and its entry {(i, j)} is not"
                 )
-        for k in self.choice.added:
+        for k in self.choice.added_rows:
             columns = [i for i in range(n) if not is_zero(self.all_rows[k, i])]
             for i in columns:
                 for j in columns:
@@ -349,45 +366,46 @@ class Elimination:
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
         """Return Q (n_q,), and the right-hand sides (n_c + n_a,) of all rows of G a = gamma, at velocities v."""
-        return list(self._values_of("force", v)), [
-            *self._values_of("gamma", v),
-            *self._values_of("nonholonomic_gamma", v),
-        ]
+        return list(self._terms_of("force", v)), [*self._terms_of("gamma", v), *self._terms_of("nonholonomic_gamma", v)]
 
     @cached_property
-    def mass_first(self) -> Program:
+    def mass_first_program(self) -> Program:
         """Return the program for the accelerations by an elimination that begins with M."""
         solution = self._accelerations(self.v)
         self._check_length()
         return Program(self.graph, {"a": solution[: self.system.n_q]}, self.conditions)
 
     @cached_property
-    def reduced(self) -> Program | None:
+    def reduced_program(self) -> Program | None:
         """Return the program for the accelerations by dependent coordinates; None if it costs too much."""
         blocks = self.choice.blocks
         if not blocks:
             return None
-        max_cost, n_before = int(MAX_COST_RATIO * self.mass_first.cost()), len(self.graph.operations)
+        max_cost, n_before = int(MAX_COST_RATIO * self.mass_first_program.cost()), len(self.graph.operations)
         force, gamma = self._right_sides(self.v)
         try:
             dependent = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, max_cost)
             a, conditions = reduced_accelerations(self.mass, force, dependent)
             reduced = Program(self.graph, {"a": a}, [*dependent.conditions, *conditions])
-        except NotReduced:
+        except ReductionFailed:
             reduced = None
         self._n_reduced += len(self.graph.operations) - n_before
         return reduced if reduced is not None and reduced.cost() < max_cost else None
 
     @property
     def accelerations(self) -> list[Program]:
-        """Return the programs for accelerations: `reduced`, if there is one, then `mass_first`."""
-        return [self.mass_first] if self.reduced is None else [self.reduced, self.mass_first]
+        """Return the programs for accelerations: `reduced_program`, if there is one, then `mass_first_program`."""
+        return (
+            [self.mass_first_program]
+            if self.reduced_program is None
+            else [self.reduced_program, self.mass_first_program]
+        )
 
     @cached_property
     def right_sides(self) -> Program:
         """Return the program for "r", Q, and "c", the right-hand sides of the rows of G."""
         force, gamma = self._right_sides(self.v)
-        used = {*self.choice.rows, *self.choice.added}
+        used = {*self.choice.rows, *self.choice.added_rows}
         return Program(
             self.graph, {"r": force, "c": [value if k in used else self.zero for k, value in enumerate(gamma)]}
         )
@@ -396,7 +414,7 @@ class Elimination:
         """Return a list of the accelerations and the multipliers of the independent rows, at velocities v."""
         return self._solve(*self._right_sides(v))
 
-    def _on_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
+    def _for_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
         """Return a list with one value for each row of G: those of `independent`, and 0 for dependent rows."""
         values = [self.zero] * len(self.all_rows)
         for k, value in zip(self.choice.rows, independent, strict=True):
@@ -406,8 +424,8 @@ class Elimination:
     @cached_property
     def position_errors(self) -> Program:
         """Return the program for "c", the right-hand sides -C of position corrections; 0 for dependent rows and A."""
-        errors = [*(-violation for violation in self._values_of("constraint")), *[self.zero] * self.system.n_a]
-        return Program(self.graph, {"c": self._on_all_rows([errors[k] for k in self.choice.rows])})
+        errors = [*(-violation for violation in self._terms_of("constraint")), *[self.zero] * self.system.n_a]
+        return Program(self.graph, {"c": self._for_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
@@ -418,18 +436,18 @@ class Elimination:
             for entry, u in zip(row, self.v, strict=True):
                 total = total + entry * u
             errors.append(-total)
-        return Program(self.graph, {"c": self._on_all_rows(errors)})
+        return Program(self.graph, {"c": self._for_all_rows(errors)})
 
     @cached_property
     def position_projection(self) -> Program:
-        """Return the program for "q", the position after a Newton step towards the constraints, and "moved"."""
+        """Return the program for "q", the position after one Newton step, and "moved", the change of the position."""
         moved = self._correction(self.position_errors)
         position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
         return Program(self.graph, position, self.conditions)
 
     @cached_property
     def projection(self) -> Program:
-        """Return the program for projected q and v, and a and the multipliers of least norm at this v."""
+        """Return the program for the projected q and v, their "a", and their "lam" of least norm."""
         arrays = self.basic_projection.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
         lam = multipliers_of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
@@ -438,13 +456,15 @@ class Elimination:
 
     @cached_property
     def basic_projection(self) -> Program:
-        """Return the program for projected q and v, and a and multipliers at this v, which are 0 for dependent rows."""
+        """Return the program for the projected q and v, their "a", and their "lam", which is 0 for dependent rows."""
         n, position = self.system.n_q, self.position_projection.arrays
-        v = [(u + change).value() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
+        v = [(u + change).as_term() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
         solution = self._accelerations(v)
         self._check_length()
         return Program(
-            self.graph, {"a": solution[:n], **position, "v": v, "lam": self._on_all_rows(solution[n:])}, self.conditions
+            self.graph,
+            {"a": solution[:n], **position, "v": v, "lam": self._for_all_rows(solution[n:])},
+            self.conditions,
         )
 
     def _correction(self, c: Program) -> list[Affine]:
@@ -491,92 +511,92 @@ class Solution:
     Parameters
     ----------
     equations : Elimination
-    more : sequence of Program
-        Further programs at the same state; quantities that they share with the factors are stored, too.
+    other_programs : sequence of Program
+        Other programs at the same state; quantities that they share with the factors are stored, too.
 
     Attributes
     ----------
-    stored : dict
-        Index in the array of stored quantities, by quantity of the graph of `equations`; the factors come first.
-    kept : Program
+    stored_indices : dict
+        For each stored quantity of the graph of `equations`: its index in the array. The factors come first.
+    factor_program : Program
         Program that computes the stored quantities.
     graph : Graph
         Graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the stored factors.
-    solved : Program
+    solution_program : Program
         Program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for dependent rows.
-    least : Program
-        Program for "lam" (n_c + n_a,) of least norm; its input c is the "lam" of `solved`.
+    least_norm_program : Program
+        Program for "lam" (n_c + n_a,) of least norm; its input c is the "lam" of `solution_program`.
     """
 
-    def __init__(self, equations: Elimination, more: Sequence[Program] = ()):
+    def __init__(self, equations: Elimination, other_programs: Sequence[Program] = ()):
         factors, self._choice, self._n = equations.factors, equations.choice, equations.system.n_q
         n_rows, rows = len(equations.all_rows), self._choice.rows
-        dependent = [k for k in range(n_rows) if k not in rows] if more else []
-        refined, mass = self._choice.refined, equations.mass
-        used = {*self._choice.added, *dependent, *(rows if refined else ())}
-        forms = [form for k in used for form in equations.all_rows[k]] + [*(mass.flat if refined else ())]
-        forms += [form for block in factors.blocks for row in block.inverse for form in row]
-        forms += [form for block in factors.blocks for _, row in block.below for form in row]
-        factor_quantities = sorted({i for form in forms for i in form.terms})
-        shared = _shared_quantities(equations.graph, factor_quantities, more)
-        self.stored = {i: k for k, i in enumerate([*factor_quantities, *shared])}
-        stored = [equations.graph.quantity(i) for i in self.stored]
-        self.kept = Program(equations.graph, {"kept": stored}, equations.conditions)
+        dependent = [k for k in range(n_rows) if k not in rows] if other_programs else []
+        refined, mass = self._choice.is_refined, equations.mass
+        used = {*self._choice.added_rows, *dependent, *(rows if refined else ())}
+        exprs = [expr for k in used for expr in equations.all_rows[k]] + [*(mass.flat if refined else ())]
+        exprs += [expr for block in factors.blocks for row in block.inverse for expr in row]
+        exprs += [expr for block in factors.blocks for _, row in block.rows_below for expr in row]
+        factor_quantities = sorted({i for expr in exprs for i in expr.terms})
+        shared = _shared_quantities(equations.graph, factor_quantities, other_programs)
+        self.stored_indices = {i: k for k, i in enumerate([*factor_quantities, *shared])}
+        stored = [equations.graph.quantity(i) for i in self.stored_indices]
+        self.factor_program = Program(equations.graph, {"kept": stored}, equations.conditions)
         self.graph = Graph()
         self._r, self._c = self.graph.inputs(self._n, False), self.graph.inputs(n_rows, False)
-        inputs = [only_quantity(form) for form in self.graph.inputs(len(factor_quantities), False)]
+        inputs = [only_quantity(expr) for expr in self.graph.inputs(len(factor_quantities), False)]
 
-        def in_new_graph(form: Affine) -> Affine:
-            return Affine(self.graph, form.constant, {inputs[self.stored[i]]: x for i, x in form.terms.items()})
+        def to_new_graph(expr: Affine) -> Affine:
+            return Affine(self.graph, expr.constant, {inputs[self.stored_indices[i]]: x for i, x in expr.terms.items()})
 
         self._blocks = [
             Block(
-                block.places,
-                [[in_new_graph(x) for x in row] for row in block.inverse],
-                [(j, [in_new_graph(x) for x in row]) for j, row in block.below],
+                block.row_indices,
+                [[to_new_graph(x) for x in row] for row in block.inverse],
+                [(j, [to_new_graph(x) for x in row]) for j, row in block.rows_below],
             )
             for block in factors.blocks
         ]
-        self._rows = {k: [in_new_graph(x) for x in equations.all_rows[k]] for k in used}
-        self._mass = [[in_new_graph(x) for x in row] for row in mass] if refined else []
-        self._nothing = Affine(self.graph, 0.0, {})
-        self.solved = self._solution_program()
+        self._rows = {k: [to_new_graph(x) for x in equations.all_rows[k]] for k in used}
+        self._mass = [[to_new_graph(x) for x in row] for row in mass] if refined else []
+        self._zero = Affine(self.graph, 0.0, {})
+        self.solution_program = self._make_solution_program()
 
     @property
     def n_stored(self) -> int:
         """Return the number of stored quantities."""
-        return len(self.stored)
+        return len(self.stored_indices)
 
     def _solve(self, rhs: Sequence[Affine]) -> list[Affine]:
         return solve(self._blocks, rhs)
 
-    def _independent(self) -> list[Affine]:
+    def _independent_c(self) -> list[Affine]:
         return [self._c[k] for k in self._choice.rows]
 
-    def _solution_program(self) -> Program:
-        lam = [self._nothing] * len(self._c)
+    def _make_solution_program(self) -> Program:
+        lam = [self._zero] * len(self._c)
         solution = solve_refined(self._solve, self._choice, self._mass, self._rows, self._r, self._c)
         for k, value in zip(self._choice.rows, solution[self._n :], strict=True):
             lam[k] = value
         return Program(self.graph, {"a": solution[: self._n], "lam": lam})
 
     @cached_property
-    def least(self) -> Program:
+    def least_norm_program(self) -> Program:
         """Return the program for "lam", the multipliers of least norm."""
         rows = [self._rows.get(k, []) for k in range(len(self._c))]
         return Program(
             self.graph,
-            {"lam": multipliers_of_least_norm(self.graph, self._independent(), rows, self._choice.rows, self._solve)},
+            {"lam": multipliers_of_least_norm(self.graph, self._independent_c(), rows, self._choice.rows, self._solve)},
         )
 
 
 def _shared_quantities(graph: Graph, factors: Sequence[int], other_programs: Sequence[Program]) -> list[int]:
-    """Return the quantities on which `factors` depend and which `other_programs` use, too, without `factors`."""
-    computed = set(graph.needed_by(map(graph.quantity, factors)))
-    used = {i for program in other_programs for form in program.forms for i in form.terms}
+    """Return the quantities that both `factors` and `other_programs` use, except `factors` themselves."""
+    computed = set(graph.quantities_for(map(graph.quantity, factors)))
+    used = {i for program in other_programs for expr in program.expressions for i in expr.terms}
     for program in other_programs:
         for j in program.quantities(computed):
             operation = graph.operations[j]
             assert operation is not None
-            used |= {i for form in operation[1:] if isinstance(form, Affine) for i in form.terms}
+            used |= {i for expr in operation[1:] if isinstance(expr, Affine) for i in expr.terms}
     return sorted(used & computed - set(factors))

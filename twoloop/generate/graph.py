@@ -11,34 +11,35 @@ from typing import Any
 import numpy as np
 
 from twoloop.generate.parameter_expressions import (
-    CANCELLED,
+    CANCELLATION_LIMIT,
     OPERATORS,
     Parameter,
     Symbolic,
+    as_number,
     elementwise,
-    function_of_number,
-    number,
+    math_function,
 )
-from twoloop.generate.parameter_expressions import (
-    Untraceable as Untraceable,
-)
+from twoloop.generate.parameter_expressions import Untraceable as Untraceable
 from twoloop.kernels.evaluation import operations as op
 
 # largest number of operations of a derived program or a series: tracing more would take longer than most runs
-MOST_OPERATIONS = 20_000
-# Constant factors are taken out of a product unless they might underflow or overflow: the product of the factors must
-# be between MIN_FACTOR and its inverse, and a power of which the product is part has an exponent of at most HIGH_POWER.
-MIN_FACTOR, HIGH_POWER = 1e-100, 8
-# reasons for refusing a callback: a comparison or conversion of an expression, and a conversion by float()
-BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
+MAX_TRACED_OPERATIONS = 20_000
+# A product is recorded once for all its multiples: its constant factor is taken out, unless this might underflow or
+# overflow. So the factor must be between MIN_FACTOR and 1 / MIN_FACTOR in magnitude, and powers with exponents above
+# HIGH_EXPONENT keep the factors of their products.
+MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
+# reason, for messages, why a callback is refused that compares an expression, or converts one to a number
+BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
 
 # functions of `math` that also accept Parameters
-SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
+SIN, COS, EXP, LOG, ATAN, ROOT = map(math_function, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
 _equal = float.__eq__  # comparison of the current values of floats or Parameters, which refuse ==
 _magnitude = float.__abs__  # absolute value as a plain float, also for a Parameter
 
-CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
+CONVERSION_REASON = (
+    "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
+)
 
 
 class Graph(Symbolic):
@@ -49,83 +50,95 @@ class Graph(Symbolic):
     operations : list
         For each quantity the kind of operation and two arguments, of which the second may be None; None for an input.
         The second argument of a logarithm or an arctangent is the divisor of its derivative.
-    sizes : list of int
+    input_sizes : list of int
         Number of inputs added by each call of `inputs`.
     traced : dict
         Results of traced callbacks: arrays of expressions by kind of callback.
     """
 
     def __init__(self) -> None:
-        self.sizes: list[int] = []
+        self.input_sizes: list[int] = []
         self.operations: list[tuple[int, Affine, Affine | None] | None] = []
-        self.late: list[bool] = []  # whether a quantity depends on inputs other than time and coordinates
-        self.inputs_of: list[int] = []  # bit masks of the inputs on which a quantity depends
+        self.is_late: list[bool] = []  # whether a quantity depends on inputs other than time and coordinates
+        self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs on which it depends
         self.traced: dict[str, Any] = {}
-        self._recorded: dict[tuple[int, int, int], int] = {}
+        self._recorded_quantities: dict[tuple[int, int, int], int] = {}
         # rank of each factor (by its identifier) in the order of first use, which is the same for all parameter values
-        self._order: dict[int, int] = {}
-        self._numbers: dict[Any, int] = {}  # identifier of each key of an expression: keys take long to compare
+        self._factor_order: dict[int, int] = {}
+        self._identifiers: dict[Any, int] = {}  # identifier of each key of an expression: keys take long to compare
         self._quantities: dict[int, Affine] = {}
 
     def copy(self) -> "Graph":
         """Return a copy, which can be extended independently; `traced` is empty in the copy."""
         graph = Graph()
-        graph.sizes, graph.late, graph.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
-        graph._recorded, graph._order, graph._numbers = self._recorded.copy(), self._order.copy(), self._numbers.copy()
+        graph.input_sizes, graph.is_late, graph.input_masks = (
+            self.input_sizes.copy(),
+            self.is_late.copy(),
+            self.input_masks.copy(),
+        )
+        graph._recorded_quantities, graph._factor_order, graph._identifiers = (
+            self._recorded_quantities.copy(),
+            self._factor_order.copy(),
+            self._identifiers.copy(),
+        )
         graph.operations = [
             None
             if operation is None
-            else (operation[0], operation[1].on(graph), None if operation[2] is None else operation[2].on(graph))
+            else (
+                operation[0],
+                operation[1].on_graph(graph),
+                None if operation[2] is None else operation[2].on_graph(graph),
+            )
             for operation in self.operations
         ]
         return graph
 
-    def inputs(self, n: int, late: bool) -> list["Affine"]:
-        """Add n inputs and return them as expressions; `late`: false for time and coordinates, true for others."""
+    def inputs(self, n: int, is_late: bool) -> list["Affine"]:
+        """Add n inputs and return them as expressions; `is_late`: False for time and coordinates, else True."""
         first = len(self.operations)
-        self.sizes.append(n)
+        self.input_sizes.append(n)
         self.operations += [None] * n
-        self.late += [late] * n
-        self.inputs_of += [1 << first + i for i in range(n)]
+        self.is_late += [is_late] * n
+        self.input_masks += [1 << first + i for i in range(n)]
         return [self.quantity(first + i) for i in range(n)]
 
     def quantity(self, i: int) -> "Affine":
         """Return quantity i as an expression."""
-        expression = self._quantities.get(i)
-        if expression is None:
-            self._quantities[i] = expression = Affine(self, 0.0, {i: 1.0})
-        return expression
+        expr = self._quantities.get(i)
+        if expr is None:
+            self._quantities[i] = expr = Affine(self, 0.0, {i: 1.0})
+        return expr
 
-    def number(self, form: "Affine") -> int:
+    def identifier(self, expr: "Affine") -> int:
         """Return an integer that identifies an expression, up to rounding of its coefficients."""
-        if form.cached_number is None:
-            form.cached_number = self._numbers.setdefault(form.key, len(self._numbers))
-        return form.cached_number
+        if expr.cached_identifier is None:
+            expr.cached_identifier = self._identifiers.setdefault(expr.key, len(self._identifiers))
+        return expr.cached_identifier
 
     def operation(self, kind: int, first: "Affine", second: "Affine | None" = None) -> "Affine":
         """Return the result of an operation as a quantity; record the operation unless it is recorded already."""
-        key = kind, self.number(first), -1 if second is None else self.number(second)
-        quantity = self._recorded.get(key)
+        key = kind, self.identifier(first), -1 if second is None else self.identifier(second)
+        quantity = self._recorded_quantities.get(key)
         if quantity is None:
-            quantity = self._recorded[key] = len(self.operations)
+            quantity = self._recorded_quantities[key] = len(self.operations)
             self.operations.append((kind, first, second))
-            self.late.append(first.late or (second is not None and second.late))
+            self.is_late.append(first.is_late or (second is not None and second.is_late))
             mask = 0
             for i in (*first.terms, *(() if second is None else second.terms)):
-                mask |= self.inputs_of[i]
-            self.inputs_of.append(mask)
+                mask |= self.input_masks[i]
+            self.input_masks.append(mask)
         return self.quantity(quantity)
 
-    def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of quantities needed for `forms`, arguments first, without inputs and `available` ones."""
+    def quantities_for(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
+        """Return the indices of quantities that `exprs` need, arguments first, except inputs and `available` ones."""
         needed: set[int] = set()
-        stack = [i for form in forms for i in form.terms]
+        stack = [i for expr in exprs for i in expr.terms]
         while stack:
             i = stack.pop()
             operation = self.operations[i]
             if i not in needed and operation is not None and i not in available:
                 needed.add(i)
-                stack += [j for form in operation[1:] if isinstance(form, Affine) for j in form.terms]
+                stack += [j for expr in operation[1:] if isinstance(expr, Affine) for j in expr.terms]
         return sorted(needed)
 
     def kind(self, i: int) -> int:
@@ -136,13 +149,13 @@ class Graph(Symbolic):
 
     def arguments(self, i: int) -> list["Affine"]:
         """Return the arguments of the operation that computes a quantity; an empty list for an input."""
-        return [form for form in (self.operations[i] or ())[1:] if isinstance(form, Affine)]
+        return [expr for expr in (self.operations[i] or ())[1:] if isinstance(expr, Affine)]
 
-    def in_order_of_use(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of the quantities of `needed_by`, each just before its first use."""
+    def quantities_by_use(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
+        """Return the indices of the quantities of `quantities_for`, each just before its first use."""
         order: list[int] = []
         needed: set[int] = set()
-        stack = [i for form in forms for i in form.terms][::-1]
+        stack = [i for expr in exprs for i in expr.terms][::-1]
         while stack:
             i = stack.pop()
             operation = None if i < 0 else self.operations[i]
@@ -151,31 +164,31 @@ class Graph(Symbolic):
             elif i not in needed and operation is not None and i not in available:
                 needed.add(i)
                 stack.append(~i)
-                stack += [j for form in operation[1:] if isinstance(form, Affine) for j in form.terms][::-1]
+                stack += [j for expr in operation[1:] if isinstance(expr, Affine) for j in expr.terms][::-1]
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a b as a multiple of the product of normalized factors, which is recorded once for all multiples."""
+        """Return the product of a and b, as a multiple of the product of normalized factors, which is recorded once."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
             return a.times(b.constant)
-        (scale_a, first), (scale_b, second) = a.normalised(), b.normalised()
+        (scale_a, first), (scale_b, second) = a.normalized(), b.normalized()
         factor = scale_a * scale_b
         if not MIN_FACTOR < _magnitude(factor) < 1.0 / MIN_FACTOR:
             first, second, factor = a, b, 1.0
         return self._product(first, second).times(factor)
 
     def _product(self, a: "Affine", b: "Affine") -> "Affine":
-        order = self._order
-        first = order.setdefault(self.number(a), len(order))
-        if order.setdefault(self.number(b), len(order)) < first:
+        order = self._factor_order
+        first = order.setdefault(self.identifier(a), len(order))
+        if order.setdefault(self.identifier(b), len(order)) < first:
             a, b = b, a
         return self.operation(op.PRODUCT, a, b)
 
-    def square(self, form: "Affine", high: bool) -> "Affine":
-        """Return the square of an expression; `high`: it is part of a power with an exponent above HIGH_POWER."""
-        return self._product(form, form) if high and form.terms else self.product(form, form)
+    def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
+        """Return the square; `is_high_power`: it is a factor in a power with an exponent above HIGH_EXPONENT."""
+        return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 
 def rounded(value: float) -> Any:
@@ -183,25 +196,25 @@ def rounded(value: float) -> Any:
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
-    split = 4097.0 * value  # 2**12 + 1: Dekker's splitting
-    return split - (split - value)
+    scaled = 4097.0 * value  # 2**12 + 1: Dekker's splitting
+    return scaled - (scaled - value)
 
 
 class Affine:
-    """Affine expression of quantities, with the arithmetic of a number: a symbol for callbacks.
+    """Affine expression of quantities with the operators of a number, so that callbacks can run on expressions.
 
     An expression has no value to be compared. While a callback runs on expressions, operations by which the callback
     could distinguish expressions from numbers raise an exception.
     """
 
-    __slots__ = ("cached_key", "cached_number", "constant", "graph", "terms")
+    __slots__ = ("cached_identifier", "cached_key", "constant", "graph", "terms")
 
     def __init__(self, graph: Graph, constant: float, terms: dict[int, float]):
         self.graph, self.constant, self.terms = graph, constant, terms
         self.cached_key: tuple[Any, ...] | None = None
-        self.cached_number: int | None = None  # identifier, see Graph.number
+        self.cached_identifier: int | None = None  # identifier, see Graph.number
 
-    def on(self, graph: Graph) -> "Affine":
+    def on_graph(self, graph: Graph) -> "Affine":
         """Return this expression in terms of the quantities of `graph`, which must be a copy of self.graph."""
         copy = Affine(graph, self.constant, self.terms)
         copy.cached_key = self.cached_key
@@ -209,15 +222,15 @@ class Affine:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """Return a key, equal for expressions whose coefficients are equal up to rounding."""
+        """Return a hashable key, which is equal for expressions whose coefficients are equal up to rounding."""
         if self.cached_key is None:
             self.cached_key = rounded(self.constant), *[(i, rounded(self.terms[i])) for i in sorted(self.terms)]
         return self.cached_key
 
     @property
-    def late(self) -> bool:
+    def is_late(self) -> bool:
         """Return whether the expression depends on inputs other than time and coordinates."""
-        return any(self.graph.late[i] for i in self.terms)
+        return any(self.graph.is_late[i] for i in self.terms)
 
     def times(self, factor: float) -> "Affine":
         """Return the expression multiplied by a number."""
@@ -227,7 +240,7 @@ class Affine:
             return Affine(self.graph, 0.0, {})
         return Affine(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
-    def normalised(self) -> tuple[float, "Affine"]:
+    def normalized(self) -> tuple[float, "Affine"]:
         """Return the coefficient of the quantity with the lowest index, and the expression divided by it."""
         first = min(self.terms)
         factor = self.terms[first]
@@ -236,27 +249,27 @@ class Affine:
         if len(self.terms) == 1 and _equal(self.constant, 0.0):
             return factor, self.graph.quantity(first)
         if type(factor) is Parameter:
-            inverse = factor.to(-1.0)
+            inverse = factor.to_power(-1.0)
             return factor, Affine(self.graph, self.constant * inverse, {i: c * inverse for i, c in self.terms.items()})
         return factor, Affine(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
-    def _lifted(self, other: Any) -> "Affine":
+    def _as_expression(self, other: Any) -> "Affine":
         """Return an operand, a number or an expression, as an expression; refuse expressions of other graphs."""
         if type(other) is not Affine:
-            return Affine(self.graph, number(other), {})
+            return Affine(self.graph, as_number(other), {})
         if other.graph is not self.graph:
-            graph = self.graph if self.graph.running else other.graph
+            graph = self.graph if self.graph.is_tracing else other.graph
             graph.refuse("it uses t, q or v of another call, which it has kept")
         return other
 
     def __add__(self, other: Any) -> Any:
         if type(other) is not Affine and isinstance(other, np.ndarray):
             return elementwise(lambda x: x + self, [other])
-        other = self._lifted(other)
+        other = self._as_expression(other)
         terms = dict(self.terms)
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
-            if _magnitude(total) <= CANCELLED * _magnitude(c):
+            if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
                 terms.pop(i, None)  # the term may be absent: c may have underflowed to zero
             else:
                 terms[i] = total
@@ -264,7 +277,9 @@ class Affine:
             return Affine(self.graph, self.constant, terms)
         constant = self.constant + other.constant
         return Affine(
-            self.graph, 0.0 if _magnitude(constant) <= CANCELLED * _magnitude(other.constant) else constant, terms
+            self.graph,
+            0.0 if _magnitude(constant) <= CANCELLATION_LIMIT * _magnitude(other.constant) else constant,
+            terms,
         )
 
     __radd__ = __add__
@@ -284,7 +299,7 @@ class Affine:
     def __mul__(self, other: Any) -> Any:
         if type(other) is not Affine and isinstance(other, np.ndarray):
             return elementwise(lambda x: x * self, [other])
-        return self.graph.product(self, self._lifted(other))
+        return self.graph.product(self, self._as_expression(other))
 
     __rmul__ = __mul__
 
@@ -314,12 +329,12 @@ class Affine:
                 return self ** math.floor(exponent) * self.square_root()
             return (self.logarithm() * exponent).exponential()
         n = abs(int(exponent))
-        result, square, high = Affine(self.graph, 1.0, {}), self, n > HIGH_POWER
+        result, square, is_high_power = Affine(self.graph, 1.0, {}), self, n > HIGH_EXPONENT
         while n:
             if n % 2:
                 result = result * square
             n //= 2
-            square = self.graph.square(square, high) if n else square
+            square = self.graph.square(square, is_high_power) if n else square
         return result.reciprocal() if exponent < 0.0 else result
 
     def _function(self, kind: int, of_number: Callable[[float], float]) -> "Affine":
@@ -328,62 +343,64 @@ class Affine:
         return self.graph.operation(kind, self)
 
     def reciprocal(self) -> "Affine":
-        """Return 1 / x."""
+        """Return the reciprocal of this expression."""
         if not self.terms:
             return Affine(self.graph, 1.0 / self.constant, {})
-        scale, form = self.normalised()
-        return self.graph.operation(op.RECIPROCAL, form).times(1.0 / scale)
+        scale, expr = self.normalized()
+        return self.graph.operation(op.RECIPROCAL, expr).times(1.0 / scale)
 
     def square_root(self) -> "Affine":
-        """Return the square root."""
+        """Return the square root of this expression."""
         return self._function(op.SQUARE_ROOT, ROOT)
 
     def exponential(self) -> "Affine":
-        """Return exp x."""
+        """Return the exponential of this expression."""
         return self._function(op.EXPONENTIAL, EXP)
 
     def sine(self) -> "Affine":
-        """Return sin x; cos x is recorded, too, because the derivative needs it."""
+        """Return the sine of this expression; record the cosine, too, because the derivative needs it."""
         self._function(op.COSINE, COS)
         return self._function(op.SINE, SIN)
 
     def cosine(self) -> "Affine":
-        """Return cos x; sin x is recorded, too, because the derivative needs it."""
+        """Return the cosine of this expression; record the sine, too, because the derivative needs it."""
         self._function(op.SINE, SIN)
         return self._function(op.COSINE, COS)
 
-    def value(self) -> "Affine":
+    def as_term(self) -> "Affine":
         """Return the expression as a number or a multiple of one quantity; record a longer sum as a new quantity."""
         if len(self.terms) + (not _equal(self.constant, 0.0)) < 2:
             return self
-        scale, form = self.normalised()
-        return self.graph.operation(op.SUM, form).times(scale)
+        scale, expr = self.normalized()
+        return self.graph.operation(op.SUM, expr).times(scale)
 
     def logarithm(self) -> "Affine":
-        """Return log x, whose derivative is x' / x."""
+        """Return the logarithm of this expression x, whose derivative is x' / x."""
         if not self.terms:
             return Affine(self.graph, LOG(self.constant), {})
         return self.graph.operation(op.LOGARITHM, self, self)
 
     def arctangent(self) -> "Affine":
-        """Return atan x, whose derivative is x' / (1 + x^2)."""
+        """Return the arctangent of this expression x, whose derivative is x' / (1 + x^2)."""
         if not self.terms:
             return Affine(self.graph, ATAN(self.constant), {})
         return self.graph.operation(op.ARCTANGENT, self, self * self + 1.0)
 
-    def _branching(self, *_: Any) -> Any:
+    def _refuse_number(self, *_: Any) -> Any:
         """Refuse an operation that needs a definite value: comparison, conversion, rounding, hash or pickling."""
-        self.graph.refuse(BRANCHES)
+        self.graph.refuse(BRANCHING_REASON)
 
     def __float__(self) -> float:
-        self.graph.refuse(CONVERTS)
+        self.graph.refuse(CONVERSION_REASON)
 
-    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __int__ = __abs__ = _branching
-    __index__ = __complex__ = __floordiv__ = __mod__ = __divmod__ = __rfloordiv__ = __rmod__ = __rdivmod__ = _branching
-    __round__ = __trunc__ = __floor__ = __ceil__ = __hash__ = __reduce_ex__ = _branching  # type: ignore[assignment]
+    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __int__ = __abs__ = _refuse_number
+    __index__ = __complex__ = __floordiv__ = __mod__ = __divmod__ = __rfloordiv__ = __rmod__ = __rdivmod__ = (
+        _refuse_number
+    )
+    __round__ = __trunc__ = __floor__ = __ceil__ = __hash__ = __reduce_ex__ = _refuse_number  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        if self.graph.running:
+        if self.graph.is_tracing:
             self.graph.refuse("it makes text of what depends on t, q or v")
         return "<a symbol of t, q or v, kept from where the callback ran on symbols>"
 
@@ -404,19 +421,19 @@ class Affine:
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:  # isinstance reads this property
-        if self.graph.running:
+        if self.graph.is_tracing:
             self.graph.refuse("it asks for the type of what depends on t, q or v")
         return Affine
 
     def __getattr__(self, name: str) -> Any:
-        if self.graph.running and not name.startswith("__"):
+        if self.graph.is_tracing and not name.startswith("__"):
             self.graph.refuse(f"it asks for .{name} of what depends on t, q or v")
         raise AttributeError(name)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
         function = OPERATORS.get(ufunc.__name__) or FUNCTIONS.get(ufunc.__name__)
         if ufunc.__name__ in COMPARISONS:
-            self._branching()
+            self._refuse_number()
         if function is None or method != "__call__" or options or (out is not None and out[0].dtype != object):
             self.graph.refuse(f"it calls numpy.{ufunc.__name__} on what depends on t, q or v")
         return elementwise(function, inputs, out)
@@ -440,17 +457,17 @@ for _name, _function in FUNCTIONS.items():  # NumPy functions call methods of th
     setattr(Affine, _name, _function)
 
 
-def symbols(forms: Iterable[Affine]) -> Any:
-    """Return an array (of objects) of expressions, to be passed to callbacks."""
-    forms = list(forms)
-    array = np.empty(len(forms), dtype=object)
-    array[:] = forms
+def symbol_array(exprs: Iterable[Affine]) -> Any:
+    """Return a NumPy array of objects with these expressions, as an argument of callbacks."""
+    exprs = list(exprs)
+    array = np.empty(len(exprs), dtype=object)
+    array[:] = exprs
     return array
 
 
-def is_zero(form: Affine) -> bool:
+def is_zero(expr: Affine) -> bool:
     """Return whether an expression has no terms and the constant 0."""
-    return not form.terms and form.constant == 0.0
+    return not expr.terms and expr.constant == 0.0
 
 
 class Derivative:
@@ -459,41 +476,43 @@ class Derivative:
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
         self._derivatives = dict(direction)
-        self._changing = sum(1 << i for i in direction)  # bit mask of the inputs that change
+        self._input_mask = sum(1 << i for i in direction)  # bit mask of the inputs that change
 
-    def of(self, form: Affine) -> Affine:
+    def differentiate(self, expr: Affine) -> Affine:
         """Return the derivative of an expression."""
         total = Affine(self.graph, 0.0, {})
-        for i, c in form.terms.items():
-            if self.graph.inputs_of[i] & self._changing:
-                total = total + self._of_quantity(i).times(c)
+        for i, c in expr.terms.items():
+            if self.graph.input_masks[i] & self._input_mask:
+                total = total + self._differentiate_quantity(i).times(c)
         return total
 
-    def _of_quantity(self, i: int) -> Affine:
+    def _differentiate_quantity(self, i: int) -> Affine:
         stack = [i]  # an explicit stack, as products may be nested more deeply than Python allows recursion
         while i not in self._derivatives:
             operation = self.graph.operations[stack[-1]]
-            forms = () if operation is None else [form for form in operation[1:] if isinstance(form, Affine)]
+            exprs = () if operation is None else [expr for expr in operation[1:] if isinstance(expr, Affine)]
             missing = [
                 k
-                for form in forms
-                for k in form.terms
-                if k not in self._derivatives and self.graph.inputs_of[k] & self._changing
+                for expr in exprs
+                for k in expr.terms
+                if k not in self._derivatives and self.graph.input_masks[k] & self._input_mask
             ]
             if missing:
                 stack += missing
                 continue
             k = stack.pop()
             if k not in self._derivatives:
-                change = Affine(self.graph, 0.0, {}) if operation is None else self._of_operation(k, *operation)
-                self._derivatives[k] = change.value()
+                change = (
+                    Affine(self.graph, 0.0, {}) if operation is None else self._differentiate_operation(k, *operation)
+                )
+                self._derivatives[k] = change.as_term()
         return self._derivatives[i]
 
-    def _of_operation(self, i: int, kind: int, first: Affine, second: Affine | None) -> Affine:
-        result, change = self.graph.quantity(i), self.of(first)
+    def _differentiate_operation(self, i: int, kind: int, first: Affine, second: Affine | None) -> Affine:
+        result, change = self.graph.quantity(i), self.differentiate(first)
         if kind == op.PRODUCT:
             assert second is not None
-            return change * second + first * self.of(second)
+            return change * second + first * self.differentiate(second)
         if kind == op.SUM:
             return change
         if kind == op.RECIPROCAL:

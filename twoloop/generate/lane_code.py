@@ -29,7 +29,7 @@ from twoloop.generate.compile_equations import write_accelerations
 from twoloop.generate.elimination import Elimination, PivotChoice, Solution
 from twoloop.generate.graph import Untraceable, is_zero
 from twoloop.generate.lane_series import LaneEmitter, LaneSeries
-from twoloop.generate.llvm_code import lower
+from twoloop.generate.llvm_code import lower_program
 from twoloop.generate.llvm_text import INTEGER, Module, Value, integer
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.generate.program import Coefficients, Program
@@ -49,18 +49,18 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-TARGET_ERROR = 0.3  # value of OFF for which the next step size is chosen after a step with OFF above 1 was rejected
+TARGET_ERROR = 0.3  # value of OFF for which the next step size is chosen after a step was rejected because OFF > 1
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
 MAX_REJECTIONS = 10  # largest number of successive rejected steps; after more, the run leaves its lane
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
 # a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
-CONTRACTION = 0.5  # ratio of a correction to the previous one, above which a projection fails
-IN_PARALLEL = 3  # number of coordinates in one loop of Horner schemes: each needs 3 of the 16 vector registers
+CONTRACTION = 0.5  # largest ratio of a correction to the previous one: above this ratio, a projection fails
+N_PARALLEL = 3  # number of coordinates whose series one loop evaluates: each needs 3 of the 16 vector registers
 
 
-class Places(NamedTuple):
-    """Order of the series, and pointers to `work` and to the arrays in it, see kernels/lanes/layout.py."""
+class LaneMemory(NamedTuple):
+    """Order of the series, pointer to `work`, and pointers to the arrays in `work`, see kernels/lanes/layout.py."""
 
     order: Value
     work: Value
@@ -82,81 +82,81 @@ class LaneSteps:
     def __init__(self, n: int, n_rows: int):
         self.n, self.n_rows = n, n_rows
 
-    def unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
+    def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
         """Store and return UNIT, the unit of time of the series, s; a new one in new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
-        fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
-        span = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
-        next_unit = emit.smaller(
+        is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
+        duration = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
+        next_unit = emit.minimum(
             emit.multiply(emit.load(work, lanes.LENGTH), unit),
             emit.multiply(emit.constant(MAX_FACTOR), emit.load(work, lanes.H)),
         )
-        first_unit = emit.multiply(emit.constant(FIRST_UNIT), span)
-        unit = select(fresh, first_unit, select(accepted, next_unit, unit))
+        first_unit = emit.multiply(emit.constant(FIRST_UNIT), duration)
+        unit = select(is_fresh, first_unit, select(is_accepted, next_unit, unit))
         emit.store(unit, work, lanes.UNIT)
         for field, value in ((lanes.LONGEST, math.inf), (lanes.SHIFT, 0.0)):
-            emit.store(select(fresh, emit.constant(value), emit.load(work, field)), work, field)
+            emit.store(select(is_fresh, emit.constant(value), emit.load(work, field)), work, field)
         return unit
 
     def lengths(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store the step sizes H and X, computed from the last two terms of the series, and update RUNNING and FINE."""
-        builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
+        builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, norms = emit.constant(1.0), []
         scales = []
         for j in range(n):
-            q, v = (emit.function("fabs", emit.load(at.series, i)) for i in (j, n + j))
+            q, v = (emit.function("fabs", emit.load(memory.series, i)) for i in (j, n + j))
             of_q, of_v = (
                 emit.add(atol[j], emit.multiply(rtol, q)),
                 emit.add(emit.multiply(atol[j], unit), emit.multiply(rtol, v)),
             )
-            scales.append(emit.divide(one, emit.smaller(of_q, emit.divide(of_v, emit.number(order)))))
+            scales.append(emit.divide(one, emit.minimum(of_q, emit.divide(of_v, emit.to_double(order)))))
         for back in (0, 1):
             power = builder.sub(order, integer(back))
-            row, largest = emit.pointer(at.series, builder.mul(power, integer(n))), emit.constant(0.0)
+            row, largest = emit.pointer(memory.series, builder.mul(power, integer(n))), emit.constant(0.0)
             for j, scale in enumerate(scales):
-                largest = emit.larger(emit.multiply(emit.function("fabs", emit.load(row, j)), scale), largest)
+                largest = emit.maximum(emit.multiply(emit.function("fabs", emit.load(row, j)), scale), largest)
             norms.append(largest)
         log_roots = [
-            emit.divide(emit.logarithm(value), emit.number(power))
+            emit.divide(emit.logarithm(value), emit.to_double(power))
             for value, power in zip(norms, (order, builder.sub(order, integer(1))), strict=True)
         ]
-        h_in_units = emit.exponential(emit.negative(emit.larger(*log_roots)))
+        h_in_units = emit.exponential(emit.negate(emit.maximum(*log_roots)))
         emit.store(h_in_units, work, lanes.LENGTH)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
         time_left, zero = emit.subtract(t1, t), emit.constant(0.0)
-        h = emit.smallest_of(emit.multiply(h_in_units, unit), emit.load(work, lanes.LONGEST))
+        h = emit.minimum_or_nan(emit.multiply(h_in_units, unit), emit.load(work, lanes.LONGEST))
         h = builder.select(builder.compare("fcmp oge", h, time_left), time_left, h)
-        largest = emit.larger(emit.function("fabs", t), emit.function("fabs", t1))
-        continues = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
+        largest = emit.maximum(emit.function("fabs", t), emit.function("fabs", t1))
+        is_continued = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
         for field in (lanes.RUNNING, lanes.FINE):
-            continues = builder.both(continues, is_set(emit, work, field))
-        h = builder.select(continues, h, zero)
+            is_continued = builder.bitwise_and(is_continued, is_set(emit, work, field))
+        h = builder.select(is_continued, h, zero)
         emit.store(h, work, lanes.H)
         emit.store(emit.divide(h, unit), work, lanes.X)
         for field in (lanes.RUNNING, lanes.FINE):
-            store_mask(emit, work, field, continues)
+            store_mask(emit, work, field, is_continued)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Evaluate the series at X units of time; store NEW, `series_a`, and the positions once more as `predicted`."""
-        at = self.places(emit, order, control, work)
-        for j, q in enumerate(self.positions(emit, at, emit.load(work, lanes.X))):
-            emit.store(q, at.predicted, j)
+        memory = self.memory(emit, order, control, work)
+        for j, q in enumerate(self.evaluate_positions(emit, memory, emit.load(work, lanes.X))):
+            emit.store(q, memory.predicted, j)
 
-    def positions(self, emit: LaneEmitter, at: Places, x: Value) -> list[Value]:
-        """Evaluate the series at x units of time; store NEW and `series_a`; return the positions."""
+    def evaluate_positions(self, emit: LaneEmitter, memory: LaneMemory, x: Value) -> list[Value]:
+        """Evaluate the series at x units of time; store NEW and the accelerations `series_a`; return the positions."""
         positions: list[Value] = []
-        builder, n, order = emit.builder, self.n, at.order
-        unit, zero = emit.load(at.work, lanes.UNIT), emit.constant(0.0)
+        builder, n, order = emit.builder, self.n, memory.order
+        unit, zero = emit.load(memory.work, lanes.UNIT), emit.constant(0.0)
         per_unit = emit.divide(emit.constant(1.0), unit)
         acceleration_unit = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
-        last_row = emit.pointer(at.series, builder.mul(order, integer(n)))
-        for begin in range(0, n, IN_PARALLEL):
-            group = range(begin, min(begin + IN_PARALLEL, n))
+        last_row = emit.pointer(memory.series, builder.mul(order, integer(n)))
+        for begin in range(0, n, N_PARALLEL):
+            group = range(begin, min(begin + N_PARALLEL, n))
             initial = [each for j in group for each in (emit.load(last_row, j), zero, zero)]
             with emit.loop(integer(0), order, initial) as (m, carried, new):
                 power = builder.sub(builder.sub(order, integer(1)), m)
-                row = emit.pointer(at.series, builder.mul(power, integer(n)))
+                row = emit.pointer(memory.series, builder.mul(power, integer(n)))
                 for j, (q, v, a) in zip(group, _triples(carried), strict=True):
                     # a first and q last: in this order each new number takes the register of the old one
                     a = emit.add(emit.multiply(a, x), v)
@@ -164,43 +164,43 @@ class LaneSteps:
                     new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
             for j, (q, v, a) in zip(group, _triples(new), strict=True):
                 positions.append(q)
-                emit.store(q, at.new, j)
-                emit.store(emit.multiply(v, per_unit), at.new, n + j)
-                emit.store(emit.multiply(a, acceleration_unit), at.series_a, j)
+                emit.store(q, memory.new, j)
+                emit.store(emit.multiply(v, per_unit), memory.new, n + j)
+                emit.store(emit.multiply(a, acceleration_unit), memory.series_a, j)
         return positions
 
     def defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store DEFECT, the defect of a step at its end (see `defect_of`), for the accelerations in memory."""
-        at = self.places(emit, order, control, work)
-        a = [emit.load(at.a, j) for j in range(self.n)]
-        emit.store(self.defect_of(emit, control, at, a), work, lanes.DEFECT)
+        """Store DEFECT, the defect of a step at its end (see `compute_defect`), for the accelerations in memory."""
+        memory = self.memory(emit, order, control, work)
+        a = [emit.load(memory.a, j) for j in range(self.n)]
+        emit.store(self.compute_defect(emit, control, memory, a), work, lanes.DEFECT)
 
-    def defect_of(self, emit: LaneEmitter, control: Value, at: Places, a: list[Value]) -> Value:
+    def compute_defect(self, emit: LaneEmitter, control: Value, memory: LaneMemory, a: list[Value]) -> Value:
         """Return the defect of the series at NEW, relative to the tolerances, see control/step_size.py.
 
         The defect is the difference between the accelerations of the series and `a`, those by the equations of motion.
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
-        order, h = emit.number(at.order), emit.load(at.work, lanes.H)
+        order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)
         # per_duration is infinite if h is 0: then positions set no limit
         duration, per_duration = emit.divide(h, order), emit.divide(order, h)
-        largest = worst = emit.constant(0.0)
+        largest = max_defect = emit.constant(0.0)
         for each in a:
-            largest = emit.larger(emit.function("fabs", each), largest)
+            largest = emit.maximum(emit.function("fabs", each), largest)
         noise = emit.multiply(emit.constant(ROUNDING), largest)
         for j, each in enumerate(a):
-            defect = emit.function("fabs", emit.subtract(emit.load(at.series_a, j), each))
+            defect = emit.function("fabs", emit.subtract(emit.load(memory.series_a, j), each))
             of_q, of_v = (
-                emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(at.new, place))))
+                emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(memory.new, place))))
                 for place in (j, n + j)
             )
-            allowed = emit.smallest_of(of_v, emit.multiply(of_q, per_duration))
-            worst = emit.largest_of(emit.divide(emit.subtract(defect, noise), allowed), worst)
-        return emit.multiply(duration, worst)
+            allowed = emit.minimum_or_nan(of_v, emit.multiply(of_q, per_duration))
+            max_defect = emit.maximum_or_nan(emit.divide(emit.subtract(defect, noise), allowed), max_defect)
+        return emit.multiply(duration, max_defect)
 
     def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store OFF, the ratio of |predicted - projected positions| to its limit, see control/step_size.py."""
-        n, at, (rtol, atol) = self.n, self.places(emit, order, control, work), self.tolerances(emit, control)
+        n, memory, (rtol, atol) = self.n, self.memory(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
         def magnitude(base: Value, index: int) -> Value:
@@ -211,34 +211,41 @@ class LaneSteps:
 
         motion = error = emit.constant(0.0)
         for j in range(n):
-            distance = emit.larger(emit.multiply(h, magnitude(at.state, n + j)), difference(at.new, at.state, j))
-            motion = emit.larger(distance, motion)
-        turned, least = self.turned(emit, at), emit.multiply(emit.constant(FRACTION_AT_SIGN_CHANGE), motion)
+            distance = emit.maximum(
+                emit.multiply(h, magnitude(memory.state, n + j)), difference(memory.new, memory.state, j)
+            )
+            motion = emit.maximum(distance, motion)
+        is_passage, least = (
+            self.singular_passage_mask(emit, memory),
+            emit.multiply(emit.constant(FRACTION_AT_SIGN_CHANGE), motion),
+        )
         motion = emit.multiply(emit.constant(FRACTION_OF_MOTION), motion)
         for j in range(n):
-            scale = emit.add(atol[j], emit.multiply(rtol, emit.larger(magnitude(at.new, j), magnitude(at.state, j))))
+            scale = emit.add(
+                atol[j], emit.multiply(rtol, emit.maximum(magnitude(memory.new, j), magnitude(memory.state, j)))
+            )
             allowed = emit.add(motion, emit.multiply(emit.constant(FIXED_FRACTION), scale))
-            allowed = emit.smaller(scale, allowed)
-            if turned is not None:
-                allowed = emit.builder.select(turned, emit.smaller(scale, least), allowed)
-            allowed = emit.larger(allowed, emit.constant(LEAST))
-            error = emit.largest_of(emit.divide(difference(at.predicted, at.new, j), allowed), error)
+            allowed = emit.minimum(scale, allowed)
+            if is_passage is not None:
+                allowed = emit.builder.select(is_passage, emit.minimum(scale, least), allowed)
+            allowed = emit.maximum(allowed, emit.constant(LEAST))
+            error = emit.maximum_or_nan(emit.divide(difference(memory.predicted, memory.new, j), allowed), error)
         emit.store(error, work, lanes.OFF)
 
-    def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return a mask of the lanes that may have passed a singular position in this step, or None without a check."""
+    def singular_passage_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
+        """Return a mask of the lanes that may have passed a singular position in this step; None: no check."""
         return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store ACCEPTED, and LONGEST, the limit of the next step; clear RUNNING after MAX_REJECTIONS or a NaN."""
+        """Store ACCEPTED, and LONGEST, the largest next step size; clear RUNNING after MAX_REJECTIONS or a NaN."""
         builder, one = emit.builder, emit.constant(1.0)
-        select, per_order = builder.select, emit.divide(one, emit.number(order))
+        select, per_order = builder.select, emit.divide(one, emit.to_double(order))
         off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
         is_valid = is_set(emit, work, lanes.FINE)
         for value in (off, *defects):
             magnitude = emit.function("fabs", value)
-            is_valid = builder.both(is_valid, builder.compare("fcmp olt", magnitude, emit.constant(math.inf)))
-        defect, shortest = emit.larger(*defects), emit.constant(MIN_FACTOR)
+            is_valid = builder.bitwise_and(is_valid, builder.compare("fcmp olt", magnitude, emit.constant(math.inf)))
+        defect, shortest = emit.maximum(*defects), emit.constant(MIN_FACTOR)
 
         def root(x: Value) -> Value:
             return emit.exponential(emit.multiply(emit.logarithm(x), per_order))
@@ -246,35 +253,37 @@ class LaneSteps:
         departure_factor = root(emit.divide(emit.constant(TARGET_ERROR), off))
         factor = select(builder.compare("fcmp ogt", off, one), departure_factor, one)
         defect_factor = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
-        defect_factor = emit.smaller(factor, emit.larger(shortest, defect_factor))
+        defect_factor = emit.minimum(factor, emit.maximum(shortest, defect_factor))
         factor = select(builder.compare("fcmp ogt", defect, one), defect_factor, factor)
         factor = select(is_valid, factor, shortest)
-        running, refused = is_set(emit, work, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
-        accepted = builder.both(running, builder.compare("fcmp oge", factor, one))
-        store_mask(emit, work, lanes.ACCEPTED, accepted)
+        is_running, is_refused = is_set(emit, work, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
+        is_accepted = builder.bitwise_and(is_running, builder.compare("fcmp oge", factor, one))
+        store_mask(emit, work, lanes.ACCEPTED, is_accepted)
         n_refused = emit.load(work, lanes.REFUSED)
-        n_refused = select(builder.both(running, refused), emit.add(n_refused, one), n_refused)
+        n_refused = select(builder.bitwise_and(is_running, is_refused), emit.add(n_refused, one), n_refused)
         # end a run with a value that is not finite: shorter steps could pass the point where equations are undefined
         n_refused = select(is_valid, n_refused, emit.constant(math.inf))
         emit.store(n_refused, work, lanes.REFUSED)
-        h_longest = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(MAX_FACTOR)))
-        emit.store(select(running, h_longest, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
+        h_longest = emit.multiply(emit.load(work, lanes.H), select(is_refused, factor, emit.constant(MAX_FACTOR)))
+        emit.store(select(is_running, h_longest, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
         within_limit = builder.compare("fcmp ole", n_refused, emit.constant(float(MAX_REJECTIONS)))
-        store_mask(emit, work, lanes.RUNNING, builder.both(running, within_limit))
+        store_mask(emit, work, lanes.RUNNING, builder.bitwise_and(is_running, within_limit))
 
     def commit(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Copy NEW to STATE in the lanes in which the step was accepted."""
-        at = self.places(emit, order, control, work)
-        accepted = is_set(emit, work, lanes.ACCEPTED)
+        memory = self.memory(emit, order, control, work)
+        is_accepted = is_set(emit, work, lanes.ACCEPTED)
         for k in range(2 * self.n):
-            emit.store(emit.builder.select(accepted, emit.load(at.new, k), emit.load(at.state, k)), at.state, k)
+            emit.store(
+                emit.builder.select(is_accepted, emit.load(memory.new, k), emit.load(memory.state, k)), memory.state, k
+            )
 
     def tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
         """Return rtol, and a list with atol of each coordinate, broadcast to all lanes."""
         atol = [broadcast_entry(emit, control, lanes.ATOL + j) for j in range(self.n)]
         return broadcast_entry(emit, control, lanes.RTOL), atol
 
-    def places(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> Places:
+    def memory(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> LaneMemory:
         """Return the pointers to the arrays in `work`; store the pointers to coefficients in `emit`."""
         *fixed, series = lanes.array_offsets(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
@@ -283,7 +292,7 @@ class LaneSteps:
         n_coefficients = emit.builder.add(order, integer(1))
         scratch = emit.pointer(series_memory, emit.builder.mul(n_coefficients, integer(self.n)))
         state, new, predicted, series_a, a, lam = (emit.pointer(work, place) for place in fixed)
-        return Places(order, work, state, new, predicted, series_a, a, lam, series_memory, scratch)
+        return LaneMemory(order, work, state, new, predicted, series_a, a, lam, series_memory, scratch)
 
 
 def _triples(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
@@ -292,7 +301,7 @@ def _triples(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
 
 def broadcast_entry(emit: LaneEmitter, control: Value, index: int) -> Value:
     """Return entry `index` of the array `control`, broadcast to all lanes."""
-    return emit.splat(emit.builder.load(emit.builder.gep(control, integer(index))))
+    return emit.broadcast(emit.builder.load(emit.builder.gep(control, integer(index))))
 
 
 def is_set(emit: LaneEmitter, work: Value, field: int) -> Value:
@@ -305,15 +314,15 @@ def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
     emit.store(emit.builder.select(mask, emit.constant(1.0), emit.constant(0.0)), work, field)
 
 
-def clear_fine_unless(emit: LaneEmitter, work: Value, holds: Value) -> None:
+def clear_fine_unless(emit: LaneEmitter, work: Value, is_valid: Value) -> None:
     """Clear FINE in the lanes in which a condition does not hold."""
-    store_mask(emit, work, lanes.FINE, emit.builder.both(is_set(emit, work, lanes.FINE), holds))
+    store_mask(emit, work, lanes.FINE, emit.builder.bitwise_and(is_set(emit, work, lanes.FINE), is_valid))
 
 
 Rows = list[dict[int, Value]]  # the nonzero entries of each row, by column
 
 
-def changed_orientation(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
+def orientation_change_mask(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
     """Return a mask of the lanes where det G1 G0^T <= 0, whose steps may have passed a singular position.
 
     G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula
@@ -337,7 +346,7 @@ def changed_orientation(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
         i = min(remaining, key=lambda each: (len(matrix[each]), each))
         remaining.remove(i)
         pivot = matrix[i].pop(i)
-        sign_unless_positive = select(compare("fcmp olt", pivot, zero), emit.negative(sign), zero)
+        sign_unless_positive = select(compare("fcmp olt", pivot, zero), emit.negate(sign), zero)
         sign = select(compare("fcmp ogt", pivot, zero), sign, sign_unless_positive)
         inverse = emit.divide(one, pivot)
         for k in sorted(remaining):
@@ -346,7 +355,7 @@ def changed_orientation(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
                 for j, value in matrix[i].items():
                     change = emit.multiply(multiple, value)
                     entry = matrix[k].get(j)
-                    matrix[k][j] = emit.negative(change) if entry is None else emit.subtract(entry, change)
+                    matrix[k][j] = emit.negate(change) if entry is None else emit.subtract(entry, change)
     return compare("fcmp ule", sign, zero)
 
 
@@ -374,31 +383,31 @@ class LaneStages:
         """Return the tableau as a list of bytes; besides n, the code depends on nothing else."""
         return [np.asarray(each).tobytes() for each in self.tableau]
 
-    def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], at: Places) -> None:
+    def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
         """Store NEW, the state at the time X after the beginning of the step, and ERROR, which is valid if X is H."""
-        A, b, c, fine, coarse = self.tableau
+        A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
         for i in range(1, len(b)):
             stage_time = emit.add(t, emit.multiply(emit.constant(c[i]), x))
             emit.store(stage_time, work, lanes.AHEAD)
             with emit.loop(integer(0), integer(self.n), []) as (j, _, _):
-                coordinate = _Coordinate(self, emit, at, j, i)
-                coordinate.move(A[i], A[i] @ A, x)
-            emit.builder.run("accelerate", arguments)
+                coordinate = _Coordinate(self, emit, memory, j, i)
+                coordinate.store_state(A[i], A[i] @ A, x)
+            emit.builder.call_void("accelerate", arguments)
         rtol, zero = broadcast_entry(emit, control, lanes.RTOL), emit.constant(0.0)
         with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
-            coordinate = _Coordinate(self, emit, at, j, len(b))
-            new_state = coordinate.move(b, b @ A, x)
+            coordinate = _Coordinate(self, emit, memory, j, len(b))
+            new_state = coordinate.store_state(b, b @ A, x)
             atol_pointer = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
-            atol = emit.splat(emit.builder.load(atol_pointer))
+            atol = emit.broadcast(emit.builder.load(atol_pointer))
             error_weights = [
                 coordinate.error_weight(atol, rtol, *each) for each in zip(coordinate.before, new_state, strict=True)
             ]
-            for largest, weights in ((e, fine), (d, coarse)):
+            for largest, weights in ((e, fine_weights), (d, coarse_weights)):
                 of_q, of_v = emit.multiply(x, coordinate.sum(weights @ A)), coordinate.sum(weights)
                 for off, weight in zip((of_q, of_v), error_weights, strict=True):
-                    largest = emit.larger(emit.multiply(emit.function("fabs", off), weight), largest)
+                    largest = emit.maximum(emit.multiply(emit.function("fabs", off), weight), largest)
                     total = emit.add(total, emit.multiply(zero, off))
                 new.append(largest)
             for each in new_state:
@@ -417,15 +426,15 @@ class LaneStages:
 class _Coordinate:
     """Coordinate j in a loop over coordinates: its state before the step, and its accelerations at `count` stages."""
 
-    def __init__(self, stages: LaneStages, emit: LaneEmitter, at: Places, j: Value, count: int):
-        n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(at.new, j), stages.n
-        memory = emit.pointer(at.series, j)
-        self.before = tuple(emit.load(memory, lanes.BEGIN * n + place) for place in (0, n))
-        self._slopes = [(memory, (lanes.SLOPES + k) * n) for k in range(count)]
+    def __init__(self, stages: LaneStages, emit: LaneEmitter, memory: LaneMemory, j: Value, count: int):
+        n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(memory.new, j), stages.n
+        series_pointer = emit.pointer(memory.series, j)
+        self.before = tuple(emit.load(series_pointer, lanes.BEGIN * n + place) for place in (0, n))
+        self._acceleration_locations = [(series_pointer, (lanes.SLOPES + k) * n) for k in range(count)]
         self._loaded: dict[int, Value] = {}
         if count > 1:  # the acceleration of the last stage was just computed, and is not stored yet
-            self._loaded[count - 1] = emit.load(emit.pointer(at.a, j))
-            emit.store(self._loaded[count - 1], *self._slopes[count - 1])
+            self._loaded[count - 1] = emit.load(emit.pointer(memory.a, j))
+            emit.store(self._loaded[count - 1], *self._acceleration_locations[count - 1])
 
     def sum(self, weights: Array) -> Value:
         """Return the sum of the accelerations at the stages, multiplied by `weights`, one for each stage."""
@@ -433,7 +442,7 @@ class _Coordinate:
         for k, weight in enumerate(weights.tolist()):
             if abs(weight) > WEIGHT_ROUNDING:
                 if k not in self._loaded:
-                    self._loaded[k] = self.emit.load(*self._slopes[k])
+                    self._loaded[k] = self.emit.load(*self._acceleration_locations[k])
                 term = self.emit.multiply(self.emit.constant(weight), self._loaded[k])
                 total = term if total is None else self.emit.add(total, term)
         return self.emit.constant(0.0) if total is None else total
@@ -441,23 +450,23 @@ class _Coordinate:
     def error_weight(self, atol: Value, rtol: Value, before: Value, after: Value) -> Value:
         """Return the reciprocal of the allowed error of a position or velocity that goes from `before` to `after`."""
         emit = self.emit
-        magnitude = emit.larger(emit.function("fabs", before), emit.function("fabs", after))
+        magnitude = emit.maximum(emit.function("fabs", before), emit.function("fabs", after))
         return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, magnitude)))
 
-    def move(self, weights: Array, twice: Array, x: Value) -> tuple[Value, Value]:
-        """Store q and v at a stage in NEW; return both. `weights`, `twice`: weights of accelerations in v and in q."""
+    def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
+        """Store q and v at a stage in NEW; return both. `weights`, `position_weights`: of accelerations in v, in q."""
         emit, (q, v) = self.emit, self.before
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
-        q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(twice)))))
+        q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(position_weights)))))
         v = emit.add(v, emit.multiply(x, self.sum(weights)))
         for value, place in ((q, 0), (v, self.n)):
             emit.store(value, self.new, place)
         return q, v
 
 
-GOLDEN = 0.6180339887498949  # golden section: its multiples modulo 1 are spread evenly on [0, 1]
-MOST_PARTS = 1000.0  # largest number of parts into which a step is divided; the defect is checked between the parts
-MOST_OPERATIONS = 1500  # largest number of operations of a series: this many take some seconds to compile
+GOLDEN_SECTION = 0.6180339887498949  # multiples of this number modulo 1 are spread evenly on [0, 1]
+MAX_PARTS = 1000.0  # largest number of parts of a step, between which the defect is evaluated
+MAX_SERIES_OPERATIONS = 1500  # largest number of operations of a series: this many take some seconds to compile
 
 
 class LaneCode(LaneSteps):
@@ -489,20 +498,20 @@ class LaneCode(LaneSteps):
     ):
         if system.n_a > 0:
             raise Untraceable("it has nonholonomic rows")
-        self.numbers = Coefficients(apart=True)
+        self.numbers = Coefficients(separate_varying=True)
         self.equations = equations = Elimination(system, choice, Equations(system, parameters))
         self.solution = Solution(self.equations)
         super().__init__(system.n_q, system.n_c + system.n_a)
         self.recurrences: LaneSeries | None = None
-        self.explicit = None if tableau is None else LaneStages(tableau, self.n)
+        self.stage_generator = None if tableau is None else LaneStages(tableau, self.n)
         if series:
-            program = series_program(system, Equations(system, parameters), {*choice.rows, *choice.added})
-            if program.n_operations > MOST_OPERATIONS:
-                raise Untraceable(f"its series takes more than {MOST_OPERATIONS} operations")
+            program = series_program(system, Equations(system, parameters), {*choice.rows, *choice.added_rows})
+            if program.n_operations > MAX_SERIES_OPERATIONS:
+                raise Untraceable(f"its series takes more than {MAX_SERIES_OPERATIONS} operations")
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
         rows = self.equations.rows
-        self._entries = [(k, j) for k, row in enumerate(rows) for j in range(self.n) if not is_zero(row[j])]
-        self._rows_at = Program(equations.graph, {"G": [rows[k, j] for k, j in self._entries]})
+        self._row_entries = [(k, j) for k, row in enumerate(rows) for j in range(self.n) if not is_zero(row[j])]
+        self._row_program = Program(equations.graph, {"G": [rows[k, j] for k, j in self._row_entries]})
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
         programs = [
@@ -511,9 +520,9 @@ class LaneCode(LaneSteps):
             equations.basic_projection,
             equations.redundant_rows,
         ]
-        programs += [self.solution.kept] if series else []
+        programs += [self.solution.factor_program] if series else []
         counts = [len(each.quantities()) for each in programs]
-        counts += [len(self.solution.solved.quantities())] if series else []
+        counts += [len(self.solution.solution_program.quantities())] if series else []
         self.n_quantities = sum(counts)
 
     @property
@@ -521,7 +530,7 @@ class LaneCode(LaneSteps):
         """Return the names of the functions to generate."""
         if self.recurrences is not None:
             return *lanes.TASKS, *lanes.TASKS_OF_SERIES
-        explicit_tasks = () if self.explicit is None else lanes.TASKS_OF_EXPLICIT
+        explicit_tasks = () if self.stage_generator is None else lanes.TASKS_OF_EXPLICIT
         return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit_tasks
 
     def series_size(self, order: int) -> int:
@@ -531,7 +540,7 @@ class LaneCode(LaneSteps):
 
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
-        description: list[Any] = [] if self.explicit is None else [*self.explicit.structure]
+        description: list[Any] = [] if self.stage_generator is None else [*self.stage_generator.structure]
         programs = [
             *equations.accelerations,
             equations.position_projection,
@@ -540,38 +549,40 @@ class LaneCode(LaneSteps):
         ]
         if self.recurrences is not None:
             description += list(self.recurrences.structure)
-            programs.append(self.solution.kept)
+            programs.append(self.solution.factor_program)
         else:
-            programs.append(self._rows_at)  # its coefficients must get indices, also if the code is read from the disk
+            programs.append(
+                self._row_program
+            )  # its coefficients must get indices, also if the code is read from the disk
         for outputs in programs:
             description += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
-            description += list(numbers.structure(self.solution.solved))
+            description += list(numbers.structure(self.solution.solution_program))
         return hashlib.sha256(repr(description).encode()).hexdigest()
 
     # methods that write the generated functions
 
     def series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Compute the Taylor coefficients of q about the state of each lane, with UNIT as the unit of time."""
-        builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
-        unit, out, scratch = self.unit(emit, control, work), at.series, at.scratch
-        inputs = [emit.load(work, lanes.T), *(emit.load(at.state, i) for i in range(2 * n))]
-        lowering, (kept,) = lower(emit, self.solution.kept, inputs, self.numbers)
-        holds = lowering.holds(self.solution.kept, kept)
+        builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
+        unit, out, scratch = self.update_unit(emit, control, work), memory.series, memory.scratch
+        inputs = [emit.load(work, lanes.T), *(emit.load(memory.state, i) for i in range(2 * n))]
+        lowering, (kept,) = lower_program(emit, self.solution.factor_program, inputs, self.numbers)
+        is_valid = lowering.is_valid(self.solution.factor_program, kept)
         for i, value in enumerate(kept):
             emit.store(value, scratch, i)
         for j in range(n):
             emit.store(inputs[1 + j], out, j)
             emit.store(emit.multiply(unit, inputs[1 + n + j]), out, n + j)
         assert self.recurrences is not None
-        self.recurrences.begin(emit, inputs, scratch)
+        self.recurrences.write_order_0(emit, inputs, scratch)
         with emit.loop(integer(1), order, []) as (k, _, _):
-            self.recurrences.order(emit, k, unit, out, scratch)
+            self.recurrences.write_order(emit, k, unit, out, scratch)
         last_row, total = emit.pointer(out, builder.mul(order, integer(n))), emit.constant(0.0)
         for j in range(n):
             total = emit.add(total, emit.multiply(emit.constant(0.0), emit.load(last_row, j)))
-        holds = builder.both(holds, builder.compare("fcmp oeq", total, emit.constant(0.0)))
-        store_mask(emit, work, lanes.FINE, holds)
+        is_valid = builder.bitwise_and(is_valid, builder.compare("fcmp oeq", total, emit.constant(0.0)))
+        store_mask(emit, work, lanes.FINE, is_valid)
 
     def check_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store WORST, the largest defect at equidistant times within the step, at most GAP apart.
@@ -579,28 +590,28 @@ class LaneCode(LaneSteps):
         AHEAD becomes each of these times, and finally the end of the step. SHIFT is a multiple of the golden section
         modulo 1, which moves the times as far as GAP allows, so that they differ from step to step.
         """
-        builder, at = emit.builder, self.places(emit, order, control, work)
+        builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
         zero, one, two = (emit.constant(x) for x in (0.0, 1.0, 2.0))
         n_lane_parts = emit.function("ceil", emit.divide(h, gap))
-        n_lane_parts = emit.larger(emit.smaller(n_lane_parts, emit.constant(MOST_PARTS)), one)
+        n_lane_parts = emit.maximum(emit.minimum(n_lane_parts, emit.constant(MAX_PARTS)), one)
         part_size = emit.divide(h, n_lane_parts)
-        shift = emit.add(emit.load(work, lanes.SHIFT), emit.constant(GOLDEN))
+        shift = emit.add(emit.load(work, lanes.SHIFT), emit.constant(GOLDEN_SECTION))
         shift = emit.subtract(shift, builder.select(builder.compare("fcmp oge", shift, one), one, zero))
         emit.store(shift, work, lanes.SHIFT)
         offset = emit.multiply(
-            emit.subtract(emit.multiply(two, shift), one), emit.larger(emit.subtract(gap, part_size), zero)
+            emit.subtract(emit.multiply(two, shift), one), emit.maximum(emit.subtract(gap, part_size), zero)
         )
         n_parts = builder.convert("fptosi", emit.largest_lane(n_lane_parts), INTEGER)
-        with emit.loop(integer(1), n_parts, [zero]) as (index, (worst,), new):
-            part = emit.number(index)
+        with emit.loop(integer(1), n_parts, [zero]) as (index, (max_defect,), new):
+            part = emit.to_double(index)
             is_inside = builder.compare("fcmp olt", part, n_lane_parts)
             x = builder.select(is_inside, emit.add(emit.multiply(part, part_size), offset), zero)
             emit.store(emit.add(emit.load(work, lanes.T), x), work, lanes.AHEAD)
-            self.positions(emit, at, emit.divide(x, emit.load(work, lanes.UNIT)))
-            holds, a = self._accelerations(emit, work, at)
-            defect = builder.select(holds, self.defect_of(emit, control, at, a), emit.constant(math.inf))
-            new.append(emit.largest_of(builder.select(is_inside, defect, zero), worst))
+            self.evaluate_positions(emit, memory, emit.divide(x, emit.load(work, lanes.UNIT)))
+            is_valid, a = self._accelerations(emit, work, memory)
+            defect = builder.select(is_valid, self.compute_defect(emit, control, memory, a), emit.constant(math.inf))
+            new.append(emit.maximum_or_nan(builder.select(is_inside, defect, zero), max_defect))
         emit.store(new[0], work, lanes.WORST)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
         is_last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
@@ -608,95 +619,97 @@ class LaneCode(LaneSteps):
 
     def approach(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Correct the positions NEW once in lanes with FINE = 1; store in FINE and LEFT_TO_MOVE where this succeeds."""
-        active, _ = self._project(
-            emit, self.equations.position_projection, lanes.FINE, self.places(emit, order, control, work)
+        is_active, _ = self._project(
+            emit, self.equations.position_projection, lanes.FINE, self.memory(emit, order, control, work)
         )
         for field in (lanes.FINE, lanes.LEFT_TO_MOVE):
-            store_mask(emit, work, field, active)
+            store_mask(emit, work, field, is_active)
         emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
 
     def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Project NEW once in lanes with LEFT_TO_MOVE = 1; store a, lam, FINE (converged) and LEFT_TO_MOVE."""
-        builder, at = emit.builder, self.places(emit, order, control, work)
-        fine, moves = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
-        active, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, at)
+        builder, memory = emit.builder, self.memory(emit, order, control, work)
+        is_fine, is_unfinished = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
+        is_active, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, memory)
         largest = emit.constant(0.0)
         for j in range(self.n):
-            largest = emit.larger(emit.function("fabs", emit.load(at.new, j)), largest)
+            largest = emit.maximum(emit.function("fabs", emit.load(memory.new, j)), largest)
         tolerance = emit.multiply(emit.constant(RELATIVE_CORRECTION), largest)
-        tolerance = emit.larger(tolerance, emit.constant(ABSOLUTE_CORRECTION))
-        converged = builder.both(active, builder.compare("fcmp ole", moved, tolerance))
+        tolerance = emit.maximum(tolerance, emit.constant(ABSOLUTE_CORRECTION))
+        converged = builder.bitwise_and(is_active, builder.compare("fcmp ole", moved, tolerance))
         limit = emit.multiply(emit.constant(CONTRACTION), emit.load(work, lanes.MOVED_BEFORE))
-        continues = builder.both(active, builder.compare("fcmp ole", moved, limit))
-        continues = builder.both(continues, builder.compare("fcmp ogt", moved, tolerance))
-        emit.store(emit.larger(moved, tolerance), work, lanes.MOVED_BEFORE)
-        store_mask(emit, work, lanes.LEFT_TO_MOVE, continues)
-        has_finished = builder.operation("xor", fine, builder.both(fine, moves))
+        is_continued = builder.bitwise_and(is_active, builder.compare("fcmp ole", moved, limit))
+        is_continued = builder.bitwise_and(is_continued, builder.compare("fcmp ogt", moved, tolerance))
+        emit.store(emit.maximum(moved, tolerance), work, lanes.MOVED_BEFORE)
+        store_mask(emit, work, lanes.LEFT_TO_MOVE, is_continued)
+        has_finished = builder.operation("xor", is_fine, builder.bitwise_and(is_fine, is_unfinished))
         store_mask(emit, work, lanes.FINE, builder.operation("or", has_finished, converged))
 
-    def _project(self, emit: LaneEmitter, outputs: Program, field: int, at: Places) -> tuple[Value, Value]:
+    def _project(self, emit: LaneEmitter, outputs: Program, field: int, memory: LaneMemory) -> tuple[Value, Value]:
         """Correct NEW by a projection program, in the lanes in which the field `field` is 1.
 
         Return a mask of the lanes whose correction is valid, and the largest change of a position in each lane.
         """
-        select, work = emit.builder.select, at.work
-        inputs = self._new_state(emit, work, at)
-        lowering, arrays = lower(emit, outputs, inputs, self.numbers)
+        select, work = emit.builder.select, memory.work
+        inputs = self._new_state(emit, work, memory)
+        lowering, arrays = lower_program(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
-        active = emit.builder.both(is_set(emit, work, field), lowering.holds(outputs, arrays[0]))
+        is_active = emit.builder.bitwise_and(is_set(emit, work, field), lowering.is_valid(outputs, arrays[0]))
         largest = emit.constant(0.0)
         for value in values["moved"]:
-            largest = emit.larger(emit.function("fabs", value), largest)
+            largest = emit.maximum(emit.function("fabs", value), largest)
         for k, value in enumerate([*values["q"], *values.get("v", [])]):
-            emit.store(select(active, value, inputs[1 + k]), at.new, k)
-        for base, name in ((at.a, "a"), (at.lam, "lam")):
+            emit.store(select(is_active, value, inputs[1 + k]), memory.new, k)
+        for base, name in ((memory.a, "a"), (memory.lam, "lam")):
             for k, value in enumerate(values.get(name, [])):
-                emit.store(select(active, value, emit.load(base, k)), base, k)
-        return active, largest
+                emit.store(select(is_active, value, emit.load(base, k)), base, k)
+        return is_active, largest
 
     def accelerate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store the accelerations at the state NEW and the time AHEAD; clear FINE in lanes where they are invalid."""
-        at = self.places(emit, order, control, work)
-        holds, a = self._accelerations(emit, work, at)
+        memory = self.memory(emit, order, control, work)
+        is_valid, a = self._accelerations(emit, work, memory)
         for k, value in enumerate(a):
-            emit.store(value, at.a, k)
-        clear_fine_unless(emit, work, holds)
+            emit.store(value, memory.a, k)
+        clear_fine_unless(emit, work, is_valid)
 
-    def _accelerations(self, emit: LaneEmitter, work: Value, at: Places) -> tuple[Value, list[Value]]:
-        a, holds = write_accelerations(emit, self.equations, self._new_state(emit, work, at), self.numbers)
-        return holds, a
+    def _accelerations(self, emit: LaneEmitter, work: Value, memory: LaneMemory) -> tuple[Value, list[Value]]:
+        a, is_valid = write_accelerations(emit, self.equations, self._new_state(emit, work, memory), self.numbers)
+        return is_valid, a
 
-    def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return the mask `changed_orientation`; None for series, whose defects reveal passed singular positions."""
+    def singular_passage_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
+        """Return `orientation_change_mask` for the step; None for series, whose defects reveal singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
-        return changed_orientation(emit, *(self._rows(emit, at, time, base) for time, base in self._ends_of_step(at)))
+        return orientation_change_mask(
+            emit, *(self._row_values(emit, memory, time, base) for time, base in self._ends_of_step(memory))
+        )
 
-    def _ends_of_step(self, at: Places) -> list[tuple[int, Value]]:
-        return [(lanes.T, at.state), (lanes.AHEAD, at.new)]
+    def _ends_of_step(self, memory: LaneMemory) -> list[tuple[int, Value]]:
+        return [(lanes.T, memory.state), (lanes.AHEAD, memory.new)]
 
-    def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
+    def _row_values(self, emit: LaneEmitter, memory: LaneMemory, time: int, base: Value) -> list[dict[int, Value]]:
         """Return the nonzero entries of each row of G, by column; `time`: field of t; `base`: pointer to the state."""
-        inputs = [emit.load(at.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
-        _, (entries,) = lower(emit, self._rows_at, inputs, self.numbers)
+        inputs = [emit.load(memory.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
+        _, (entries,) = lower_program(emit, self._row_program, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
-        for (k, j), value in zip(self._entries, entries, strict=True):
+        for (k, j), value in zip(self._row_entries, entries, strict=True):
             rows[k][j] = value
         return rows
 
     def stages(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store NEW and ERROR, computed by the stages of an explicit step."""
-        assert self.explicit is not None
-        self.explicit.write(emit, (order, control, work), self.places(emit, order, control, work))
+        assert self.stage_generator is not None
+        self.stage_generator.write(emit, (order, control, work), self.memory(emit, order, control, work))
 
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Clear FINE in the lanes in which NEW violates a redundant constraint."""
-        at, outputs = self.places(emit, order, control, work), self.equations.redundant_rows
-        lowering, (no_values,) = lower(emit, outputs, self._new_state(emit, work, at), self.numbers)
-        clear_fine_unless(emit, work, lowering.holds(outputs, no_values))
+        memory, outputs = self.memory(emit, order, control, work), self.equations.redundant_rows
+        lowering, (no_values,) = lower_program(emit, outputs, self._new_state(emit, work, memory), self.numbers)
+        clear_fine_unless(emit, work, lowering.is_valid(outputs, no_values))
 
-    def _new_state(self, emit: LaneEmitter, work: Value, at: Places) -> list[Value]:
-        return [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
+    def _new_state(self, emit: LaneEmitter, work: Value, memory: LaneMemory) -> list[Value]:
+        return [emit.load(work, lanes.AHEAD), *(emit.load(memory.new, i) for i in range(2 * self.n))]
 
 
 class LaneConstraints(LaneSteps):
@@ -724,36 +737,36 @@ class LaneConstraints(LaneSteps):
 
     def __init__(self, system: ConstrainedSystem, parameters: Any):
         super().__init__(system.n_q, system.n_c)
-        equations, self.numbers = Equations(system, parameters), Coefficients(apart=True)
-        G, self._graph = equations.of("jacobian"), equations.graph
+        equations, self.numbers = Equations(system, parameters), Coefficients(separate_varying=True)
+        G, self._graph = equations.expressions("jacobian"), equations.graph
         columns = [[j for j, entry in enumerate(row) if not is_zero(entry)] for row in G]
         begins = np.cumsum([len(columns) + 1, *map(len, columns)])
         self.pattern = np.array([*begins, *chain(*columns)], dtype=np.int64)
         entries = [G[i, j] for i, row in enumerate(columns) for j in row]
-        values = {kind: list(equations.of(kind)) for kind in ("constraint", "constraint_rate")}
-        self._rows = Program(self._graph, {**values, "entries": entries})
-        description = self.n, self.pattern.tolist(), *self.numbers.structure(self._rows)
+        values = {kind: list(equations.expressions(kind)) for kind in ("constraint", "constraint_rate")}
+        self._program = Program(self._graph, {**values, "entries": entries})
+        description = self.n, self.pattern.tolist(), *self.numbers.structure(self._program)
         self.structure = hashlib.sha256(repr(description).encode()).hexdigest()
-        self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities())
+        self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._program.quantities())
 
     def rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store C, C_t and the entries of C_q, at the state NEW and the time AHEAD, in the memory `Places.series`."""
-        at = self.places(emit, order, control, work)
-        inputs = [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
-        lowering, arrays = lower(emit, self._rows, inputs, self.numbers)
+        memory = self.memory(emit, order, control, work)
+        inputs = [emit.load(work, lanes.AHEAD), *(emit.load(memory.new, i) for i in range(2 * self.n))]
+        lowering, arrays = lower_program(emit, self._program, inputs, self.numbers)
         values = [value for array in arrays for value in array]
         for k, value in enumerate(values):
-            emit.store(value, at.series, k)
-        clear_fine_unless(emit, work, lowering.holds(self._rows, values))
+            emit.store(value, memory.series, k)
+        clear_fine_unless(emit, work, lowering.is_valid(self._program, values))
 
 
-BUILD_SECONDS = 3e-4  # estimated time to compile the operation of one quantity, s
-ELIMINATION = (elimination, null_space, compile_equations)  # modules that write the code of accelerations
+SECONDS_PER_QUANTITY = 3e-4  # estimated time to compile the operation of one quantity, s
+ELIMINATION_MODULES = (elimination, null_space, compile_equations)  # modules that write the code of accelerations
 # modules that write the code: cached code is invalid after a change of one of them
-WRITERS = (series, *ELIMINATION, program, lane_series, llvm_code, llvm_text)
+CODE_MODULES = (series, *ELIMINATION_MODULES, program, lane_series, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)
-KIND = "lanes"  # first part of the names of cached files
+FILE_PREFIX = "lanes"  # first part of the names of cached files
 
 
 class GeneratedLanes(Generic[Code]):
@@ -766,14 +779,14 @@ class GeneratedLanes(Generic[Code]):
     code : LaneCode or LaneConstraints
     """
 
-    def __init__(self, record: ParameterTape, code: Code):
-        self.record = record
+    def __init__(self, tape: ParameterTape, code: Code):
+        self.tape = tape
         self.code: Code = code
 
     @cached_property
     def functions(self) -> GeneratedFunctions:
         """Return the compiled functions; the first use compiles them, or reads them from the disk."""
-        return generated_functions(KIND, _stamp(), self.code.structure, self._module_text)
+        return generated_functions(FILE_PREFIX, _stamp(), self.code.structure, self._module_text)
 
     def _module_text(self) -> tuple[list[str], str]:
         module = Module()
@@ -784,13 +797,13 @@ class GeneratedLanes(Generic[Code]):
     @property
     def seconds_to_build(self) -> float:
         """Return the estimated time to compile the code, s; 0 if the code is in memory or on the disk."""
-        if are_cached(KIND, _stamp(), self.code.structure):
+        if are_cached(FILE_PREFIX, _stamp(), self.code.structure):
             return 0.0
-        return BUILD_SECONDS * self.code.n_quantities
+        return SECONDS_PER_QUANTITY * self.code.n_quantities
 
-    def numbers(self, parameters: Array) -> Array:
+    def coefficients_for(self, parameters: Array) -> Array:
         """Return the coefficients (n_runs, n_numbers) that vary between runs, for parameters (n_runs, n_p)."""
-        return self.code.numbers.for_parameters(self.record, parameters)
+        return self.code.numbers.values_for(self.tape, parameters)
 
 
 @cache
@@ -799,4 +812,4 @@ def _stamp() -> str:
     from twoloop.kernels.data import common
 
     kernels = ("lanes.control", "control.step_size")
-    return digest_of("".join(map(common.source_digest, kernels)), __file__, *WRITERS)
+    return digest_of("".join(map(common.source_digest, kernels)), __file__, *CODE_MODULES)

@@ -12,10 +12,10 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from twoloop.generate.elimination import Solution
-from twoloop.generate.llvm_code import FUNCTIONS, INTRINSICS, Emitter, Quantities, lower, sine_and_cosine
+from twoloop.generate.llvm_code import FUNCTIONS, INTRINSICS, Emitter, Quantities, lower_program, sine_and_cosine
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Builder, Value, integer, undefined, vector_of
 from twoloop.generate.program import Coefficient, Coefficients, Terms
-from twoloop.generate.series import SeriesProgram, Sums, Table
+from twoloop.generate.series import OperationGroups, SeriesProgram, Sums
 from twoloop.kernels.data.collocation import LANES as STAGES
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
@@ -31,9 +31,9 @@ from twoloop.kernels.lanes.layout import LANES
 
 # polynomials for log2 on [1, 2] and 2^x on [-1/2, 1/2]: coefficients, lowest power first, by least squares at Chebyshev
 # points. The errors of the polynomials, 2e-06 and 1e-07, are small enough for step sizes
-LOG2 = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
-EXP2 = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
-LARGEST_POWER, SMALLEST = 1000.0, 1e-300  # largest |x| in 2^x, and smallest argument of log2: others would overflow
+LOG2_COEFFICIENTS = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
+EXP2_COEFFICIENTS = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
+MAX_EXPONENT, MIN_ARGUMENT = 1000.0, 1e-300  # largest |x| in 2^x, and smallest argument of log2: others would overflow
 
 
 class LaneEmitter(Emitter):
@@ -44,33 +44,33 @@ class LaneEmitter(Emitter):
     def __init__(self, builder: Builder, lanes: int = LANES):
         super().__init__(builder)
         self.lanes, self.suffix = lanes, f"v{lanes}f64" if lanes > 1 else Emitter.suffix
-        self.double, self.whole_number, self.bit = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
+        self.double_type, self.integer_type, self.bit_type = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
 
-    def like(self, builder: Builder) -> "LaneEmitter":
+    def for_builder(self, builder: Builder) -> "LaneEmitter":
         """Return an emitter with the same number of lanes that writes to another function, that of `builder`."""
         return LaneEmitter(builder, self.lanes)
 
-    def splat(self, value: Value) -> Value:
+    def broadcast(self, value: Value) -> Value:
         """Return a vector with the number `value` in all lanes."""
         if self.lanes == 1:
             return value
         vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)
-        return self.builder.first_everywhere(vector)
+        return self.builder.broadcast_first(vector)
 
-    def far(self, value: float) -> Value:
-        """Return a vector with the number `value` in all lanes, loaded just before its use, see `Builder.far`."""
-        return self.splat(super().far(value))
+    def load_constant(self, value: float) -> Value:
+        """Return a vector with the number `value` in all lanes, loaded from memory just before its use."""
+        return self.broadcast(super().load_constant(value))
 
     def coefficient(self, number: float) -> Value:
         """Return a literal or loaded Coefficient: with a value for each lane if it varies, else one for all lanes."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
-        pointer = self.builder.gep(self.constants, integer(number.place))
-        return self.splat(self.builder.load(pointer, constant=True))
+        pointer = self.builder.gep(self.constants, integer(number.index))
+        return self.broadcast(self.builder.load(pointer, constant=True))
 
-    def number(self, whole: Value) -> Value:
+    def to_double(self, whole: Value) -> Value:
         """Return a vector with the integer `whole`, converted to double, in all lanes."""
-        return self.splat(super().number(whole))
+        return self.broadcast(super().to_double(whole))
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
         """Return the pointer `base` advanced by the sum of `places`, counted in vectors."""
@@ -83,18 +83,18 @@ class LaneEmitter(Emitter):
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
         """Return vector number `place` of the array at `base`, loaded from memory."""
-        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*")
+        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double_type}*")
         return self.builder.load(pointer, constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
         """Store `value` as vector number `place` of the array at `base`."""
-        self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*"))
+        self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double_type}*"))
 
     def function(self, name: str, x: Value) -> Value:
         """Return f(x) in each lane, by one LLVM intrinsic for all lanes, or by a function of libm lane by lane."""
         if name in INTRINSICS:
             return super().function(name, x)
-        result, scalar = undefined(self.double), Emitter(self.builder)
+        result, scalar = undefined(self.double_type), Emitter(self.builder)
         for lane in range(self.lanes):
             result = self.builder.insert(result, scalar.function(name, self.builder.extract(x, lane)), lane)
         return result
@@ -104,37 +104,42 @@ class LaneEmitter(Emitter):
         width = self.lanes
         while width > 2:
             width //= 2
-            x = self.larger(*(self.builder.shuffle(x, x, range(k, k + width)) for k in (0, width)))
-        return x if width == 1 else self.larger(*(self.builder.extract(x, k) for k in (0, 1)))
+            x = self.maximum(*(self.builder.shuffle(x, x, range(k, k + width)) for k in (0, width)))
+        return x if width == 1 else self.maximum(*(self.builder.extract(x, k) for k in (0, 1)))
 
     def logarithm(self, x: Value) -> Value:
-        """Return log2 x for x >= 0 with an error below 1e-4; below SMALLEST, return the value at SMALLEST."""
+        """Return log2 x for x >= 0 with an error below 1e-4; below MIN_ARGUMENT, return the value at MIN_ARGUMENT."""
         builder = self.builder
-        bits = builder.convert("bitcast", self.larger(x, self.constant(SMALLEST)), self.whole_number)
-        exponent = builder.sub(builder.operation("lshr", bits, self.whole(52)), self.whole(1023))
-        mantissa = builder.operation("or", builder.both(bits, self.whole((1 << 52) - 1)), self.whole(1023 << 52))
+        bits = builder.convert("bitcast", self.maximum(x, self.constant(MIN_ARGUMENT)), self.integer_type)
+        exponent = builder.sub(builder.operation("lshr", bits, self.integer_constant(52)), self.integer_constant(1023))
+        mantissa = builder.operation(
+            "or", builder.bitwise_and(bits, self.integer_constant((1 << 52) - 1)), self.integer_constant(1023 << 52)
+        )
         return self.add(
-            builder.convert("sitofp", exponent, self.double),
-            self.polynomial(LOG2, builder.convert("bitcast", mantissa, self.double)),
+            builder.convert("sitofp", exponent, self.double_type),
+            self.polynomial(LOG2_COEFFICIENTS, builder.convert("bitcast", mantissa, self.double_type)),
         )
 
     def exponential(self, x: Value) -> Value:
         """Return 2^x with a relative error below 1e-4."""
         builder = self.builder
-        x = self.larger(self.smaller(x, self.constant(LARGEST_POWER)), self.constant(-LARGEST_POWER))
+        x = self.maximum(self.minimum(x, self.constant(MAX_EXPONENT)), self.constant(-MAX_EXPONENT))
         whole = self.function("rint", x)
         bits = builder.operation(
-            "shl", builder.add(builder.convert("fptosi", whole, self.whole_number), self.whole(1023)), self.whole(52)
+            "shl",
+            builder.add(builder.convert("fptosi", whole, self.integer_type), self.integer_constant(1023)),
+            self.integer_constant(52),
         )
         return self.multiply(
-            builder.convert("bitcast", bits, self.double), self.polynomial(EXP2, self.subtract(x, whole))
+            builder.convert("bitcast", bits, self.double_type),
+            self.polynomial(EXP2_COEFFICIENTS, self.subtract(x, whole)),
         )
 
-    def smallest_of(self, a: Value, b: Value) -> Value:
+    def minimum_or_nan(self, a: Value, b: Value) -> Value:
         """Return the smaller of a and b, or a if one of the two is NaN: if a is NaN, the result is NaN."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
-    def largest_of(self, a: Value, b: Value) -> Value:
+    def maximum_or_nan(self, a: Value, b: Value) -> Value:
         """Return the larger of a and b, or a if one of the two is NaN: if a is NaN, the result is NaN."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
@@ -157,14 +162,14 @@ def store_lanes(emit: LaneEmitter, value: Value, base: Value, place: int = 0) ->
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
     """Return the sum of the elements of a, and that of b; both are computed by the same instructions."""
     builder, half = emit.builder, STAGES // 2
-    lower, upper = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
-    total = emit.add(builder.shuffle(a, b, lower), builder.shuffle(a, b, upper))
+    lower_half, upper_half = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
+    total = emit.add(builder.shuffle(a, b, lower_half), builder.shuffle(a, b, upper_half))
     for distance in (2, 1):
         total = emit.add(total, builder.shuffle(total, total, [k ^ distance for k in range(STAGES)]))
     return [builder.extract(total, k) for k in (0, half)]
 
 
-def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
+def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
     """Return the elements number `lane` of all `vectors` as one vector; of a single vector, return this element."""
     builder, indices = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
@@ -182,15 +187,15 @@ def loop_over(
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
     """Return a context for a loop over `coordinates`: it yields k, coordinates[k], and the lists of `Emitter.loop`."""
     builder = emit.builder
-    table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.table(coordinates)
+    table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.add_table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
         i = k if table is None else builder.convert("sext", builder.load(builder.gep(table, k), 4), INTEGER)
         yield k, i, values, new
 
 
-ZEROS = -1  # order of a row of factors that are all zero, which is stored before the row of order 0
+ZERO_ROW = -1  # order of the row of zeros, which is stored before the row of order 0
 # largest number of sums in one loop, so that the totals fit into the registers: 32 of eight doubles, or 16 of four
-SUMS_IN_LOOP = 12 if LANES == 8 else 6
+MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
 class Operation(NamedTuple):
@@ -212,52 +217,54 @@ class LaneSeries:
 
     def __init__(self, program: SeriesProgram, solution: Solution, numbers: Coefficients, n: int, n_rows: int):
         self.solution, self.numbers, self.n, self.n_rows = solution, numbers, n, n_rows
-        self.slots: dict[Any, int] = {}
-        self._divisors: dict[int, int] = {}
+        self.factor_indices: dict[Any, int] = {}
+        self._divisor_indices: dict[int, int] = {}
         first_result = 1 + 3 * n + n_rows
-        self.early = self._operations(program.early, first_result)
-        self.late = self._operations(program.late, first_result + len(program.early.first.column))
-        self.rows = self._rows(program.rows, program.row_places)
-        self.balance = self._rows(program.balance, program.balance_places)
+        self.early = self._make_operations(program.early, first_result)
+        self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
+        self.rows = self._row_expressions(program.rows, program.row_indices)
+        self.balance = self._row_expressions(program.balance, program.balance_indices)
         # factors of the sums that are carried over, by product; `_factors`, which `_shared_sums` calls, reads this dict
-        self._carried: dict[int, tuple[int, int]] = {}
-        self._carried |= self._shared_sums()
-        self.sums_ahead = sorted(set(self._carried.values()))
+        self._carried_sums: dict[int, tuple[int, int]] = {}
+        self._carried_sums |= self._shared_sums()
+        self.carried_pairs = sorted(set(self._carried_sums.values()))
         for operation in (*self.early, *self.late):
             self._factors(operation)
             if operation.kind in (SQUARE_ROOT, LOGARITHM, ARCTANGENT):
-                self._divisors[operation.results[0]] = len(self._divisors)
-        self.r = solution.n_stored
-        self.divisors = self.r + n
-        self.carried = self.divisors + len(self._divisors)
-        self.width = len(self.slots)
-        self.zeros = self.carried + len(self.sums_ahead)
-        self.table = self.zeros + self.width
+                self._divisor_indices[operation.results[0]] = len(self._divisor_indices)
+        self.rhs_offset = solution.n_stored
+        self.divisor_offset = self.rhs_offset + n
+        self.carried_offset = self.divisor_offset + len(self._divisor_indices)
+        self.row_length = len(self.factor_indices)
+        self.zero_row_offset = self.carried_offset + len(self.carried_pairs)
+        self.row_0_offset = self.zero_row_offset + self.row_length
 
     def scratch_size(self, order: int) -> int:
         """Return the length of `scratch`, in vectors, for a series up to `order`."""
-        return self.table + self.width * (order + 1)
+        return self.row_0_offset + self.row_length * (order + 1)
 
     @property
     def structure(self) -> list[Any]:
         """Return the data on which the code depends, for a digest."""
-        return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.slots]
+        return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
-    def _forms(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
+    def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
-        for row, i, c in zip(sums.row.tolist(), sums.more_column.tolist(), sums.more_coefficient.tolist(), strict=True):
+        for row, i, c in zip(
+            sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
+        ):
             more[row].append((i, c))
         first_terms = zip(rows, sums.column.tolist(), sums.coefficient.tolist(), sums.constant.tolist(), strict=True)
         return [
-            self.numbers.of(tuple(term for term in ((i, c), *more[row]) if term[1] != 0.0), constant)
+            self.numbers.indexed_terms(tuple(term for term in ((i, c), *more[row]) if term[1] != 0.0), constant)
             for row, i, c, constant in first_terms
         ]
 
-    def _rows(self, sums: Sums, places: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        return list(zip(places.tolist(), self._forms(sums, places.tolist()), strict=True))
+    def _row_expressions(self, sums: Sums, places: Any) -> list[tuple[int, tuple[Terms, float]]]:
+        return list(zip(places.tolist(), self._expressions(sums, places.tolist()), strict=True))
 
-    def _operations(self, table: Table, quantity: int) -> list[Operation]:
-        firsts, seconds = (self._forms(each, range(len(each.column))) for each in (table.first, table.second))
+    def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
+        firsts, seconds = (self._expressions(each, range(len(each.column))) for each in (table.first, table.second))
         operations = []
         for kind, begin, end in table.groups[:, :3].tolist():
             count = (end - begin) // 2 if kind == SINE else end - begin
@@ -266,12 +273,12 @@ class LaneSeries:
                 operations.append(Operation(kind, results, firsts[k], seconds[k]))
         return operations
 
-    def _slot(self, *key: Any) -> int:
+    def _factor_index(self, *key: Any) -> int:
         """Return the index of a factor in a row.
 
         `key` is (terms, constant), or ("scaled", terms, constant) for this factor multiplied by the order.
         """
-        return self.slots.setdefault(key, len(self.slots))
+        return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
         """Return the factors of the sums that products (cos x) x' and (sin x) x' share with recurrences of sin and cos.
@@ -295,82 +302,82 @@ class LaneSeries:
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
         """Return the indices in a row of the factors X and Y in the recurrence of each result of an operation."""
         kind, results, first, second = operation
-        if results[0] in self._carried:
+        if results[0] in self._carried_sums:
             return []
         if kind in (PRODUCT, PENDING):
-            return [(self._slot(*first), self._slot(*second))]
+            return [(self._factor_index(*first), self._factor_index(*second))]
         if kind in (LOGARITHM, ARCTANGENT):
-            return [(self._slot("scaled", ((results[0], 1.0),), 0.0), self._slot(*second))]
-        result_slots = [self._slot(((result, 1.0),), 0.0) for result in results]
+            return [(self._factor_index("scaled", ((results[0], 1.0),), 0.0), self._factor_index(*second))]
+        result_indices = [self._factor_index(((result, 1.0),), 0.0) for result in results]
         if kind == RECIPROCAL:
-            return [(self._slot(*first), result_slots[0])]
+            return [(self._factor_index(*first), result_indices[0])]
         if kind == SQUARE_ROOT:
-            return [(result_slots[0], result_slots[0])]
-        x = self._slot("scaled", *first)
-        return [(x, result_slots[1]), (x, result_slots[0])] if kind == SINE else [(x, result_slots[0])]
+            return [(result_indices[0], result_indices[0])]
+        x = self._factor_index("scaled", *first)
+        return [(x, result_indices[1]), (x, result_indices[0])] if kind == SINE else [(x, result_indices[0])]
 
-    def begin(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
+    def write_order_0(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
         """Write code for order 0 at `inputs`, [t, q, v]; `scratch` already has the factors of the linear equations."""
-        for place in (*range(self.r, self.divisors), *range(self.carried, self.table)):
+        for place in (*range(self.rhs_offset, self.divisor_offset), *range(self.carried_offset, self.row_0_offset)):
             emit.store(emit.constant(0.0), scratch, place)
-        row = _Row(self, emit, emit.pointer(scratch, self.table))
+        row = _Row(self, emit, emit.pointer(scratch, self.row_0_offset))
         quantities = Quantities(emit, lambda i: inputs[i])
-        self._begin(emit, quantities, self.early, row, scratch)
-        self._begin(emit, quantities, self.late, row, scratch)
-        for place, form in self.balance:
-            emit.store(quantities.sum(*form), scratch, self.r + place)
+        self._write_order_0(emit, quantities, self.early, row, scratch)
+        self._write_order_0(emit, quantities, self.late, row, scratch)
+        for place, expr in self.balance:
+            emit.store(quantities.sum(*expr), scratch, self.rhs_offset + place)
 
-    def order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
+    def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
         """Write code for order k > 0: it stores the coefficients k + 1 of q in `out`, and the factors in `scratch`."""
         builder, n = emit.builder, self.n
         next_order = builder.add(k, integer(1))
         q = emit.pointer(out, builder.mul(k, integer(n)))
-        order, zero = emit.number(k), emit.constant(0.0)
+        order, zero = emit.to_double(k), emit.constant(0.0)
         is_first = builder.compare("icmp eq", k, integer(1))
         time_coefficient = builder.select(is_first, unit, zero)
         quantities = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time_coefficient)
-        row = _Row(self, emit, self._row(emit, scratch, k))
+        row = _Row(self, emit, self._row_pointer(emit, scratch, k))
         per_order = emit.divide(emit.constant(1.0), order)
-        first_row = self._row(emit, scratch, builder.select(is_first, integer(ZEROS), integer(1)))
-        row_before = _Row(self, emit, self._row(emit, scratch, builder.sub(k, integer(1))))
-        sums = self._sums(emit, scratch, k)
-        edges = _Edges(sums, first_row, self._row(emit, scratch, integer(1)), row_before)
-        self._operate(emit, quantities, self.early, row, scratch, edges, order, per_order)
-        next_sums = {pair: edges.next_sum(pair, row) for pair in self.sums_ahead}
-        for place, pair in enumerate(self.sums_ahead):
-            emit.store(next_sums[pair], scratch, self.carried + place)
+        first_row = self._row_pointer(emit, scratch, builder.select(is_first, integer(ZERO_ROW), integer(1)))
+        row_before = _Row(self, emit, self._row_pointer(emit, scratch, builder.sub(k, integer(1))))
+        sums = self._write_sums(emit, scratch, k)
+        partial_sums = _PartialSums(sums, first_row, self._row_pointer(emit, scratch, integer(1)), row_before)
+        self._write_order(emit, quantities, self.early, row, scratch, partial_sums, order, per_order)
+        next_sums = {pair: partial_sums.sum_of_next_order(pair, row) for pair in self.carried_pairs}
+        for place, pair in enumerate(self.carried_pairs):
+            emit.store(next_sums[pair], scratch, self.carried_offset + place)
         per_unit = emit.divide(emit.constant(1.0), unit)
-        for result, pair in self._carried.items():
+        for result, pair in self._carried_sums.items():
             quantities.define(result, emit.multiply(per_unit, next_sums[pair]))
-        minus_rate = emit.negative(emit.divide(order, unit))
+        minus_rate = emit.negate(emit.divide(order, unit))
         c = [zero] * self.n_rows
         for place, (terms, _) in self.rows:
             c[place] = emit.multiply(minus_rate, quantities.sum(terms))
-        r = [emit.load(scratch, self.r + i) for i in range(n)]
+        r = [emit.load(scratch, self.rhs_offset + i) for i in range(n)]
         stored = [emit.load(scratch, i) for i in range(self.solution.n_stored)]
         solution = self.solution
-        _, (a, lam) = lower(emit, solution.solved, [*r, *c, *stored], self.numbers)
-        per_v, per_q = emit.multiply(unit, per_order), emit.divide(unit, emit.number(next_order))
-        before = Quantities(emit, lambda i: zero)  # values at order k - 1: a and lam; 0 for other quantities
+        _, (a, lam) = lower_program(emit, solution.solution_program, [*r, *c, *stored], self.numbers)
+        per_v, per_q = emit.multiply(unit, per_order), emit.divide(unit, emit.to_double(next_order))
+        previous = Quantities(emit, lambda i: zero)  # values at order k - 1: a and lam; 0 for other quantities
         for j in range(n):
             v = emit.multiply(per_v, a[j])
             quantities.define(1 + n + j, v)
             emit.store(emit.multiply(per_q, v), emit.pointer(out, builder.mul(next_order, integer(n))), j)
-            before.define(1 + 2 * n + j, a[j])
+            previous.define(1 + 2 * n + j, a[j])
         for i in range(self.n_rows):
-            before.define(1 + 3 * n + i, lam[i])
-        for operations, values, into in ((self.early, quantities, row), (self.late, before, row_before)):
+            previous.define(1 + 3 * n + i, lam[i])
+        for operations, values, target_row in ((self.early, quantities, row), (self.late, previous, row_before)):
             for operation in operations:
-                if operation.kind == PENDING and operation.results[0] not in self._carried:
-                    into.store(operation.second, values.sum(operation.second[0]))
-        self._operate(emit, quantities, self.late, row, scratch, edges, order, per_order)
+                if operation.kind == PENDING and operation.results[0] not in self._carried_sums:
+                    target_row.store(operation.second, values.sum(operation.second[0]))
+        self._write_order(emit, quantities, self.late, row, scratch, partial_sums, order, per_order)
         for place, (terms, _) in self.balance:
-            emit.store(quantities.sum(terms), scratch, self.r + place)
+            emit.store(quantities.sum(terms), scratch, self.rhs_offset + place)
 
-    def _row(self, emit: LaneEmitter, scratch: Value, order: Value) -> Value:
-        return emit.pointer(scratch, self.table, emit.builder.mul(order, integer(self.width)))
+    def _row_pointer(self, emit: LaneEmitter, scratch: Value, order: Value) -> Value:
+        return emit.pointer(scratch, self.row_0_offset, emit.builder.mul(order, integer(self.row_length)))
 
-    def _begin(
+    def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
         """Write code for the results of operations at order 0; store those of their factors in `row` that are known."""
@@ -381,7 +388,7 @@ class LaneSeries:
             row.store(first, x, "if used")
             divisor = None
             if kind == PENDING:
-                if operations is self.early and results[0] not in self._carried:
+                if operations is self.early and results[0] not in self._carried_sums:
                     row.store(second, quantities.sum(*second))
                 values = [zero]
             elif kind == PRODUCT:
@@ -403,30 +410,33 @@ class LaneSeries:
                 scaled = (((results[0], 1.0),), 0.0) if kind in (LOGARITHM, ARCTANGENT) else first
                 row.store(("scaled", *scaled), zero)
             if divisor is not None:
-                emit.store(emit.divide(one, divisor), scratch, self.divisors + self._divisors[results[0]])
+                emit.store(emit.divide(one, divisor), scratch, self.divisor_offset + self._divisor_indices[results[0]])
             for result, value in zip(results, values, strict=True):
                 quantities.define(result, value)
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
-    def _sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Return a dict of sums over 1 < j < k; its keys are (indices of the factors X and Y, whether for order k + 1).
+    def _write_sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
+        """Return a dict of sums over 1 < j < k. Keys: (indices of the factors X and Y, whether it is for order k + 1).
 
-        The value for (pair, False) is the sum of X[j] Y[k - j], for (pair, True) that of X[j] Y[k + 1 - j]. `_Edges`
-        adds the first and last terms when they are known. So one loop computes several sums, does not wait for the
-        previous order, and loads each row once.
+        The value for (pair, False) is the sum of X[j] Y[k - j], for (pair, True) that of X[j] Y[k + 1 - j]. The first
+        and last terms, which are known later, are added by `_PartialSums`. So one loop computes several sums, does not
+        wait for the previous order, and loads each row once.
         """
         builder = emit.builder
-        keys = [(pair, True) for pair in self.sums_ahead]
+        keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
-        keys += [(pair, False) for pair in pairs - set(self.sums_ahead)]
+        keys += [(pair, False) for pair in pairs - set(self.carried_pairs)]
         keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours often share a factor
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
         next_order = builder.add(k, integer(1))
-        for begin in range(0, len(keys), SUMS_IN_LOOP):
-            group = keys[begin : begin + SUMS_IN_LOOP]
+        for begin in range(0, len(keys), MAX_SUMS_IN_LOOP):
+            group = keys[begin : begin + MAX_SUMS_IN_LOOP]
             with emit.loop(integer(2), k, [emit.constant(0.0)] * len(group)) as (j, totals, new):
-                up, down = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(next_order, j))
-                row_before = self._row(emit, scratch, builder.sub(j, integer(1)))
+                up, down = (
+                    self._row_pointer(emit, scratch, j),
+                    self._row_pointer(emit, scratch, builder.sub(next_order, j)),
+                )
+                row_before = self._row_pointer(emit, scratch, builder.sub(j, integer(1)))
                 loaded: dict[tuple[Value, int], Value] = {}
                 for ((x, y), for_next_order), total in zip(group, totals, strict=True):
                     places = ((up, x), (down, y)) if for_next_order else ((down, x), (row_before, y))
@@ -437,14 +447,14 @@ class LaneSeries:
             sums |= dict(zip(group, new, strict=True))
         return sums
 
-    def _operate(
+    def _write_order(
         self,
         emit: LaneEmitter,
         quantities: Quantities,
         operations: list[Operation],
         row: "_Row",
         scratch: Value,
-        edges: "_Edges",
+        partial_sums: "_PartialSums",
         order: Value,
         inverse: Value,
     ) -> None:
@@ -452,14 +462,14 @@ class LaneSeries:
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:
-            if pair in self.sums_ahead:
-                sums[pair] = emit.load(scratch, self.carried + self.sums_ahead.index(pair))
+            if pair in self.carried_pairs:
+                sums[pair] = emit.load(scratch, self.carried_offset + self.carried_pairs.index(pair))
             else:
-                sums[pair] = edges.now(pair)
-        row_0 = emit.pointer(scratch, self.table)
+                sums[pair] = partial_sums.sum_of_order(pair)
+        row_0 = emit.pointer(scratch, self.row_0_offset)
         for operation in operations:
             kind, results, (first, _), (second, _) = operation
-            if results[0] in self._carried:
+            if results[0] in self._carried_sums:
                 continue
             totals = [sums[pair] for pair in self._factors(operation)]
             start = [(emit.load(row_0, x), emit.load(row_0, y)) for x, y in self._factors(operation)]
@@ -473,12 +483,12 @@ class LaneSeries:
                 values = [emit.add(emit.add(totals[0], emit.multiply(u, start[0][1])), emit.multiply(start[0][0], z))]
             elif kind == RECIPROCAL:
                 total = emit.add(totals[0], emit.multiply(u, start[0][1]))
-                values = [emit.negative(emit.multiply(total, start[0][1]))]
+                values = [emit.negate(emit.multiply(total, start[0][1]))]
             elif kind == SQUARE_ROOT:
-                divisor = emit.load(scratch, self.divisors + self._divisors[results[0]])
+                divisor = emit.load(scratch, self.divisor_offset + self._divisor_indices[results[0]])
                 values = [emit.multiply(emit.subtract(u, totals[0]), divisor)]
             elif kind in (LOGARITHM, ARCTANGENT):
-                divisor = emit.load(scratch, self.divisors + self._divisors[results[0]])
+                divisor = emit.load(scratch, self.divisor_offset + self._divisor_indices[results[0]])
                 values = [emit.multiply(emit.subtract(u, emit.multiply(totals[0], inverse)), divisor)]
                 row.store(("scaled", ((results[0], 1.0),), 0.0), emit.multiply(order, values[0]))
                 row.store(operation.second, quantities.sum(second))
@@ -490,7 +500,7 @@ class LaneSeries:
                     for total, (_, y) in zip(totals, start, strict=True)
                 ]
                 if kind == SINE:
-                    values[1] = emit.negative(values[1])
+                    values[1] = emit.negate(values[1])
             for result, value in zip(results, values, strict=True):
                 quantities.define(result, value)
                 row.store((((result, 1.0),), 0.0), value, "if used")
@@ -505,7 +515,7 @@ class _Row:
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
         """Store the value of the factor `key` at its index; if `when` is "if used", skip a factor without an index."""
-        place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
+        place = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if place is not None and place not in self._stored:
             self._stored[place] = value
             self.emit.store(value, self.base, place)
@@ -515,21 +525,21 @@ class _Row:
         return self._stored[place] if place in self._stored else self.emit.load(self.base, place)
 
 
-class _Edges(NamedTuple):
-    """Sums of order k without their first and last terms, and the rows with the factors of these terms."""
+class _PartialSums(NamedTuple):
+    """Sums over 1 < j < k for the orders k and k + 1, and the rows with the factors of the terms j = 1 and j = k."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._sums`
-    first: Value  # pointer to the row of order 1, or to zeros if k is 1
-    one: Value  # pointer to the row of order 1
-    before: _Row  # row of order k - 1
+    sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._write_sums`
+    first_row: Value  # pointer to the row of order 1, or to a row of zeros if k is 1
+    row_1: Value  # pointer to the row of order 1
+    row_before: _Row  # row of order k - 1
 
-    def now(self, pair: tuple[int, int]) -> Value:
+    def sum_of_order(self, pair: tuple[int, int]) -> Value:
         """Return the sum of X[j] Y[k - j] over 0 < j < k for the factors (X, Y) = `pair`."""
-        emit, (x, y) = self.before.emit, pair
-        return emit.add(self.sums[pair, False], emit.multiply(emit.load(self.first, x), self.before.load(y)))
+        emit, (x, y) = self.row_before.emit, pair
+        return emit.add(self.sums[pair, False], emit.multiply(emit.load(self.first_row, x), self.row_before.load(y)))
 
-    def next_sum(self, pair: tuple[int, int], row: _Row) -> Value:
+    def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
         """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k for (X, Y) = `pair`; `row` has the factors of order k."""
-        emit, (x, y) = self.before.emit, pair
-        total = emit.add(self.sums[pair, True], emit.multiply(row.load(x), emit.load(self.first, y)))
-        return emit.add(total, emit.multiply(emit.load(self.one, x), row.load(y)))
+        emit, (x, y) = self.row_before.emit, pair
+        total = emit.add(self.sums[pair, True], emit.multiply(row.load(x), emit.load(self.first_row, y)))
+        return emit.add(total, emit.multiply(emit.load(self.row_1, x), row.load(y)))

@@ -38,7 +38,7 @@ from twoloop.kernels.evaluation.operations import (
     SQUARE_ROOT,
 )
 
-FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # fast-math flags of floating-point instructions, as in kernels
+FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # fast-math flags of floating-point instructions, as in kernels
 MIN_TERMS_SPLIT = 4  # number of terms from which on a sum is computed as the sum of two halves
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
 # names of LLVM intrinsics by names of functions; a function without an intrinsic is called in libm
@@ -51,38 +51,38 @@ class Emitter:
     Array indices count doubles. `numbers` points to the coefficients that the code reads.
     """
 
-    double, whole_number, bit = DOUBLE, INTEGER, BIT
+    double_type, integer_type, bit_type = DOUBLE, INTEGER, BIT
     suffix = "f64"  # last part of the names of LLVM intrinsics: the type of their arguments
 
     def __init__(self, builder: Builder):
         self.builder = builder
         self.numbers: Any = None
 
-    def like(self, builder: Builder) -> "Emitter":
+    def for_builder(self, builder: Builder) -> "Emitter":
         """Return an emitter of the same class that writes to another function, that of `builder`."""
         return type(self)(builder)
 
     def constant(self, value: float) -> Value:
         """Return a literal number."""
-        return constant(self.double, value)
+        return constant(self.double_type, value)
 
-    def far(self, value: float) -> Value:
-        """Return a number that is loaded from memory just before its use, see `Builder.far`."""
-        return self.builder.far(value)
+    def load_constant(self, value: float) -> Value:
+        """Return a number that is loaded from memory just before its use, see `Builder.load_constant`."""
+        return self.builder.load_constant(value)
 
-    def whole(self, value: int) -> Value:
+    def integer_constant(self, value: int) -> Value:
         """Return a literal integer of 64 bits; in lanes, a vector of equal integers."""
-        return constant(self.whole_number, value)
+        return constant(self.integer_type, value)
 
     def coefficient(self, number: float) -> Value:
         """Return a literal, or a Coefficient loaded from the array `numbers`, which does not change during a call."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
-        return self.load(self.numbers, number.place, constant=True)
+        return self.load(self.numbers, number.index, constant=True)
 
     def add(self, a: Value, b: Value) -> Value:
         """Return a + b."""
-        return self.builder.operation(f"fadd {FLAGS}", a, b)
+        return self.builder.operation(f"fadd {FAST_MATH_FLAGS}", a, b)
 
     def add_sums(self, a: Value, b: Value) -> Value:
         """Return a + b for two sums without reassociation: LLVM would chain the terms of both, which is slower."""
@@ -90,49 +90,49 @@ class Emitter:
 
     def subtract(self, a: Value, b: Value) -> Value:
         """Return a - b."""
-        return self.builder.operation(f"fsub {FLAGS}", a, b)
+        return self.builder.operation(f"fsub {FAST_MATH_FLAGS}", a, b)
 
     def multiply(self, a: Value, b: Value) -> Value:
-        """Return a b."""
-        return self.builder.operation(f"fmul {FLAGS}", a, b)
+        """Return the product of a and b."""
+        return self.builder.operation(f"fmul {FAST_MATH_FLAGS}", a, b)
 
     def divide(self, a: Value, b: Value) -> Value:
         """Return a / b."""
-        return self.builder.operation(f"fdiv {FLAGS}", a, b)
+        return self.builder.operation(f"fdiv {FAST_MATH_FLAGS}", a, b)
 
-    def fused(self, a: Value, b: Value, c: Value) -> Value:
-        """Return a b + c, rounded once."""
+    def fma(self, a: Value, b: Value, c: Value) -> Value:
+        """Return a * b + c, rounded only once."""
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
         """Return the value at x of a polynomial; `coefficients`: constant first. Pairs of terms run in parallel."""
-        square, terms = self.builder.operation("fmul", x, x), [self.far(each) for each in coefficients]
-        pairs = [self.fused(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
+        square, terms = self.builder.operation("fmul", x, x), [self.load_constant(each) for each in coefficients]
+        pairs = [self.fma(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
         total = pairs.pop()
         while pairs:
-            total = self.fused(total, square, pairs.pop())
+            total = self.fma(total, square, pairs.pop())
         return total
 
-    def negative(self, a: Value) -> Value:
+    def negate(self, a: Value) -> Value:
         """Return -a."""
-        return self.builder.negative(FLAGS, a)
+        return self.builder.negate(FAST_MATH_FLAGS, a)
 
-    def larger(self, a: Value, b: Value) -> Value:
+    def maximum(self, a: Value, b: Value) -> Value:
         """Return the larger of two numbers."""
         return self.builder.select(self.builder.compare("fcmp ogt", a, b), a, b)
 
-    def smaller(self, a: Value, b: Value) -> Value:
+    def minimum(self, a: Value, b: Value) -> Value:
         """Return the smaller of two numbers."""
         return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
 
-    def times(self, factor: float, a: Value) -> Value:
+    def scale(self, factor: float, a: Value) -> Value:
         """Return `factor` times a; `factor` is a literal, or a Coefficient loaded from memory."""
         if factor in (1.0, -1.0):
-            return a if factor == 1.0 else self.negative(a)
+            return a if factor == 1.0 else self.negate(a)
         return self.multiply(self.coefficient(factor), a)
 
-    def number(self, whole: Value) -> Value:
+    def to_double(self, whole: Value) -> Value:
         """Return the integer `whole` converted to a double."""
         return self.builder.convert("sitofp", whole, DOUBLE)
 
@@ -251,9 +251,9 @@ class Quantities:
     def sum(self, terms: Terms, constant: float = 0.0) -> Value:
         """Return `constant` plus the sum of coefficient * quantity over the terms."""
         key = terms, constant
-        if self._emit.builder.module.divided and len(terms) == 1 and constant == 0.0:
+        if self._emit.builder.module.splits_blocks and len(terms) == 1 and constant == 0.0:
             ((quantity, coefficient),) = terms  # another multiplication takes no longer than loading the product
-            return self._emit.times(coefficient, self.value(quantity))
+            return self._emit.scale(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
             half = len(terms) // 2 if len(terms) >= MIN_TERMS_SPLIT else 0
@@ -263,11 +263,11 @@ class Quantities:
             for quantity, coefficient in terms:
                 value = self.value(quantity)
                 if total is None:
-                    total = self._emit.times(coefficient, value)
+                    total = self._emit.scale(coefficient, value)
                 elif coefficient == -1.0:
                     total = self._emit.subtract(total, value)
                 else:
-                    total = self._emit.add(total, self._emit.times(coefficient, value))
+                    total = self._emit.add(total, self._emit.scale(coefficient, value))
             self._sums[key] = total
         return self._sums[key]
 
@@ -308,31 +308,31 @@ COSINES = (
 
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     """Return sine and cosine of x, accurate to rounding errors for |x| up to LARGEST_ANGLE."""
-    builder, whole = emit.builder, emit.whole
-    quarter_turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
+    builder, whole = emit.builder, emit.integer_constant
+    quarter_turns = emit.function("rint", builder.operation("fmul", x, emit.load_constant(1.0 / HALF_PI[0])))
     remainder = x
     for part in HALF_PI:
-        remainder = emit.fused(quarter_turns, emit.far(-part), remainder)
+        remainder = emit.fma(quarter_turns, emit.load_constant(-part), remainder)
     square = builder.operation("fmul", remainder, remainder)
     fourth = builder.operation("fmul", square, square)
-    sine = emit.fused(builder.operation("fmul", square, remainder), emit.polynomial(SINES, square), remainder)
-    cosine = emit.fused(square, emit.far(-0.5), emit.constant(1.0))
-    cosine = emit.fused(fourth, emit.polynomial(COSINES, square), cosine)
-    quarter = builder.convert("fptosi", quarter_turns, emit.whole_number)
-    odd, next_quarter = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
+    sine = emit.fma(builder.operation("fmul", square, remainder), emit.polynomial(SINES, square), remainder)
+    cosine = emit.fma(square, emit.load_constant(-0.5), emit.constant(1.0))
+    cosine = emit.fma(fourth, emit.polynomial(COSINES, square), cosine)
+    quarter = builder.convert("fptosi", quarter_turns, emit.integer_type)
+    is_odd, next_quarter = builder.convert("trunc", quarter, emit.bit_type), builder.add(quarter, whole(1))
     results = []
     for if_odd, if_even, turn in ((cosine, sine, quarter), (sine, cosine, next_quarter)):
-        sign = builder.operation("shl", builder.both(turn, whole(2)), whole(62))
-        bits = builder.convert("bitcast", builder.select(odd, if_odd, if_even), emit.whole_number)
-        results.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double))
+        sign = builder.operation("shl", builder.bitwise_and(turn, whole(2)), whole(62))
+        bits = builder.convert("bitcast", builder.select(is_odd, if_odd, if_even), emit.integer_type)
+        results.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double_type))
     return results[0], results[1]
 
 
 # names of mathematical functions, by kinds of operations
 FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
 
-Place = tuple[Value, int]  # memory location: pointer to an array, and an index in this array
-NOWHERE: Mapping[int, Place] = {}  # no memory locations
+Location = tuple[Value, int]  # memory location: pointer to an array, and an index in this array
+NO_LOCATIONS: Mapping[int, Location] = {}  # no memory locations
 
 
 class Lowering(Algebra[Value]):
@@ -346,15 +346,15 @@ class Lowering(Algebra[Value]):
         Memory locations of quantities that are stored already.
     """
 
-    def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Place] = NOWHERE):
+    def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Location] = NO_LOCATIONS):
         super().__init__()
-        self.emit, self.numbers, self._places = emit, numbers, dict(places)
-        self.angles: list[Value] = []  # arguments of sines and cosines, to be compared with LARGEST_ANGLE by `holds`
+        self.emit, self.numbers, self._locations = emit, numbers, dict(places)
+        self.angles: list[Value] = []  # arguments of sines and cosines, to be compared with LARGEST_ANGLE by `is_valid`
         self.functions = {kind: partial(emit.function, name) for kind, name in FUNCTIONS.items()}
         self.functions[RECIPROCAL] = lambda x: emit.divide(emit.constant(1.0), x)
-        self._quantities = Quantities(emit, lambda quantity: emit.load(*self._places[quantity]))
-        self._pairs: dict[Any, tuple[Value, Value]] = {}  # sines and cosines, by the keys of their angles
-        self._computed = set(places)
+        self._quantities = Quantities(emit, lambda quantity: emit.load(*self._locations[quantity]))
+        self._sines_and_cosines: dict[Any, tuple[Value, Value]] = {}  # sines and cosines, by the keys of their angles
+        self._computed_quantities = set(places)
 
     def define(self, quantity: int, value: Value) -> None:
         """Define the value of a quantity."""
@@ -363,12 +363,12 @@ class Lowering(Algebra[Value]):
     def define_inputs(self, graph: Graph, arguments: Sequence[Value]) -> None:
         """Define the inputs of a graph by the arguments of the function: numbers, or pointers to arrays of inputs."""
         first = 0
-        for argument, size in zip(arguments, graph.sizes, strict=True):
-            if argument.type == self.emit.double:
+        for argument, size in zip(arguments, graph.input_sizes, strict=True):
+            if argument.type == self.emit.double_type:
                 self.define(first, argument)
             else:
-                self._places |= {first + j: (argument, j) for j in range(size)}
-                if not self.emit.builder.module.divided:
+                self._locations |= {first + j: (argument, j) for j in range(size)}
+                if not self.emit.builder.module.splits_blocks:
                     for quantity in range(first, first + size):
                         self.value(quantity)
             first += size
@@ -377,12 +377,12 @@ class Lowering(Algebra[Value]):
         """Return the value of a quantity."""
         return self._quantities.value(quantity)
 
-    def affine(self, expression: Affine) -> Value:
+    def affine(self, expr: Affine) -> Value:
         """Return the value of an affine expression."""
-        return self._quantities.sum(*self.numbers.of_form(expression))
+        return self._quantities.sum(*self.numbers.indexed_expression(expr))
 
     def product(self, a: Value, b: Value) -> Value:
-        """Return a b."""
+        """Return the product of a and b."""
         return self.emit.multiply(a, b)
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> Value:
@@ -390,12 +390,12 @@ class Lowering(Algebra[Value]):
         if kind not in (SINE, COSINE):
             return super().operation(kind, first, second)
         angle = self.affine(first)
-        if first.key not in self._pairs:
+        if first.key not in self._sines_and_cosines:
             self.angles.append(angle)
-            self._pairs[first.key] = sine_and_cosine(self.emit, angle)
-        return self._pairs[first.key][kind == COSINE]
+            self._sines_and_cosines[first.key] = sine_and_cosine(self.emit, angle)
+        return self._sines_and_cosines[first.key][kind == COSINE]
 
-    def run(self, graph: Graph, quantities: Iterable[int], places: Mapping[int, Place] = NOWHERE) -> None:
+    def run(self, graph: Graph, quantities: Iterable[int], places: Mapping[int, Location] = NO_LOCATIONS) -> None:
         """Write code that computes quantities in this order, and stores those that have a location in `places`."""
         if not places:
             return super().run(graph, quantities)
@@ -403,7 +403,7 @@ class Lowering(Algebra[Value]):
             super().run(graph, [i])
             if i in places:
                 self.emit.store(self.value(i), *places[i])
-                self._places[i] = places[i]
+                self._locations[i] = places[i]
                 self._quantities.mark_stored(i)
         return None
 
@@ -414,35 +414,35 @@ class Lowering(Algebra[Value]):
         parts; LLVM reorders instructions only within a part.
         """
         graph = program.graph
-        if not self.emit.builder.module.divided:
-            self.run(graph, program.quantities(self._computed))
-            return [[self.affine(form) for form in forms] for forms in program.arrays.values()]
-        arrays = [[self.forms(graph, [form])[0] for form in forms] for forms in program.arrays.values()]
-        self.run(graph, graph.in_order_of_use(program.forms, self._computed))
+        if not self.emit.builder.module.splits_blocks:
+            self.run(graph, program.quantities(self._computed_quantities))
+            return [[self.affine(expr) for expr in exprs] for exprs in program.arrays.values()]
+        arrays = [[self.expressions(graph, [expr])[0] for expr in exprs] for exprs in program.arrays.values()]
+        self.run(graph, graph.quantities_by_use(program.expressions, self._computed_quantities))
         return arrays
 
-    def forms(self, graph: Graph, forms: Sequence[Affine]) -> list[Value]:
+    def expressions(self, graph: Graph, exprs: Sequence[Affine]) -> list[Value]:
         """Return the values of expressions, after writing code for their quantities that were not computed before."""
-        quantities = graph.in_order_of_use(forms, self._computed)
+        quantities = graph.quantities_by_use(exprs, self._computed_quantities)
         self.run(graph, quantities)
-        self._computed.update(quantities)
-        return [self.affine(form) for form in forms]
+        self._computed_quantities.update(quantities)
+        return [self.affine(expr) for expr in exprs]
 
-    def holds(self, program: Program, values: Sequence[Value]) -> Value:
+    def is_valid(self, program: Program, values: Sequence[Value]) -> Value:
         """Return whether the conditions of a program hold, `values` are finite, and angles are below LARGEST_ANGLE."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN
             total = emit.add(total, emit.multiply(value, zero))
-        holds = builder.compare("fcmp oeq", total, zero)
+        is_valid = builder.compare("fcmp oeq", total, zero)
         pairs = [(self.affine(larger), self.affine(smaller)) for larger, smaller in program.conditions]
         pairs += [(emit.constant(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in self.angles]
         for larger, smaller in pairs:
-            holds = builder.both(holds, builder.compare("fcmp ogt", larger, smaller))
-        return holds
+            is_valid = builder.bitwise_and(is_valid, builder.compare("fcmp ogt", larger, smaller))
+        return is_valid
 
 
-def lower(
+def lower_program(
     emit: Emitter, program: Program, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[Lowering, list[list[Value]]]:
     """Write code that evaluates a program at `inputs`; return the Lowering that wrote it, and the program's arrays."""

@@ -9,9 +9,9 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
+DOUBLE, INTEGER, WORD, BIT, VOID = "double", "i64", "i32", "i1", "void"
 DOUBLES_PER_CACHE_LINE = 8  # size of a cache line of the processor, in doubles
-# largest number of instructions in a block of a divided function: longer blocks more than double the compile time
+# largest number of instructions in a block if blocks are split: longer blocks more than double the compile time
 MAX_BLOCK_LENGTH = 400
 
 
@@ -102,14 +102,14 @@ def undefined(kind: str) -> Value:
 class Module:
     """LLVM module: functions, and declarations of the other functions that they call.
 
-    `divided`: whether long blocks are divided, as the time that LLVM takes grows faster than the length of a block.
+    `splits_blocks`: whether long blocks are split, because the time that LLVM takes grows faster than their length.
     """
 
-    def __init__(self, divided: bool = False) -> None:
-        self.divided = divided
-        self.kept_apart: list[str] = []  # addresses of blocks that LLVM must not merge
+    def __init__(self, splits_blocks: bool = False) -> None:
+        self.splits_blocks = splits_blocks
+        self.block_addresses: list[str] = []  # addresses of blocks that LLVM must not merge
         self._tables: list[str] = []
-        self._numbers: list[float] = []  # numbers that `Builder.far` loads
+        self._numbers: list[float] = []  # numbers that `Builder.load_constant` loads
         self._declared: dict[str, str] = {}
         self._functions: list[Builder] = []
 
@@ -123,19 +123,19 @@ class Module:
         """Return whether the module contains a function of this name, not only its declaration."""
         return any(function.name == name for function in self._functions)
 
-    def table(self, places: Sequence[int]) -> Value:
+    def add_table(self, indices: Sequence[int]) -> Value:
         """Add an array of constant integers to the module, and return a pointer to the array."""
-        kind, name = f"[{len(places)} x {WORD}]", f"@table{len(self._tables)}"
-        entries = ", ".join([f"{WORD} {place}" for place in places])
+        kind, name = f"[{len(indices)} x {WORD}]", f"@table{len(self._tables)}"
+        entries = ", ".join([f"{WORD} {index}" for index in indices])
         self._tables.append(f"{name} = internal constant {kind} [{entries}]")
         return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
 
-    def far_number(self, number: float) -> int:
-        """Add a number to the array from which `Builder.far` loads, and return its index."""
+    def add_far_number(self, number: float) -> int:
+        """Add a number to the array from which `Builder.load_constant` loads; return the index of the number."""
         self._numbers.append(number)
         return len(self._numbers) - 1
 
-    def declare(self, name: str, result: str, arguments: Iterable[str]) -> None:
+    def add_declaration(self, name: str, result: str, arguments: Iterable[str]) -> None:
         """Add the declaration of a function that may be outside the module, such as one of libm."""
         self._declared[name] = f"declare {result} @{name}({', '.join(arguments)})"
 
@@ -147,12 +147,12 @@ class Module:
         if numbers:
             kind = f"[{len(numbers)} x {DOUBLE}]"
             tables.append(f"@numbers = internal constant {kind} [{', '.join(map(str, numbers))}]")
-            place = f"getelementptr inbounds ({kind}, {kind}* @numbers, {INTEGER} 0, {INTEGER} 0)"
-            tables.append(f"@far = internal global {DOUBLE}* {place}")
+            index = f"getelementptr inbounds ({kind}, {kind}* @numbers, {INTEGER} 0, {INTEGER} 0)"
+            tables.append(f"@far = internal global {DOUBLE}* {index}")
         parts = [*declared, *tables, *(function.text() for function in self._functions), "!0 = !{}"]
-        if self.kept_apart:
-            kind = f"[{len(self.kept_apart)} x i8*]"
-            parts.append(f"@kept_apart = internal constant {kind} [{', '.join(self.kept_apart)}]")
+        if self.block_addresses:
+            kind = f"[{len(self.block_addresses)} x i8*]"
+            parts.append(f"@kept_apart = internal constant {kind} [{', '.join(self.block_addresses)}]")
         return "\n".join(parts)
 
 
@@ -162,9 +162,9 @@ class Builder:
     def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str], internal: bool = False):
         self.module, self.name, self.result, self.internal = module, name, result, internal
         self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
-        self._n = self._n_rooms = 0
-        self._far: Value | None = None
-        self.part = 0  # index of the current part of a divided function
+        self._n_values = self._n_allocated = 0
+        self._far_pointer: Value | None = None
+        self.part = 0  # number of times that a block was split so far: index of the current part
         self._blocks: list[Block] = []
         self._n_blocks = 0
         self.position_at_end(self.append_block())
@@ -188,89 +188,89 @@ class Builder:
         self.block = block
         self._blocks.append(block)
 
-    def _line(self, text: str) -> None:
+    def _append_line(self, text: str) -> None:
         self.block.lines.append(text)
 
-    def _value(self, kind: str, text: str) -> Value:
-        if self.module.divided and len(self.block.lines) >= MAX_BLOCK_LENGTH:
-            self._divide()
-        value = Value(kind, f"%{self._n}")  # LLVM reads numbered values in a third less time than named values
-        self._n += 1
+    def _append_value(self, kind: str, text: str) -> Value:
+        if self.module.splits_blocks and len(self.block.lines) >= MAX_BLOCK_LENGTH:
+            self._split_block()
+        value = Value(kind, f"%{self._n_values}")  # LLVM reads numbered values in a third less time than named values
+        self._n_values += 1
         self.block.lines.append(f"{value.text} = {text}")
         return value
 
-    def _divide(self) -> None:
+    def _split_block(self) -> None:
         """Continue in a new block; its address is stored, so that LLVM does not merge it with the current block."""
         block = self.append_block()
-        self.go_to(block)
-        self.module.kept_apart.append(f"i8* blockaddress(@{self.name}, %{block.name})")
+        self.jump(block)
+        self.module.block_addresses.append(f"i8* blockaddress(@{self.name}, %{block.name})")
         self.position_at_end(block)
         self.part += 1
 
     def operation(self, name: str, a: Value, b: Value) -> Value:
         """Return the result of an operation, such as "add" or "fmul fast", on two values of the same type."""
-        return self._value(a.type, f"{name} {a.type} {a.text}, {b.text}")
+        return self._append_value(a.type, f"{name} {a.type} {a.text}, {b.text}")
 
-    def negative(self, flags: str, a: Value) -> Value:
-        """Return -a of a floating-point number."""
-        return self._value(a.type, f"fneg {flags} {a.type} {a.text}")
+    def negate(self, flags: str, a: Value) -> Value:
+        """Return -a for a floating-point number a."""
+        return self._append_value(a.type, f"fneg {flags} {a.type} {a.text}")
 
     def add(self, a: Value, b: Value) -> Value:
-        """Return a + b of integers."""
+        """Return the sum of the integers a and b."""
         return self.operation("add", a, b)
 
     def sub(self, a: Value, b: Value) -> Value:
-        """Return a - b of integers."""
+        """Return the difference a - b of integers."""
         return self.operation("sub", a, b)
 
     def mul(self, a: Value, b: Value) -> Value:
-        """Return a b of integers."""
+        """Return the product of the integers a and b."""
         return self.operation("mul", a, b)
 
-    def both(self, a: Value, b: Value) -> Value:
+    def bitwise_and(self, a: Value, b: Value) -> Value:
         """Return the bitwise "and" of a and b."""
         return self.operation("and", a, b)
 
     def convert(self, name: str, a: Value, kind: str) -> Value:
         """Return a value converted to the type `kind` by an instruction `name`, such as "sitofp" or "bitcast"."""
-        return self._value(kind, f"{name} {a.type} {a.text} to {kind}")
+        return self._append_value(kind, f"{name} {a.type} {a.text} to {kind}")
 
     def compare(self, name: str, a: Value, b: Value) -> Value:
         """Return the result (BIT) of comparing two values by an instruction such as "fcmp oeq" or "icmp slt"."""
         kind = vector_of(BIT, width_of(a.type))
-        return self._value(kind, f"{name} {a.type} {a.text}, {b.text}")
+        return self._append_value(kind, f"{name} {a.type} {a.text}, {b.text}")
 
     def select(self, condition: Value, a: Value, b: Value) -> Value:
         """Return a if the condition is true, else b; for vectors, element by element."""
-        return self._value(a.type, f"select {condition}, {a}, {b}")
+        return self._append_value(a.type, f"select {condition}, {a}, {b}")
 
     def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
         """Return the result of calling the function `name`, and declare the function. `flags`: fast-math flags."""
-        self.module.declare(name, kind, [value.type for value in arguments])
-        return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
+        self.module.add_declaration(name, kind, [value.type for value in arguments])
+        return self._append_value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
-    def run(self, name: str, arguments: Sequence[Value]) -> None:
-        """Write a call of the function `name` of the module, which returns no value."""
-        self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
+    def call_void(self, name: str, arguments: Sequence[Value]) -> None:
+        """Write a call of a function of the module that returns no value."""
+        self._append_line(f"call {VOID} @{name}({', '.join(map(str, arguments))})")
 
-    def room(self, kind: str, size: int) -> Value:
-        """Return a pointer to `size` numbers of stack memory, allocated in the first block, outside of loops."""
-        pointer = Value(f"{kind}*", f"%room{self._n_rooms}")
+    def allocate(self, kind: str, size: int) -> Value:
+        """Return a pointer to `size` numbers of stack memory, which the first block of the function allocates."""
+        pointer = Value(f"{kind}*", f"%room{self._n_allocated}")
         self._blocks[0].lines.insert(
-            self._n_rooms, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
+            self._n_allocated, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
         )
-        self._n_rooms += 1
+        self._n_allocated += 1
         return pointer
 
-    def far(self, number: float) -> Value:
+    def load_constant(self, number: float) -> Value:
         """Return a number loaded just before its use: a literal would occupy a register or stack memory for long."""
-        if self._far is None:
-            self._far = Value(f"{DOUBLE}*", "%far")
+        if self._far_pointer is None:
+            self._far_pointer = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
-            self._n_rooms += 1
-        return self.load(self.gep(self._far, integer(self.module.far_number(number))))
+            self._n_allocated += 1
+        return self.load(self.gep(self._far_pointer, integer(self.module.add_far_number(number))))
 
-    def leave_unless(self, condition: Value) -> None:
+    def return_false_unless(self, condition: Value) -> None:
         """Write code that returns false from the function if a condition is false."""
         go_on, leave = self.append_block(), self.append_block()
         self.branch(condition, go_on, leave)
@@ -278,51 +278,51 @@ class Builder:
         self.ret(Value(BIT, "false"))
         self.position_at_end(go_on)
 
-    def gep(self, base: Value, place: Value) -> Value:
-        """Return the pointer `base` advanced by `place` elements."""
-        return self._value(base.type, f"getelementptr inbounds {base.type[:-1]}, {base}, {place}")
+    def gep(self, base: Value, index: Value) -> Value:
+        """Return the pointer `base` advanced by `index` elements."""
+        return self._append_value(base.type, f"getelementptr inbounds {base.type[:-1]}, {base}, {index}")
 
     def load(self, pointer: Value, align: int = 8, constant: bool = False) -> Value:
         """Return the value to which a pointer points; `constant`: this value does not change during a call."""
         kind, metadata = pointer.type[:-1], ", !invariant.load !0" if constant else ""
-        return self._value(kind, f"load {kind}, {pointer}, align {align}{metadata}")
+        return self._append_value(kind, f"load {kind}, {pointer}, align {align}{metadata}")
 
     def store(self, value: Value, pointer: Value, align: int = 8) -> None:
         """Store a value at the address `pointer`."""
-        self._line(f"store {value}, {pointer}, align {align}")
+        self._append_line(f"store {value}, {pointer}, align {align}")
 
-    def insert(self, vector: Value, value: Value, place: int) -> Value:
-        """Return a vector whose element number `place` is replaced by `value`."""
-        return self._value(vector.type, f"insertelement {vector}, {value}, {WORD} {place}")
+    def insert(self, vector: Value, value: Value, index: int) -> Value:
+        """Return a vector whose element number `index` is replaced by `value`."""
+        return self._append_value(vector.type, f"insertelement {vector}, {value}, {WORD} {index}")
 
-    def extract(self, vector: Value, place: int) -> Value:
-        """Return the element number `place` of a vector."""
-        return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
+    def extract(self, vector: Value, index: int) -> Value:
+        """Return the element number `index` of a vector."""
+        return self._append_value(element_of(vector.type), f"extractelement {vector}, {WORD} {index}")
 
-    def shuffle(self, a: Value, b: Value, places: Sequence[int]) -> Value:
-        """Return a vector of the elements `places` of the vectors a and b, whose indices follow those of a."""
-        mask = f"<{len(places)} x {WORD}> <{', '.join(f'{WORD} {place}' for place in places)}>"
-        return self._value(vector_of(element_of(a.type), len(places)), f"shufflevector {a}, {b}, {mask}")
+    def shuffle(self, a: Value, b: Value, indices: Sequence[int]) -> Value:
+        """Return a vector of the elements `indices` of the concatenation of the vectors a and b."""
+        mask = f"<{len(indices)} x {WORD}> <{', '.join(f'{WORD} {index}' for index in indices)}>"
+        return self._append_value(vector_of(element_of(a.type), len(indices)), f"shufflevector {a}, {b}, {mask}")
 
-    def first_everywhere(self, vector: Value) -> Value:
+    def broadcast_first(self, vector: Value) -> Value:
         """Return a vector whose elements all equal the first element of `vector`."""
         mask = f"<{width_of(vector.type)} x {WORD}> zeroinitializer"
-        return self._value(vector.type, f"shufflevector {vector}, {vector}, {mask}")
+        return self._append_value(vector.type, f"shufflevector {vector}, {vector}, {mask}")
 
     def phi(self, kind: str) -> Phi:
         """Append a phi node to the current block, and return it; `Phi.add_incoming` adds its values."""
-        phi = Phi(kind, f"%{self._n}")
-        self._n += 1
+        phi = Phi(kind, f"%{self._n_values}")
+        self._n_values += 1
         self.block.lines.append(phi)
         return phi
 
-    def go_to(self, block: Block) -> None:
+    def jump(self, block: Block) -> None:
         """End the current block by a jump to `block`."""
-        self._line(f"br label %{block.name}")
+        self._append_line(f"br label %{block.name}")
 
     def branch(self, condition: Value, then: Block, otherwise: Block) -> None:
         """End the current block by a branch to `then` if the condition is true, else to `otherwise`."""
-        self._line(f"br {condition}, label %{then.name}, label %{otherwise.name}")
+        self._append_line(f"br {condition}, label %{then.name}, label %{otherwise.name}")
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
@@ -331,9 +331,9 @@ class Builder:
         self.branch(condition, then, after)
         self.position_at_end(then)
         yield
-        self.go_to(after)
+        self.jump(after)
         self.position_at_end(after)
 
     def ret(self, value: Value | None) -> None:
         """Write a return from the function with the result `value`; None: without a result."""
-        self._line("ret void" if value is None else f"ret {value}")
+        self._append_line("ret void" if value is None else f"ret {value}")

@@ -30,9 +30,10 @@ ROUNDING_OF_SOLUTION = 1e-10
 class Block(NamedTuple):
     """Block of one or two rows of the matrix that are eliminated together, with one division."""
 
-    places: tuple[int, ...]  # indices of the rows
+    row_indices: tuple[int, ...]
     inverse: list[list[Affine]]  # inverse of the 1x1 or 2x2 matrix of pivots
-    below: list[tuple[int, list[Affine]]]  # for each row of L below the block with nonzero entries: index, and entries
+    # for each row of L with nonzero entries below the block: its index, and these entries
+    rows_below: list[tuple[int, list[Affine]]]
 
 
 class Factors:
@@ -45,7 +46,7 @@ class Factors:
     conditions : list of (Affine, Affine)
         Pairs, for rows of G (index `n` and later), of a pivot and the pivot without the other rows of G. The first
         expression must be larger than a fraction of the second.
-    positive : list of Affine
+    mass_pivots : list of Affine
         Pivots of M (index below `n`), which are positive if M is definite.
     """
 
@@ -55,44 +56,47 @@ class Factors:
             rows[i][j] = value
         self.blocks: list[Block] = []
         self.conditions: list[tuple[Affine, Affine]] = []
-        self.positive: list[Affine] = []
+        self.mass_pivots: list[Affine] = []
         pivots_alone: dict[int, Any] = {}
         pairs = _pairs_without_conditions(rows, n)
-        for places in [*pairs, *_order_rows(rows, n, pairs)]:
-            zero = Affine(rows[places[0]][places[0]].graph, 0.0, {})
-            pivots = [[rows[i].pop(j, zero).value() for j in places] for i in places]
-            inverse = self._inverse(pivots, [pivots_alone.get(i) for i in places])
-            neighbours = dict.fromkeys(j for i in places for j in rows[i])
-            entries = [(j, [rows[i].get(j, zero).value() for i in places]) for j in neighbours]
-            below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
-            for first, (j, multiples) in enumerate(below):
+        for row_indices in [*pairs, *_order_rows(rows, n, pairs)]:
+            zero = Affine(rows[row_indices[0]][row_indices[0]].graph, 0.0, {})
+            pivots = [[rows[i].pop(j, zero).as_term() for j in row_indices] for i in row_indices]
+            inverse = self._inverse(pivots, [pivots_alone.get(i) for i in row_indices])
+            neighbours = dict.fromkeys(j for i in row_indices for j in rows[i])
+            entries = [(j, [rows[i].get(j, zero).as_term() for i in row_indices]) for j in neighbours]
+            rows_below = [(j, [_dot(row, values).as_term() for row in inverse]) for j, values in entries]
+            for first, (j, multiples) in enumerate(rows_below):
                 for k, values in entries[first:]:
                     change = _dot(multiples, values)
-                    if j == k >= n > places[0]:
+                    if j == k >= n > row_indices[0]:
                         pivots_alone[j] = pivots_alone.get(j, 0.0) - change
                     rows[j][k] = rows[k][j] = rows[j][k] - change if k in rows[j] else -change
-                for i in places:
+                for i in row_indices:
                     rows[j].pop(i, None)
-            self.blocks.append(Block(places, inverse, below))
+            self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a block of pivots; add conditions. `alone`: pivots of G without other rows of G."""
-        diagonal = [None if pivot is None else pivot.value() for pivot in alone]
+        diagonal = [None if pivot is None else pivot.as_term() for pivot in alone]
         a = pivots[0][0]
         if diagonal[0] is None:
-            self.positive.append(a)
+            self.mass_pivots.append(a)
         else:
             self.conditions.append((-a, -diagonal[0]))
         if len(pivots) == 1:
             return [[a.reciprocal()]]
         b, c = pivots[0][1], pivots[1][1]
-        determinant = (a * c - b * b).value()
+        determinant = (a * c - b * b).as_term()
         if diagonal[1] is None:
-            self.positive.append(determinant)
+            self.mass_pivots.append(determinant)
         else:
-            self.conditions.append((determinant, (a * diagonal[1]).value()))
+            self.conditions.append((determinant, (a * diagonal[1]).as_term()))
         inverse = determinant.reciprocal()
-        return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
+        return [
+            [(c * inverse).as_term(), (-b * inverse).as_term()],
+            [(-b * inverse).as_term(), (a * inverse).as_term()],
+        ]
 
     def solve(self, rhs: Sequence[Affine]) -> list[Affine]:
         """Return the solution of the linear system for a right-hand side."""
@@ -106,42 +110,42 @@ def _dot(a: Sequence[Affine], b: Sequence[Affine]) -> Affine:
     return total
 
 
-def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
+def solve(blocks: Sequence[Block], rhs: Sequence[Affine]) -> list[Affine]:
     """Return the solution of a linear system, given the blocks of its `Factors` and the right-hand side."""
-    solution = list(right)
-    pending: list[list[tuple[Affine, Affine]]] = [[] for _ in right]
-    for places, _, below in blocks:
-        for i in places:
-            solution[i] = (solution[i] - _collected_sum(pending[i])).value()
-        for j, multiples in below:
-            pending[j] += [(multiple, solution[i]) for multiple, i in zip(multiples, places, strict=True)]
-    for places, inverse, below in reversed(blocks):
-        pivots = [solution[i] for i in places]
-        for place, (i, row) in enumerate(zip(places, inverse, strict=True)):
-            products = [(multiples[place], solution[j]) for j, multiples in below]
-            solution[i] = (_dot(row, pivots) - _collected_sum(products)).value()
+    solution = list(rhs)
+    pending: list[list[tuple[Affine, Affine]]] = [[] for _ in rhs]
+    for row_indices, _, rows_below in blocks:
+        for i in row_indices:
+            solution[i] = (solution[i] - _collected_sum(pending[i])).as_term()
+        for j, multiples in rows_below:
+            pending[j] += [(multiple, solution[i]) for multiple, i in zip(multiples, row_indices, strict=True)]
+    for row_indices, inverse, rows_below in reversed(blocks):
+        pivots = [solution[i] for i in row_indices]
+        for place, (i, row) in enumerate(zip(row_indices, inverse, strict=True)):
+            products = [(multiples[place], solution[j]) for j, multiples in rows_below]
+            solution[i] = (_dot(row, pivots) - _collected_sum(products)).as_term()
     return solution
 
 
 def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products a b; if factors a are multiples of one expression, first sum up the factors b."""
+    """Return the sum of products; if their first factors are multiples of one expression, first sum up the others."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
         if not factor_a.terms:
             total = total + factor_b.times(factor_a.constant)
             continue
-        scale, factor = factor_a.normalised()
+        scale, factor = factor_a.normalized()
         previous = groups.get(factor.key)
         factor_b = factor_b.times(scale)
         groups[factor.key] = (factor, factor_b if previous is None else previous[1] + factor_b)
     for factor, factor_b in groups.values():
-        total = total + factor * factor_b.value()
+        total = total + factor * factor_b.as_term()
     return total
 
 
 def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
-    """Return pairs of a coordinate and a row of G that are eliminated first, without a condition or a division.
+    """Return pairs (coordinate, row of G) that are eliminated first: their pivots need no condition and no division.
 
     The coordinate occurs in no other row of [M G^T; G 0], and both of its entries, in M and in G, are constants. The
     rank of G is the rank of the remaining rows plus the number of pairs.
@@ -170,8 +174,8 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
             waiting_for[j] -= set(pair)
     while remaining:
         i = min((j for j in remaining if not waiting_for[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
-        ready = [j for j in neighbours[i] if not waiting_for[j] and (j < n) == (i < n)]
-        same_neighbours = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
+        ready_rows = [j for j in neighbours[i] if not waiting_for[j] and (j < n) == (i < n)]
+        same_neighbours = [j for j in ready_rows if neighbours[j] | {j} == neighbours[i] | {i}]
         block = (i, *sorted(same_neighbours)[:1])
         order.append(block)
         remaining -= set(block)
@@ -198,8 +202,8 @@ Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 MIN_PIVOT_SQUARE = 0.03**2
 
 
-class NotReduced(Exception):
-    """Exception if a pivot is always zero, or if the elimination takes too many operations."""
+class ReductionFailed(Exception):
+    """Exception if a pivot is always zero, or if the elimination of dependent coordinates takes too many operations."""
 
 
 class DependentCoordinates:
@@ -220,33 +224,35 @@ class DependentCoordinates:
     independent : list of int
         Independent coordinates.
     T : list of dict
-        For each row of T, its nonzero entries by independent coordinate.
+        For each row of T, its nonzero entries by column, an independent coordinate.
     g : list of Affine
         The vector g of length n_q; 0 for independent coordinates.
     conditions : list of (Affine, Affine)
-        Pairs of expressions: in each, the first is larger than the second unless a pivot is too small.
+        Pairs of expressions. The first one is larger than the second one in each pair, unless a pivot is too small.
 
     Raises
     ------
     NotReduced
-        If a pivot is always zero, or if the elimination takes more than `max_added` operations.
+        If a pivot is always zero, or if the elimination takes more than `max_added_operations` operations.
     """
 
-    def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, max_added: int):
+    def __init__(
+        self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, max_added_operations: int
+    ):
         self._n, graph = len(rows[0]), rows[0][0].graph
-        self._graph, self._most = graph, len(graph.operations) + max_added
+        self._graph, self._max_operations = graph, len(graph.operations) + max_added_operations
         self._zero, self._one = Affine(graph, 0.0, {}), Affine(graph, 1.0, {})
         self._rows: list[Terms] = [
             {j: entry for j, entry in enumerate([*row, rhs]) if not is_zero(entry)}
             for row, rhs in zip(rows, gamma, strict=True)
         ]
         self._columns = list(zip(*rows, strict=True))
-        self._left, self._free = set(range(len(rows))), set(range(self._n))
+        self._remaining_rows, self._remaining_columns = set(range(len(rows))), set(range(self._n))
         self.conditions: list[tuple[Affine, Affine]] = []
         for block in blocks:
             self._eliminate(*block)
-        self.independent = sorted(self._free)
-        self.T: list[Terms] = [{j: self._one} if j in self._free else {} for j in range(self._n)]
+        self.independent = sorted(self._remaining_columns)
+        self.T: list[Terms] = [{j: self._one} if j in self._remaining_columns else {} for j in range(self._n)]
         self.g = [self._zero] * self._n
         for block_rows, columns in reversed(blocks):
             for i, j in zip(block_rows, columns, strict=True):
@@ -254,7 +260,7 @@ class DependentCoordinates:
 
     def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
         """Solve one or two rows of [G gamma] for as many coordinates, `columns`; eliminate them from the other rows."""
-        self.check()
+        self.check_length()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)
         other_columns = sorted({j for i in rows for j in self._rows[i]} - set(columns))
@@ -263,9 +269,9 @@ class DependentCoordinates:
             _nonzero({j: _add_products(self._zero, zip(row, column, strict=True)) for j, column in entries.items()})
             for row in inverse
         ]
-        self._left -= set(rows)
-        self._free -= set(columns)
-        for k in sorted(self._left):
+        self._remaining_rows -= set(rows)
+        self._remaining_columns -= set(columns)
+        for k in sorted(self._remaining_rows):
             row = self._rows[k]
             factors = [row.pop(j, None) for j in columns]
             for factor, solved_row in zip(factors, solved, strict=True):
@@ -277,10 +283,10 @@ class DependentCoordinates:
         if pivot.terms:
             self._add_conditions(block, columns, pivot, solved)
 
-    def check(self, more: int = 0) -> None:
-        """Raise `NotReduced` if more than `max_added` operations are added, including `more` that will follow."""
-        if len(self._graph.operations) + more > self._most:
-            raise NotReduced
+    def check_length(self, n_following: int = 0) -> None:
+        """Raise ReductionFailed if more than `max_added_operations` are added, including `n_following` later ones."""
+        if len(self._graph.operations) + n_following > self._max_operations:
+            raise ReductionFailed
 
     def _inverse(self, block: list[list[Affine]]) -> tuple[Affine, list[list[Affine]]]:
         """Return the determinant and the inverse of a 1x1 or 2x2 block; raise NotReduced if it is always singular."""
@@ -288,15 +294,15 @@ class DependentCoordinates:
             ((determinant,),) = block
         else:
             (a, b), (c, d) = block
-            determinant = (a * d - b * c).value()
+            determinant = (a * d - b * c).as_term()
         if is_zero(determinant):
-            raise NotReduced
+            raise ReductionFailed
         factor = determinant.reciprocal()
         if len(block) == 1:
             return determinant, [[factor]]
         return determinant, [
-            [(d * factor).value(), (-(b * factor)).value()],
-            [(-(c * factor)).value(), (a * factor).value()],
+            [(d * factor).as_term(), (-(b * factor)).as_term()],
+            [(-(c * factor)).as_term(), (a * factor).as_term()],
         ]
 
     def _add_conditions(
@@ -316,19 +322,21 @@ class DependentCoordinates:
             squares = _add_products(self._zero, [(entry, entry) for entry in column])
             self.conditions.append((pivot * pivot, squares.times(MIN_PIVOT_SQUARE)))
         else:
-            a, b = (_add_products(self._zero, [(x, x) for x in column]).value() for column in zip(*block, strict=True))
+            a, b = (
+                _add_products(self._zero, [(x, x) for x in column]).as_term() for column in zip(*block, strict=True)
+            )
             self.conditions.append((pivot * pivot, (a * b).times(MIN_PIVOT_SQUARE)))
 
     def _substitute(self, j: int, row: Terms) -> None:
         """Store T[j] and g[j] of a dependent coordinate j, computed from those of the coordinates in its solved row."""
-        self.check()
-        right, entries = row.get(self._n, self._zero), dict[int, Affine]()
+        self.check_length()
+        rhs, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
             if k < self._n:
-                right = right - entry * self.g[k]
+                rhs = rhs - entry * self.g[k]
                 for independent, factor in self.T[k].items():
                     entries[independent] = entries.get(independent, self._zero) - entry * factor
-        self.T[j], self.g[j] = _nonzero(entries), right.value()
+        self.T[j], self.g[j] = _nonzero(entries), rhs.as_term()
 
 
 def reduced_accelerations(
@@ -338,18 +346,18 @@ def reduced_accelerations(
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]
-    forces = [(force[i] - _add_products(zero, ((x, g[j]) for x, j in rows[i]))).value() for i in range(n)]
+    forces = [(force[i] - _add_products(zero, ((x, g[j]) for x, j in rows[i]))).as_term() for i in range(n)]
     matrix: dict[tuple[int, int], Affine] = {}
-    coordinates.check(sum(len(row) ** 2 // 2 for row in T))  # operations of T^T M T, if M is diagonal
+    coordinates.check_length(sum(len(row) ** 2 // 2 for row in T))  # operations of T^T M T, if M is diagonal
     for a, x in enumerate(independent):
         mass_T = [
-            _add_products(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).value() for row in rows
+            _add_products(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).as_term() for row in rows
         ]  # M T
         for b, y in enumerate(independent[: a + 1]):
-            inertia = _add_products(zero, ((T[i][y], mass_T[i]) for i in range(n) if y in T[i])).value()
+            inertia = _add_products(zero, ((T[i][y], mass_T[i]) for i in range(n) if y in T[i])).as_term()
             if a == b or not is_zero(inertia):
                 matrix[a, b] = matrix[b, a] = inertia
-    rhs = [_add_products(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).value() for x in independent]
+    rhs = [_add_products(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).as_term() for x in independent]
     factors = Factors(matrix, len(independent), len(independent))
     solution = dict(zip(independent, factors.solve(rhs), strict=True))
     accelerations = [g[i] + _add_products(zero, ((entry, solution[x]) for x, entry in T[i].items())) for i in range(n)]
@@ -358,10 +366,10 @@ def reduced_accelerations(
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
     """Yield pairs of a pivot of the reduced mass matrix and its lower bound, a fraction of a diagonal entry."""
-    pivots = iter(factors.positive)
-    for places, _, _ in factors.blocks:
+    pivots = iter(factors.mass_pivots)
+    for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None
-        for i in places:
+        for i in row_indices:
             pivot = next(pivots)
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
@@ -377,7 +385,7 @@ def _add_products(total: Affine, pairs: Any) -> Affine:
 
 
 def _nonzero(entries: Terms) -> Terms:
-    return {j: entry.value() for j, entry in entries.items() if not is_zero(entry)}
+    return {j: entry.as_term() for j, entry in entries.items() if not is_zero(entry)}
 
 
 def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
@@ -386,7 +394,7 @@ def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
     The loss is the change of a solution by one step of refinement: one solution for forces (gamma = 0), and one for
     motion that the rows prescribe (Q = 0). `mass` (n_q, n_q) and G (n_c + n_a, n_q) are values at the position.
     """
-    rows, added, n = G[list(choice.rows)], G[list(choice.added)], len(mass)
+    rows, added, n = G[list(choice.rows)], G[list(choice.added_rows)], len(mass)
     mass_with_rows = mass + choice.scale * added.T @ added
     factors = np.block([[mass_with_rows, rows.T], [rows, np.zeros((len(rows), len(rows)))]])
     for k in range(len(factors)):
@@ -396,7 +404,7 @@ def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
         factors[k + 1 :, k + 1 :] -= np.outer(factors[k + 1 :, k], factors[k, k + 1 :])
 
     def solve(rhs: Array) -> Array:
-        intermediate = solve_triangular(factors, rhs, lower=True, unit_diagonal=True, check_finite=False)
+        intermediate = solve_triangular(factors, rhs, lower_program=True, unit_diagonal=True, check_finite=False)
         return np.asarray(solve_triangular(factors, intermediate, check_finite=False))
 
     a, b = np.random.default_rng(1).choice((-1.0, 1.0), (2, n))
@@ -416,7 +424,7 @@ def solve_refined(
     r: Sequence[Affine],
     c: Sequence[Affine],
 ) -> list[Affine]:
-    """Return a and lam of the independent rows for M a + G^T lam = r, G a = c, with refinement if `choice.refined`.
+    """Return a and lam of the independent rows for M a + G^T lam = r, G a = c, with refinement if `choice.is_refined`.
 
     `solve`: solution of a linear system with the factors of [M + s g^T g, G^T; G 0], where rows g are added to M as in
     PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.
@@ -424,7 +432,7 @@ def solve_refined(
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:
         rhs = list(r)
-        for k in choice.added:
+        for k in choice.added_rows:
             for i, entry in enumerate(rows[k]):
                 rhs[i] = rhs[i] + (entry * c[k]).times(choice.scale)
         return solve([*rhs, *(c[k] for k in choice.rows)])
@@ -432,15 +440,15 @@ def solve_refined(
     def subtract_products(total: Affine, products: Iterable[tuple[Affine, Affine]]) -> Affine:
         for x, y in products:
             total = total if is_zero(x) else total - x * y
-        return total.value()
+        return total.as_term()
 
     solution, n = solve_once(r, c), len(r)
-    if not choice.refined:
+    if not choice.is_refined:
         return solution
     a, lam = solution[:n], dict(zip(choice.rows, solution[n:], strict=True))
     residual_r = [
         subtract_products(force, [*zip(row, a, strict=True), *((rows[k][i], x) for k, x in lam.items())])
         for i, (force, row) in enumerate(zip(r, mass, strict=True))
     ]
-    residual_c = {k: subtract_products(c[k], zip(rows[k], a, strict=True)) for k in {*choice.rows, *choice.added}}
+    residual_c = {k: subtract_products(c[k], zip(rows[k], a, strict=True)) for k in {*choice.rows, *choice.added_rows}}
     return [x + change for x, change in zip(solution, solve_once(residual_r, residual_c), strict=True)]

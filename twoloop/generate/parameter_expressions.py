@@ -21,10 +21,12 @@ Powers = tuple[tuple[int, float], ...]
 
 MAX_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
-CANCELLED = 8.0 * 2.0**-52  # largest sum of two terms, relative to one of them, that counts as zero: rounding error
-NUMBERS = (int, float, np.number)  # types of numbers; a Parameter is a float
-_UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
-FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}
+CANCELLATION_LIMIT = (
+    8.0 * 2.0**-52
+)  # largest sum of two terms, relative to one of them, that counts as zero: rounding error
+NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
+_UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
+FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY_FUNCTIONS, "hypot", "power")}
 OPERATORS: dict[str, Callable[..., Any]] = {  # functions that use only operators of Python, by the names in NumPy
     "add": operator.add,
     "subtract": operator.sub,
@@ -55,31 +57,31 @@ class Symbolic:
 
     Attributes
     ----------
-    running : bool
+    is_tracing : bool
         Whether a callback is being traced with this object.
-    refused : str
+    refusal_reason : str
         Reason why the callback cannot be traced, or "". It is stored because the callback may catch the exception.
     """
 
-    running, refused = False, ""
+    is_tracing, refusal_reason = False, ""
 
     def refuse(self, reason: str) -> NoReturn:
         """Store the reason why a callback cannot be traced, and raise an exception that ends the callback."""
-        if not self.running:
+        if not self.is_tracing:
             raise Untraceable(reason)
-        self.refused = self.refused or reason
+        self.refusal_reason = self.refusal_reason or reason
         raise Refusal(reason)
 
     @contextmanager
-    def watched(self) -> Iterator[None]:
+    def running_callback(self) -> Iterator[None]:
         """Return a context in which a callback runs; on exit, raise Untraceable if the callback caught a Refusal."""
-        self.running, self.refused = True, ""
+        self.is_tracing, self.refusal_reason = True, ""
         try:
             yield
         finally:
-            self.running = False
-        if self.refused:
-            raise Untraceable(f"{self.refused}, and catches the exception that says so")
+            self.is_tracing = False
+        if self.refusal_reason:
+            raise Untraceable(f"{self.refusal_reason}, and catches the exception that says so")
 
 
 class ParameterTape(Symbolic):
@@ -98,8 +100,10 @@ class ParameterTape(Symbolic):
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
         self.atoms: list[Any] = [None] * len(values)
-        self.merged: dict[tuple[Powers, Powers], Powers] = {}  # cache: product of two Powers, by the pair of factors
-        self._places: dict[Any, int] = {}
+        self._merged_products: dict[
+            tuple[Powers, Powers], Powers
+        ] = {}  # cache: product of two Powers, by the pair of factors
+        self._atom_indices: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
         for i in varying:
@@ -107,27 +111,27 @@ class ParameterTape(Symbolic):
 
     def atom(self, definition: Any) -> Powers:
         """Return the atom with a definition (sum or function) as Powers; add it unless an equal one exists."""
-        if definition not in self._places:
-            self._places[definition] = len(self.atoms)
+        if definition not in self._atom_indices:
+            self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)
-        return ((self._places[definition], 1.0),)
+        return ((self._atom_indices[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
         """Return a number as a sum of terms: a dict from the Powers of each term to its coefficient."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
-        (i, exponent), *further = number.powers
+        (i, exponent), *other_powers = number.powers
         definition = self.atoms[i]
-        if further or exponent != 1.0 or definition is None or definition[0] != "sum":
+        if other_powers or exponent != 1.0 or definition is None or definition[0] != "sum":
             return {number.powers: number.scale}
         return {powers: number.scale * c for powers, c in definition[1]}
 
-    def on(self, parameters: Array) -> Callable[[float], Any]:
-        """Return a function that evaluates a float or Parameter for other parameters, with results as in `products`."""
-        product = self.products(parameters)
+    def number_evaluator(self, parameters: Array) -> Callable[[float], Any]:
+        """Return a function that evaluates a float or a Parameter for other parameters, see `product_evaluator`."""
+        product = self.product_evaluator(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
-    def products(self, parameters: Array) -> Callable[[Powers], Any]:
+    def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
         """Return a function that evaluates Powers for other parameters.
 
         For parameters (n_runs, n_p) the function returns an array (n_runs,), or one number for all runs.
@@ -159,7 +163,7 @@ class ParameterTape(Symbolic):
 
     def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
         """Return the values of numbers for other parameters (n_runs, n_p), as an array (n_runs, len(numbers))."""
-        product = self.products(parameters)
+        product = self.product_evaluator(parameters)
         rows = {powers: k for k, powers in enumerate(dict.fromkeys(parameter.powers for parameter in numbers))}
         products = np.empty((len(rows), len(parameters)))
         with np.errstate(all="ignore"):
@@ -188,17 +192,17 @@ class Parameter(float):
         name = NUMPY_NAMES.get(ufunc.__name__, ufunc.__name__)
         if method != "__call__" or name not in _OPERATIONS.keys() | FUNCTIONS.keys() or options:
             self._refuse_decision(f"it calls numpy.{ufunc.__name__} on its parameters")
-            plain = (float(x) if type(x) is Parameter else x for x in inputs)
-            return getattr(ufunc, method)(*plain, **options)
+            plain_inputs = (float(x) if type(x) is Parameter else x for x in inputs)
+            return getattr(ufunc, method)(*plain_inputs, **options)
         return elementwise(lambda *arguments: apply_function(name, *arguments), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
         """Refuse an operation whose result depends on the current value, unless a module of `generate` called it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
-        if self.tape.running and not caller.startswith(__name__.rpartition(".")[0]):
+        if self.tape.is_tracing and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
 
-    def to(self, exponent: float) -> "Parameter":
+    def to_power(self, exponent: float) -> "Parameter":
         """Return this number to the power `exponent`, a nonzero whole number."""
         powers = tuple([(place, exponent * power) for place, power in self.powers])
         return Parameter(_as_float(self) ** exponent, self.tape, self.scale**exponent, powers)
@@ -227,7 +231,7 @@ def _sum(a: float, b: float) -> float:
     terms, value = tape.terms(a), _as_float(a) + _as_float(b)
     for powers, c in tape.terms(b).items():
         total = terms.get(powers, 0.0) + c
-        if abs(total) <= CANCELLED * abs(c):
+        if abs(total) <= CANCELLATION_LIMIT * abs(c):
             terms.pop(powers, None)
         else:
             terms[powers] = total
@@ -250,12 +254,12 @@ def _product(a: float, b: float) -> float:
             return a
         return Parameter(_as_float(a) * b, tape, a.scale * b, a.powers) if b else 0.0
     scale, pair = a.scale * b.scale, (a.powers, b.powers)
-    merged = tape.merged.get(pair)
+    merged = tape._merged_products.get(pair)
     if merged is None:
         powers = dict(a.powers)
         for place, exponent in b.powers:
             powers[place] = powers.get(place, 0.0) + exponent
-        merged = tape.merged[pair] = tuple(sorted(factor for factor in powers.items() if factor[1]))
+        merged = tape._merged_products[pair] = tuple(sorted(factor for factor in powers.items() if factor[1]))
     return Parameter(_as_float(a) * _as_float(b), tape, scale, merged) if merged else scale
 
 
@@ -264,14 +268,14 @@ def _power(base: float, exponent: float) -> float:
     if type(exponent) is Parameter or not exponent.is_integer():
         return _record_function("power", base, exponent)
     assert isinstance(base, Parameter)
-    return base.to(exponent) if exponent else 1.0
+    return base.to_power(exponent) if exponent else 1.0
 
 
 _OPERATIONS: dict[str, Callable[[float, float], float]] = {
     "add": _sum,
     "subtract": lambda a, b: _sum(a, -b),
     "multiply": _product,
-    "divide": lambda a, b: _product(a, b.to(-1.0) if type(b) is Parameter else 1.0 / b),
+    "divide": lambda a, b: _product(a, b.to_power(-1.0) if type(b) is Parameter else 1.0 / b),
     "power": _power,
 }
 
@@ -283,7 +287,7 @@ def _tape_of(*numbers: float) -> ParameterTape:
 def apply_function(name: str, *arguments: Any) -> Any:
     """Return the value of a function of NumPy or `math`, by its name; a Parameter if an argument is a Parameter."""
     name = NUMPY_NAMES.get(name, name)
-    if any(not issubclass(type(x), NUMBERS) for x in arguments):  # a symbol has its own operators
+    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # a symbol has its own operators
         return OPERATORS[name](*arguments)
     numbers = [x if type(x) is Parameter else float(x) for x in arguments]
     if not any(type(x) is Parameter for x in numbers):
@@ -304,27 +308,27 @@ def _record_function(name: str, *numbers: float) -> Parameter:
 def _binary_operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
     operation = _OPERATIONS[name]
 
-    def operate(self: Parameter, other: Any) -> Any:
+    def apply_operator(self: Parameter, other: Any) -> Any:
         if type(other) is float or type(other) is Parameter:
             return operation(other, self) if swapped else operation(self, other)
         pair = (other, self) if swapped else (self, other)
         if issubclass(type(other), np.ndarray):
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
-        if not issubclass(type(other), NUMBERS):  # by type(): a symbol refuses isinstance
+        if not issubclass(type(other), NUMBER_TYPES):  # by type(): a symbol refuses isinstance
             return NotImplemented
         return operation(*(x if type(x) is Parameter else float(x) for x in pair))
 
-    return operate
+    return apply_operator
 
 
 def _refusing_method(name: str) -> Callable[..., Any]:
     float_method = getattr(float, name)
 
-    def decide(self: Parameter, *others: Any) -> Any:
+    def refuse_and_call(self: Parameter, *others: Any) -> Any:
         self._refuse_decision()
         return float_method(self, *others)
 
-    return decide
+    return refuse_and_call
 
 
 _REFUSED_METHODS = ("bool", "int", "float", "trunc", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne")
@@ -334,7 +338,7 @@ Parameter.__hash__ = float.__hash__  # type: ignore[method-assign]
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
     setattr(Parameter, f"__{_symbol}__", _binary_operator(_name, False))
     setattr(Parameter, f"__r{_symbol}__", _binary_operator(_name, True))
-for _name in _UNARY:
+for _name in _UNARY_FUNCTIONS:
     # NumPy functions call methods of these names for arrays of objects
     setattr(Parameter, _name, lambda self, name=_name: apply_function(name, self))
 
@@ -358,18 +362,18 @@ def _as_object_array(value: Any) -> Any:
     return array
 
 
-def array_of(values: Iterable[float]) -> Any:
+def number_array(values: Iterable[float]) -> Any:
     """Return an array of floats, or of objects if some values are Parameters."""
     values = list(values)
     return np.array(values, dtype=object if any(type(value) is Parameter for value in values) else float)
 
 
-def number(value: Any) -> float:
+def as_number(value: Any) -> float:
     """Return a number as a float; a Parameter is returned unchanged."""
     return value if type(value) is Parameter else float(value)
 
 
-def function_of_number(name: str) -> Callable[[float], float]:
+def math_function(name: str) -> Callable[[float], float]:
     """Return a function of `math` by its name; for a Parameter, the function returns a Parameter."""
     function = getattr(math, name)
     return lambda x: apply_function(name, x) if type(x) is Parameter else function(x)

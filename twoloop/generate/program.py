@@ -1,7 +1,7 @@
 """Execute programs (selected outputs of a graph) in any algebra, and assign array indices to their coefficients.
 
-- `Program.run` executes a program, or writes code for it. The algebra defines what values are: arrays (`Arrays`), LLVM
-  values (`llvm_code.Lowering`), degrees of growth (`time_dependence.Degrees`).
+- `Program.run` executes a program, or writes code for it. The algebra defines what values are: arrays (`ArrayAlgebra`),
+  LLVM values (`llvm_code.Lowering`), degrees of growth (`time_dependence.DegreeAlgebra`).
 - `OperationTable` lists the operations as arrays, which compiled kernels interpret row by row.
 - Derivatives are further quantities of the graph (`graph.Derivative`). Expressions of parameters alone are coefficients
   (`parameter_expressions`), which are computed before a program runs.
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.graph import Affine, Graph, rounded
-from twoloop.generate.parameter_expressions import Parameter, ParameterTape, Powers, array_of
+from twoloop.generate.parameter_expressions import Parameter, ParameterTape, Powers, number_array
 from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.operations import KIND, N_COLUMNS, NODE, RESULT
 
@@ -38,7 +38,7 @@ class Algebra(Generic[T]):
     Attributes
     ----------
     functions : mapping
-        By kinds of operations with one argument: functions from value to value.
+        For each kind of operation with one argument: the function that computes its value.
     values : dict
         Values of the quantities defined so far, by index of the quantity.
     """
@@ -48,12 +48,12 @@ class Algebra(Generic[T]):
     def __init__(self) -> None:
         self.values: dict[int, T] = {}
 
-    def affine(self, expression: Affine) -> T:
+    def affine(self, expr: Affine) -> T:
         """Return the value of an affine expression."""
         raise NotImplementedError
 
     def product(self, a: T, b: T) -> T:
-        """Return a b."""
+        """Return the product of a and b."""
         raise NotImplementedError
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> T:
@@ -78,7 +78,7 @@ class Algebra(Generic[T]):
     def outputs(self, program: "Program") -> list[list[T]]:
         """Return the arrays of a program with defined inputs; compute the quantities of its conditions, too."""
         self.run(program.graph, program.quantities())
-        return [[self.affine(form) for form in forms] for forms in program.arrays.values()]
+        return [[self.affine(expr) for expr in exprs] for exprs in program.arrays.values()]
 
 
 @dataclass(frozen=True)
@@ -105,32 +105,32 @@ class Program:
         return algebra.outputs(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return the indices of the quantities needed for arrays and conditions, see `Graph.needed_by`."""
-        return self.graph.needed_by(self.forms, available)
+        """Return the indices of the quantities needed for arrays and conditions, see `Graph.quantities_for`."""
+        return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
         """Return the number of multiplications and additions; a reciprocal counts as four, other functions as none."""
-        forms, total = self.forms, 0
+        exprs, total = self.expressions, 0
         for i in self.quantities():
             kind, *_ = self.graph.operations[i]  # type: ignore[misc]
             total += COSTS.get(kind, 0)
-            forms += self.graph.arguments(i)
-        return total + sum(max(len(form.terms) - 1, 0) for form in forms)
+            exprs += self.graph.arguments(i)
+        return total + sum(max(len(expr.terms) - 1, 0) for expr in exprs)
 
     @property
     def sizes(self) -> tuple[dict[str, int], int]:
         """Return the sizes of the arrays, and the number of conditions."""
-        return {name: len(forms) for name, forms in self.arrays.items()}, len(self.conditions)
+        return {name: len(exprs) for name, exprs in self.arrays.items()}, len(self.conditions)
 
     @property
-    def forms(self) -> list[Affine]:
+    def expressions(self) -> list[Affine]:
         """Return the list of all expressions in arrays and conditions."""
-        forms = [form for array in self.arrays.values() for form in array]
-        return [*forms, *(form for condition in self.conditions for form in condition)]
+        exprs = [expr for array in self.arrays.values() for expr in array]
+        return [*exprs, *(expr for condition in self.conditions for expr in condition)]
 
 
-class Arrays(Algebra[Any]):
-    """Algebra of NumPy arrays (n_runs,): a value is an array with one number for each run, or one number for all.
+class ArrayAlgebra(Algebra[Any]):
+    """Algebra of NumPy arrays (n_runs,): a value is an array with one number for each run, or one number for all runs.
 
     Parameters
     ----------
@@ -153,17 +153,17 @@ class Arrays(Algebra[Any]):
 
     def __init__(self, tape: ParameterTape, parameters: Array):
         super().__init__()
-        self._coefficient = tape.on(parameters)
+        self._coefficient = tape.number_evaluator(parameters)
 
-    def affine(self, expression: Affine) -> Any:
+    def affine(self, expr: Affine) -> Any:
         """Return the values of an affine expression."""
-        total = self._coefficient(expression.constant)
-        for i, c in expression.terms.items():
+        total = self._coefficient(expr.constant)
+        for i, c in expr.terms.items():
             total = total + self._coefficient(c) * self.values[i]
         return total
 
     def product(self, a: Any, b: Any) -> Any:
-        """Return a b."""
+        """Return the product of a and b."""
         return a * b
 
     def outputs(self, program: Program) -> list[list[Any]]:
@@ -187,31 +187,31 @@ class OperationTable(NamedTuple):
     n_nodes: int
 
     @classmethod
-    def of(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
+    def from_results(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
         """Return the table that computes `results`, expressions by result index; `n_inputs`: number of its inputs."""
-        needed = graph.needed_by(results.values())
-        node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
-        operations: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
-        operations += [(RESULT, form, None, index) for index, form in results.items()]
+        needed = graph.quantities_for(results.values())
+        node_of = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
+        operations: list[Any] = [(*graph.operations[i], node_of[i]) for i in needed]  # type: ignore[misc]
+        operations += [(RESULT, expr, None, index) for index, expr in results.items()]
         terms: list[tuple[int, float]] = []
         rows, constants = [], []
         for kind, first, second, index in operations:
             begin = len(terms)
-            terms += [(node[i], c) for i, c in first.terms.items()]
+            terms += [(node_of[i], c) for i, c in first.terms.items()]
             middle = len(terms)
             if second is not None:
-                terms += [(node[i], c) for i, c in second.terms.items()]
+                terms += [(node_of[i], c) for i, c in second.terms.items()]
             rows.append((kind, index, begin, middle, len(terms)))
             constants += [first.constant, 0.0 if second is None else second.constant]
         return cls(
             np.array(rows, dtype=np.int64).reshape(-1, N_COLUMNS),
             np.array([i for i, _ in terms], dtype=np.int64),
-            array_of(c for _, c in terms),
-            array_of(constants).reshape(-1, 2),
-            len(node),
+            number_array(c for _, c in terms),
+            number_array(constants).reshape(-1, 2),
+            len(node_of),
         )
 
-    def flat(self) -> list[float]:
+    def as_floats(self) -> list[float]:
         """Return the table as a list of floats, to be stored in parameters of a model; results are the first nodes."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
@@ -221,7 +221,7 @@ class OperationTable(NamedTuple):
         parts: list[Any] = [sizes, rows.ravel(), self.columns + n_results, self.coefficients, self.constants.ravel()]
         return [float(x) for part in parts for x in part]
 
-    def packed(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
+    def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
         """Return the table as one array of integers and one of floats; results are stored at `result_indices`."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
@@ -229,9 +229,9 @@ class OperationTable(NamedTuple):
         integers = np.concatenate([header, rows.ravel(), self.columns, result_indices])
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
-    def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "OperationTable":
-        """Return a copy of the table with `numbers_for` applied to its two arrays of coefficients and constants."""
-        return self._replace(constants=numbers_for(self.constants), coefficients=numbers_for(self.coefficients))
+    def with_coefficients(self, convert: Callable[[Any], Array]) -> "OperationTable":
+        """Return a copy of the table with `convert` applied to its two arrays of coefficients and constants."""
+        return self._replace(constants=convert(self.constants), coefficients=convert(self.coefficients))
 
 
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
@@ -241,19 +241,19 @@ LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference from 1 or -1 at which a
 
 
 class Coefficient(float):
-    """Coefficient that generated code reads from an array, at index `place`; compared by identity, not by value.
+    """Coefficient that generated code reads from an array; compared by identity, not by value.
 
-    `varies`: whether the array is the one of the coefficients that vary with parameters.
+    `index`: index in the array. `varies`: whether the array is that of the coefficients that vary with parameters.
     """
 
-    __slots__ = ("place", "varies")
-    place: int
+    __slots__ = ("index", "varies")
+    index: int
     varies: bool
 
-    def __new__(cls, value: float, place: int, varies: bool = False) -> "Coefficient":
-        """Create a coefficient; `value`: its current value, `place`: its index in the array."""
+    def __new__(cls, value: float, index: int, varies: bool = False) -> "Coefficient":
+        """Create a coefficient; `value`: its current value, `index`: its index in the array."""
         coefficient = super().__new__(cls, value)
-        coefficient.place, coefficient.varies = place, varies
+        coefficient.index, coefficient.varies = index, varies
         return coefficient
 
     def __eq__(self, other: object) -> bool:
@@ -263,49 +263,52 @@ class Coefficient(float):
         return id(self)
 
     def __repr__(self) -> str:
-        return f"{'varying' if self.varies else 'number'} {self.place}"
+        return f"{'varying' if self.varies else 'number'} {self.index}"
 
 
 class Coefficients:
     """Assignment of array indices to the coefficients of expressions, in the order of their first use.
 
-    Equal expressions have the same indices. `apart`: whether coefficients that vary with parameters have an array, and
-    indices, of their own, because their values differ between SIMD lanes.
+    Equal expressions have the same indices. `separate_varying`: whether coefficients that vary with parameters
+    have an array and indices of their own, because their values differ between SIMD lanes.
     """
 
-    def __init__(self, apart: bool = False) -> None:
-        self._apart = apart
+    def __init__(self, separate_varying: bool = False) -> None:
+        self._separates_varying = separate_varying
         self._values: list[float] = []
         self._formulas: Any = np.zeros(0)
         self._varying: dict[tuple[float, Powers], Parameter] = {}
-        self._numbered: dict[tuple[Terms, float], tuple[Terms, float]] = {}
-        self._of_forms: dict[Any, tuple[Terms, float]] = {}
+        self._indexed_terms: dict[tuple[Terms, float], tuple[Terms, float]] = {}
+        self._indexed_expressions: dict[Any, tuple[Terms, float]] = {}
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Return the array of the coefficients' values; if `apart`, of those coefficients that do not vary."""
+        """Return the values of the coefficients; if `separate_varying`, only of those that do not vary."""
         return np.array(self._values, dtype=np.float64)
 
     @property
     def formulas(self) -> Any:
         """Return `values` as expressions in the parameters; the same array object until a coefficient is added."""
         if len(self._formulas) != len(self._values):
-            self._formulas = array_of(self._values)
+            self._formulas = number_array(self._values)
         return self._formulas
 
-    def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
+    def indexed_terms(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
         """Return terms and a constant with each number as a literal, or as a Coefficient that is read from an array."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
-        numbers = self._numbered.get(key)
+        numbers = self._indexed_terms.get(key)
         if numbers is None:
-            numbers = self._numbered[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
+            numbers = self._indexed_terms[key] = (
+                tuple((i, self._literal_or_coefficient(c)) for i, c in terms),
+                self._literal_or_coefficient(constant),
+            )
         return numbers
 
-    def of_form(self, form: Affine) -> tuple[Terms, float]:
-        """Return the terms and the constant of an affine expression, with literals and Coefficients as in `of`."""
-        numbers = self._of_forms.get(form.key)
+    def indexed_expression(self, expr: Affine) -> tuple[Terms, float]:
+        """Return terms and constant of an affine expression, with literals and Coefficients as in `indexed_terms`."""
+        numbers = self._indexed_expressions.get(expr.key)
         if numbers is None:
-            numbers = self._of_forms[form.key] = self.of(tuple(form.terms.items()), form.constant)
+            numbers = self._indexed_expressions[expr.key] = self.indexed_terms(tuple(expr.terms.items()), expr.constant)
         return numbers
 
     def structure(self, program: Program, stored: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
@@ -313,43 +316,43 @@ class Coefficients:
 
         `stored`: indices in memory of the quantities that are loaded instead of computed.
         """
-        graph, forms = program.graph, program.forms
-        needed = graph.needed_by(forms, stored)
-        name: dict[int, Any] = {i: f"input {i}" for i, operation in enumerate(graph.operations) if operation is None}
-        name |= {i: k for k, i in enumerate(needed)}
-        name |= {i: f"kept {place}" for i, place in stored.items()}
+        graph, exprs = program.graph, program.expressions
+        needed = graph.quantities_for(exprs, stored)
+        names: dict[int, Any] = {i: f"input {i}" for i, operation in enumerate(graph.operations) if operation is None}
+        names |= {i: k for k, i in enumerate(needed)}
+        names |= {i: f"kept {index}" for i, index in stored.items()}
 
-        def described_form(form: Affine) -> Any:
-            terms, constant = self.of_form(form)
-            return [(name[i], c) for i, c in terms], constant
+        def describe(expr: Affine) -> Any:
+            terms, constant = self.indexed_expression(expr)
+            return [(names[i], c) for i, c in terms], constant
 
-        yield [described_form(form) for form in forms]
+        yield [describe(expr) for expr in exprs]
         for i in needed:
             kind, *arguments = graph.operations[i]  # type: ignore[misc]
-            yield kind, [described_form(form) for form in arguments if isinstance(form, Affine)]
+            yield kind, [describe(expr) for expr in arguments if isinstance(expr, Affine)]
 
     @property
     def n_varying(self) -> int:
         """Return the number of coefficients that vary with parameters."""
         return len(self._varying)
 
-    def for_parameters(self, tape: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    def values_for(self, tape: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the values (n_runs, n_varying) of the coefficients that vary, for parameters (n_runs, n_p)."""
         return tape.evaluate(list(self._varying.values()), parameters)
 
-    def _number(self, value: float) -> float:
+    def _literal_or_coefficient(self, value: float) -> float:
         if type(value) is Parameter:  # no literal, even if its current value is 0 or 1
-            if self._apart:
-                expression = value.scale, value.powers
-                self._varying.setdefault(expression, value)
-                return Coefficient(value, list(self._varying).index(expression), varies=True)
-        elif (exact := literal(value)) is not None:
-            return exact
+            if self._separates_varying:
+                expr = value.scale, value.powers
+                self._varying.setdefault(expr, value)
+                return Coefficient(value, list(self._varying).index(expr), varies=True)
+        elif (literal := nearest_literal(value)) is not None:
+            return literal
         self._values.append(value)
         return Coefficient(value, len(self._values) - 1)
 
 
-def literal(value: float) -> float | None:
+def nearest_literal(value: float) -> float | None:
     """Return 0, 1 or -1 if a number equals it up to rounding; None if the number must be read from an array."""
     if type(value) is Parameter or not math.isfinite(value):
         return None

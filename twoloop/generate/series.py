@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.graph import MOST_OPERATIONS, Affine, Graph, Untraceable
-from twoloop.generate.parameter_expressions import array_of, elementwise
+from twoloop.generate.graph import MAX_TRACED_OPERATIONS, Affine, Graph, Untraceable
+from twoloop.generate.parameter_expressions import elementwise, number_array
 from twoloop.generate.trace import Equations, Evaluator, TraceCache, derive_cached, only_quantity
-from twoloop.generate.traced_values import Check, Traced, unchecked
+from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem
 
@@ -37,12 +37,12 @@ class Sums(NamedTuple):
     coefficient: Array  # coefficient of the first term of each expression
     constant: Array
     row: Integers  # index of the expression to which each further term belongs
-    more_column: Integers  # quantity in each further term
-    more_coefficient: Array
+    further_column: Integers  # quantity in each further term
+    further_coefficient: Array
 
 
 @dataclass(frozen=True)
-class Table:
+class OperationGroups:
     """Table of operations in the order of their computation; their results are consecutive quantities.
 
     Attributes
@@ -83,31 +83,33 @@ class SeriesProgram:
 
     n_q: int
     n_rows: int
-    early: Table
-    late: Table
+    early: OperationGroups
+    late: OperationGroups
     rows: Sums
-    row_places: Integers
+    row_indices: Integers
     balance: Sums
-    balance_places: Integers
-    traced: Traced | None = None
+    balance_indices: Integers
+    traced: CallbackTraces | None = None
 
     @property
     def n_operations(self) -> int:
         """Return the number of operations, including the products of G v and G^T lam + M a."""
         return len(self.early.first.column) + len(self.late.first.column)
 
-    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
+    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
         """Return a copy of the program with coefficients for the parameters of one system."""
 
-        def sums(expressions: Sums) -> Sums:
-            coefficient, constant = evaluate(expressions.coefficient), evaluate(expressions.constant)
-            more_coefficient = evaluate(expressions.more_coefficient)
-            return expressions._replace(coefficient=coefficient, constant=constant, more_coefficient=more_coefficient)
+        def sums(exprs: Sums) -> Sums:
+            coefficient, constant = evaluate(exprs.coefficient), evaluate(exprs.constant)
+            further_coefficient = evaluate(exprs.further_coefficient)
+            return exprs._replace(coefficient=coefficient, constant=constant, further_coefficient=further_coefficient)
 
-        early, late = (Table(table.groups, sums(table.first), sums(table.second)) for table in (self.early, self.late))
+        early, late = (
+            OperationGroups(table.groups, sums(table.first), sums(table.second)) for table in (self.early, self.late)
+        )
         rows, balance = sums(self.rows), sums(self.balance)
         assert self.traced is not None
-        traced = self.traced.of(system, evaluate)
+        traced = self.traced.for_system(system, evaluate)
         return replace(self, early=early, late=late, rows=rows, balance=balance, traced=traced)
 
     @property
@@ -121,12 +123,12 @@ class SeriesProgram:
         return 1 + 3 * self.n_q + self.n_rows + self.n_operations
 
 
-def is_quick(system: ConstrainedSystem) -> bool:
+def is_quick_to_trace(system: ConstrainedSystem) -> bool:
     """Return whether M, C_q and A have so few entries, zeros among them, that tracing a series takes about a second."""
     return system.n_q * (system.n_q + system.n_c + system.n_a) <= MAX_ENTRIES
 
 
-def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesProgram:
+def series_for(system: ConstrainedSystem, check: Check = accept_traces) -> SeriesProgram:
     """Return the cached series program of a system; `check` raises if calls of callbacks differ from their traces.
 
     Raises
@@ -158,10 +160,10 @@ def series_program(
     n, n_rows = system.n_q, system.n_c + system.n_a
     graph, v = equations.graph, equations.v
     a, lam = graph.inputs(n, True), graph.inputs(n_rows, True)
-    mass, force, jacobian, nonholonomic, rate, nonholonomic_rate = map(equations.of, USED_CALLBACKS)
-    sums = _sums_of(graph)
+    mass, force, jacobian, nonholonomic, rate, nonholonomic_rate = map(equations.expressions, USED_CALLBACKS)
+    sums = _find_sums(graph)
     arrays = np.vstack([jacobian, nonholonomic]), mass, np.append(rate, nonholonomic_rate), force
-    G, mass, rates, force = (elementwise(partial(_without_sums, sums), [array]) for array in arrays)
+    G, mass, rates, force = (elementwise(partial(_expand_sums, sums), [array]) for array in arrays)
     row_products: dict[Any, Any] = {}
     zero = Affine(graph, 0.0, {})
     used_rows = [i for i in range(n_rows) if independent is None or i in independent]
@@ -177,26 +179,26 @@ def series_program(
         balance.append(total)
     inputs = [*range(1 + 2 * n), *map(only_quantity, a), *map(only_quantity, lam)]
     program = _assemble_program(graph, sums, inputs, n, n_rows, rows, balance, row_products, reaction_products)
-    return replace(program, traced=Traced(system, graph))
+    return replace(program, traced=CallbackTraces(system, graph))
 
 
-def _sums_of(graph: Graph) -> dict[int, Affine]:
+def _find_sums(graph: Graph) -> dict[int, Affine]:
     """Return the expressions that replace quantities that are sums, by quantity: sums need no recurrence."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
-            sums[i] = _without_sums(sums, operation[1])
+            sums[i] = _expand_sums(sums, operation[1])
     return sums
 
 
-def _without_sums(sums: dict[int, Affine], form: Affine) -> Affine:
+def _expand_sums(sums: dict[int, Affine], expr: Affine) -> Affine:
     """Return an expression in which quantities that are sums are replaced by their terms."""
-    summed = [i for i in form.terms if i in sums]
-    if not summed:
-        return form
-    total = _without_terms(form, summed)
-    for i in summed:
-        total = total + sums[i].times(form.terms[i])
+    sum_quantities = [i for i in expr.terms if i in sums]
+    if not sum_quantities:
+        return expr
+    total = _without_terms(expr, sum_quantities)
+    for i in sum_quantities:
+        total = total + sums[i].times(expr.terms[i])
     return total
 
 
@@ -223,8 +225,8 @@ def _sum_of_products(
         if not factor.terms:
             continue
         varying = Affine(graph, 0.0, factor.terms)
-        scale, form = varying.normalised()
-        _add_to_group(by_factor, form, multiplier.times(scale))
+        scale, expr = varying.normalized()
+        _add_to_group(by_factor, expr, multiplier.times(scale))
         for i, c in factor.terms.items():
             _add_to_group(by_quantity, graph.quantity(i), multiplier.times(c))
     groups = (by_quantity, by_factor) if of_rates else (by_factor, by_quantity)
@@ -240,7 +242,7 @@ def _sum_of_products(
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
     """Return the key of a product, its constant factor, and both factors; the second one is normalized."""
-    scale, multiplier = multiplier.normalised()
+    scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier
 
 
@@ -262,20 +264,20 @@ def _assemble_program(
 ) -> SeriesProgram:
     early: list[Any] = []
     late: list[Any] = []
-    factors = [form for group in (row_products, reaction_products) for _, *forms in group.values() for form in forms]
+    factors = [expr for group in (row_products, reaction_products) for _, *exprs in group.values() for expr in exprs]
     for i, operation in _needed_operations(graph, [*rows, *balance, *factors]):
         if i not in sums:
             kind, first, second = operation
-            arguments = (_without_sums(sums, first), None if second is None else _without_sums(sums, second))
-            (late if graph.late[i] else early).append((i, kind, *arguments))
-    if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST_OPERATIONS:
-        raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
+            arguments = (_expand_sums(sums, first), None if second is None else _expand_sums(sums, second))
+            (late if graph.is_late[i] else early).append((i, kind, *arguments))
+    if len(early) + len(late) + len(row_products) + len(reaction_products) > MAX_TRACED_OPERATIONS:
+        raise Untraceable(f"its equations are more than {MAX_TRACED_OPERATIONS} operations")
     tables = [
         [
             *_grouped_operations(operations),
             (
                 PENDING,
-                sorted([(only_quantity(form), *factors) for form, *factors in products.values()], key=_term_counts),
+                sorted([(only_quantity(expr), *factors) for expr, *factors in products.values()], key=_term_counts),
             ),
         ]
         for operations, products in ((early, row_products), (late, reaction_products))
@@ -289,16 +291,16 @@ def _assemble_program(
     return SeriesProgram(
         n,
         n_rows,
-        _table(tables[0], nodes),
-        _table(tables[1], nodes),
-        *_nonzero_sums([_without_terms(form, v_and_a) for form in rows], nodes),
-        *_nonzero_sums([_without_terms(form, lam_and_a) for form in balance], nodes),
+        _make_groups(tables[0], nodes),
+        _make_groups(tables[1], nodes),
+        *_nonzero_sums([_without_terms(expr, v_and_a) for expr in rows], nodes),
+        *_nonzero_sums([_without_terms(expr, lam_and_a) for expr in balance], nodes),
     )
 
 
-def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
-    """Return the operations that `forms` need, as (quantity, operation), each sine with the cosine of its angle."""
-    needed = set(graph.needed_by(forms))
+def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any]]:
+    """Return the operations that `exprs` need, as (quantity, operation), each sine with the cosine of its angle."""
+    needed = set(graph.quantities_for(exprs))
     trigonometric = (SINE, COSINE)
     angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trigonometric}
     return [
@@ -308,30 +310,30 @@ def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any
     ]
 
 
-def _nonzero_sums(forms: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero ones of `forms` as Sums, and their indices in `forms`; `nodes`: node of each quantity."""
-    indices = [k for k, form in enumerate(forms) if form.terms or form.constant]
-    sums = _as_sums([forms[k] for k in indices], nodes)
+def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
+    """Return the nonzero ones of `exprs` as Sums, and their indices in `exprs`; `nodes`: node of each quantity."""
+    indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
+    sums = _as_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)
     return sums._replace(row=index_array[sums.row]), index_array
 
 
-def _without_terms(form: Affine, inputs: Container[int]) -> Affine:
+def _without_terms(expr: Affine, inputs: Container[int]) -> Affine:
     """Return an expression without its terms in the quantities `inputs`."""
-    return Affine(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
+    return Affine(expr.graph, expr.constant, {i: c for i, c in expr.terms.items() if i not in inputs})
 
 
 def _grouped_operations(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     """Return groups of operations of one kind, as (kind, operations); a group depends only on the groups before it."""
     nodes = {node for node, *_ in operations}
-    level: dict[int, int] = {}
+    levels: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}
     for node, kind, first, second in operations:  # arguments come before the operations that use them
-        arguments = [i for form in (first, second) if form is not None for i in form.terms if i in nodes]
-        level[node] = 1 + max((level[i] for i in arguments), default=0)
+        arguments = [i for expr in (first, second) if expr is not None for i in expr.terms if i in nodes]
+        levels[node] = 1 + max((levels[i] for i in arguments), default=0)
         if second is None:
             second = Affine(first.graph, 0.0, {})
-        groups.setdefault((level[node], kind), []).append((node, first, second))
+        groups.setdefault((levels[node], kind), []).append((node, first, second))
     ordered = []
     for (depth, kind), members in sorted(groups.items()):
         if kind == COSINE:
@@ -349,26 +351,26 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
     return len(first.terms), len(second.terms)
 
 
-def _table(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> Table:
+def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> OperationGroups:
     members = [member for _, group in groups for member in group]
     sums = [_as_sums([member[k] for member in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
     for kind, group in groups:
         end = begin + len(group)
-        more = [bound for arguments in sums for bound in np.searchsorted(arguments.row, [begin, end])]
-        rows.append([kind, begin, end, *more])
+        further_terms = [bound for arguments in sums for bound in np.searchsorted(arguments.row, [begin, end])]
+        rows.append([kind, begin, end, *further_terms])
         begin = end
-    return Table(np.array(rows, dtype=np.int64), *sums)
+    return OperationGroups(np.array(rows, dtype=np.int64), *sums)
 
 
-def _as_sums(forms: list[Affine], nodes: dict[int, int]) -> Sums:
-    terms = [[(nodes[i], c) for i, c in form.terms.items()] or [(0, 0.0)] for form in forms]
-    more = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]
+def _as_sums(exprs: list[Affine], nodes: dict[int, int]) -> Sums:
+    terms = [[(nodes[i], c) for i, c in expr.terms.items()] or [(0, 0.0)] for expr in exprs]
+    further_terms = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]
     return Sums(
         np.array([form_terms[0][0] for form_terms in terms], dtype=np.int64),
-        array_of(form_terms[0][1] for form_terms in terms),
-        array_of(form.constant for form in forms),
-        np.array([term[0] for term in more], dtype=np.int64),
-        np.array([term[1] for term in more], dtype=np.int64),
-        array_of(term[2] for term in more),
+        number_array(form_terms[0][1] for form_terms in terms),
+        number_array(expr.constant for expr in exprs),
+        np.array([term[0] for term in further_terms], dtype=np.int64),
+        np.array([term[1] for term in further_terms], dtype=np.int64),
+        number_array(term[2] for term in further_terms),
     )

@@ -9,7 +9,7 @@ from twoloop.generate.graph import Affine, Graph, Untraceable
 from twoloop.generate.parameter_expressions import Parameter
 from twoloop.generate.program import Algebra
 from twoloop.generate.trace import Evaluator, TraceCache, derive_cached
-from twoloop.generate.traced_values import unchecked
+from twoloop.generate.traced_values import accept_traces
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     COSINE,
@@ -23,9 +23,9 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.problem.system import ConstrainedSystem
 
-BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
+TIME_CALLBACKS = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
 # callbacks whose dependence on the state is analysed
-BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")
+STATE_CALLBACKS = ("force", "mass", "constraint", "jacobian", "nonholonomic")
 SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # operations without short pulses if degrees are at most MAX_DEGREE
 # largest degree of polynomials in time, or in sines and cosines, without short pulses; cos(t)**100 has pulses
 MAX_DEGREE = 8
@@ -38,7 +38,7 @@ MAX_RATE = 4.0
 # largest number of coordinates for which callbacks are traced for this analysis: with more, tracing may take seconds,
 # ten times as long as sampling the forces during a run
 MAX_COORDINATES = 300
-TIME = 1  # bit mask of t, the first input of a graph
+TIME_MASK = 1  # bit mask of t, the first input of a graph
 
 
 class ShortForces(NamedTuple):
@@ -51,12 +51,12 @@ class ShortForces(NamedTuple):
 class Dependence(NamedTuple):
     """Result of the analysis of callbacks; the systems of a trace cache share it."""
 
-    short: ShortForces
-    steep: bool  # whether forces or drives may be steep, see `may_be_steep`
+    short_forces: ShortForces
+    is_steep: bool  # whether forces or drives may be steep, see `may_be_steep`
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
-    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
-        """Return this result, which is the same for all parameters, for one of the systems."""
+    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
+        """Return this result: it is the same for all systems of the trace cache."""
         return self
 
 
@@ -68,7 +68,7 @@ def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForc
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
     dependence = _dependence(system, force_was_traced)
-    return ShortForces(True, True) if dependence is None else dependence.short
+    return ShortForces(True, True) if dependence is None else dependence.short_forces
 
 
 def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
@@ -80,37 +80,39 @@ def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
     if any(may_be_short(system, force_was_traced)):
         return True
     dependence = _dependence(system, force_was_traced)
-    return dependence is None or dependence.steep
+    return dependence is None or dependence.is_steep
 
 
 def _dependence(system: ConstrainedSystem, force_was_traced: bool) -> Dependence | None:
     if system.called_in_python and not force_was_traced:
         return None
     try:
-        dependence: Dependence = derive_cached(system, "dependence", _analyse(system), unchecked)
+        dependence: Dependence = derive_cached(system, "dependence", _make_analysis(system), accept_traces)
     except Untraceable:
         return None
     return dependence
 
 
-def _analyse(system: ConstrainedSystem) -> Any:
+def _make_analysis(system: ConstrainedSystem) -> Any:
     def make(cache: TraceCache) -> Dependence:
         equations = cache.equations(system)
 
         def needed(kinds: tuple[str, ...]) -> list[int]:
-            forms = [form for kind in kinds if kind in system.given for form in equations.of(kind).ravel()]
-            return equations.graph.needed_by(forms)
+            exprs = [expr for kind in kinds if kind in system.given for expr in equations.expressions(kind).ravel()]
+            return equations.graph.quantities_for(exprs)
 
         graph = equations.graph
-        by_state = needed(BY_STATE)
-        short = ShortForces(_has_time_pulses(graph, needed(BY_TIME)), _has_state_pulses(graph, by_state, system.n_q))
-        steep = _is_steep(graph, sorted({*by_state, *needed(BY_TIME)}))
-        return Dependence(short, steep, frozenset(graph.traced))
+        by_state = needed(STATE_CALLBACKS)
+        short_forces = ShortForces(
+            _has_time_pulses(graph, needed(TIME_CALLBACKS)), _has_state_pulses(graph, by_state, system.n_q)
+        )
+        is_steep = _is_steep(graph, sorted({*by_state, *needed(TIME_CALLBACKS)}))
+        return Dependence(short_forces, is_steep, frozenset(graph.traced))
 
     return make
 
 
-class Degrees(Algebra[float]):
+class DegreeAlgebra(Algebra[float]):
     """Algebra of degrees: the value of a quantity is its degree, as if it were a polynomial in some of the inputs."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
@@ -124,39 +126,42 @@ class Degrees(Algebra[float]):
         super().__init__()
         self.values = dict.fromkeys(inputs, 1.0)
 
-    def affine(self, expression: Affine) -> float:
+    def affine(self, expr: Affine) -> float:
         """Return the degree of an affine expression, which is the largest degree of its terms."""
-        return max((self.values.get(i, 0.0) for i in expression.terms), default=0.0)
+        return max((self.values.get(i, 0.0) for i in expr.terms), default=0.0)
 
     def product(self, a: float, b: float) -> float:
         """Return the degree of a product of factors of degrees a and b."""
         return a + b
 
 
-class Vibrations(Degrees):
+class TrigonometricDegrees(DegreeAlgebra):
     """Algebra of degrees in sines and cosines; their high powers are nearly zero between short pulses."""
 
     functions = MappingProxyType(
-        {**Degrees.functions, **dict.fromkeys((SINE, COSINE), lambda degree: max(degree, 1.0))}
+        {**DegreeAlgebra.functions, **dict.fromkeys((SINE, COSINE), lambda degree: max(degree, 1.0))}
     )
 
 
-class Growth(Degrees):
+class GrowthExponents(DegreeAlgebra):
     """Algebra of growth: a value is the exponent p with which a quantity grows, like x^p, for large inputs x."""
 
     functions = MappingProxyType(
         {
-            **Degrees.functions,
+            **DegreeAlgebra.functions,
             RECIPROCAL: lambda power: -power,
             **dict.fromkeys((SINE, COSINE), lambda power: 0.0),
         }
     )
 
 
-class Divisors(Degrees):
-    """Algebra of divisors: a value is the total degree of divisors in a quantity, and of arguments of arctangents."""
+class DivisorDegrees(DegreeAlgebra):
+    """Algebra of divisors: a value is the sum of the degrees of all divisors in a quantity.
 
-    def __init__(self, degrees: Degrees):
+    Arguments of arctangents count, too, because the derivatives of arctangents are quotients.
+    """
+
+    def __init__(self, degrees: DegreeAlgebra):
         super().__init__()
         self._degrees = degrees
 
@@ -166,35 +171,32 @@ class Divisors(Degrees):
         return degree + self._degrees.affine(first) if kind in (RECIPROCAL, ARCTANGENT) else degree
 
 
-class Rates(Degrees):
+class DerivativeBounds(DegreeAlgebra):
     """Algebra of rates: a value bounds the derivative of a quantity with respect to any one coordinate or velocity.
 
     If a parameter is a factor, the bound is infinite, because the parameter may have any value.
     """
 
-    def affine(self, expression: Affine) -> float:
+    def affine(self, expr: Affine) -> float:
         """Return the largest rate of the terms of an affine expression."""
         return max(
-            (
-                math.inf if type(c) is Parameter else abs(c) * self.values.get(i, 1.0)
-                for i, c in expression.terms.items()
-            ),
+            (math.inf if type(c) is Parameter else abs(c) * self.values.get(i, 1.0) for i, c in expr.terms.items()),
             default=0.0,
         )
 
 
 def _has_time_pulses(graph: Graph, needed: list[int]) -> bool:
-    dependent = [i for i in needed if graph.inputs_of[i] & TIME]
-    degrees = Degrees([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
+    dependent = [i for i in needed if graph.input_masks[i] & TIME_MASK]
+    degrees = DegreeAlgebra([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
     degrees.run(graph, dependent)
     return any(graph.kind(i) not in SMOOTH_OPERATIONS or degrees.values[i] > MAX_DEGREE for i in dependent)
 
 
 def _has_state_pulses(graph: Graph, needed: list[int], n_q: int) -> bool:
-    dependent = [i for i in needed if graph.inputs_of[i] & ~TIME]
+    dependent = [i for i in needed if graph.input_masks[i] & ~TIME_MASK]
     inputs = range(1, 2 * n_q + 1)
-    degrees, vibrations, growth = Degrees(inputs), Vibrations(), Growth(inputs)
-    divisors = Divisors(degrees)
+    degrees, vibrations, growth = DegreeAlgebra(inputs), TrigonometricDegrees(), GrowthExponents(inputs)
+    divisors = DivisorDegrees(degrees)
     for algebra in (degrees, vibrations, growth, divisors):
         algebra.run(graph, dependent)
     return any(
@@ -211,7 +213,7 @@ def _is_steep(graph: Graph, needed: list[int]) -> bool:
     """Return whether a quantity in `needed` is a quotient, a root, a sine of time, or a fast sine of the state."""
     if any(graph.kind(i) not in SMOOTH_OPERATIONS for i in needed):
         return True
-    rates = Rates()
+    rates = DerivativeBounds()
     rates.run(graph, needed)
     vibrations = [i for i in needed if graph.kind(i) in (SINE, COSINE)]
-    return any(rates.values[i] > MAX_RATE or graph.inputs_of[i] & TIME for i in vibrations)
+    return any(rates.values[i] > MAX_RATE or graph.input_masks[i] & TIME_MASK for i in vibrations)

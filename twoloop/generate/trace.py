@@ -1,8 +1,8 @@
 """Trace callbacks: run them in Python on symbols; functions of `math` and `numpy` are replaced by symbolic ones.
 
 A callback must do with symbols exactly what it does with numbers. So a function that may treat symbols differently is
-refused by name when it is called with one, even if the callback catches the exception. Differences that tracing cannot
-detect, such as a changed global variable, are found by comparing numbers (`traced_values.py`).
+refused by name when it is called with a symbol, even if the callback catches the exception. Differences that tracing
+cannot detect, such as a changed global variable, are found by comparing numbers (`traced_values.py`).
 
 `Equations` returns the result of every callback of one system as an array of expressions; exact derivatives replace
 missing callbacks. Series, eliminations, references and derived callbacks are generated from these arrays.
@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.callbacks import place_of
-from twoloop.generate.graph import FUNCTIONS, Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.graph import FUNCTIONS, Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.parameter_expressions import (
     OPERATORS,
     Parameter,
@@ -37,8 +37,8 @@ from twoloop.generate.parameter_expressions import (
     Powers,
     Refusal,
     apply_function,
+    as_number,
     elementwise,
-    number,
 )
 from twoloop.kernels.compile.caches import BoundedCache, garbage_collection_off
 from twoloop.kernels.compile.callbacks import KINDS
@@ -68,13 +68,13 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
         If the callback does not run on symbols, or may treat them differently from numbers; the message says why.
     """
     graph, value = t.graph, None
-    with graph.watched():
+    with graph.running_callback():
         try:
             value = _CallbackCopier(lambda copy, _: copy).callback(function)(t, *arguments)
         except (Refusal, Untraceable) as refusal:
-            raise Untraceable(f"{graph.refused or refusal}{place_of(refusal)}") from None
+            raise Untraceable(f"{graph.refusal_reason or refusal}{place_of(refusal)}") from None
         except Exception as error:  # a callback may raise anything on symbols
-            if not graph.refused:
+            if not graph.refusal_reason:
                 text = str(error).partition("\n")[0].replace("twoloop.generate.graph.", "").replace("Affine", "symbol")
                 text = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {text}"
                 raise Untraceable(f"{text}{place_of(error)}") from error
@@ -87,7 +87,7 @@ def convert_to_expressions(graph: Graph, values: Any) -> Any:
         entry = values[index]
         if type(entry) is not Affine:
             try:
-                values[index] = Affine(graph, number(entry), {})
+                values[index] = Affine(graph, as_number(entry), {})
             except Exception as error:
                 raise Untraceable(f"on symbols its entry {index} is {entry!r}, which is not a number") from error
         elif entry.graph is not graph:
@@ -134,14 +134,14 @@ def _symbolic_type(value: Any, *more: Any) -> Any:
     return type(value, *more)
 
 
-def _symbol_in(value: Any) -> Affine | None:
+def _first_symbol(value: Any) -> Affine | None:
     """Return the first symbol in a value (a symbol, an array, a list or a tuple); None if it contains none."""
     if type(value) is Affine:
         return value
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist() if value.dtype == object else ()
     if isinstance(value, list | tuple):
-        return next((symbol for symbol in map(_symbol_in, value) if symbol is not None), None)
+        return next((symbol for symbol in map(_first_symbol, value) if symbol is not None), None)
     return None
 
 
@@ -153,13 +153,13 @@ def _has_parameters(value: Any) -> bool:
 
 
 def _refuse_symbols(value: Any, verb: str) -> None:
-    symbol = _symbol_in(value)
+    symbol = _first_symbol(value)
     if symbol is not None:
         symbol.graph.refuse(f"it {verb} what depends on t, q or v")
 
 
 def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Return a wrapper that calls a function, but refuses symbols, which the function may not treat like numbers."""
+    """Return a wrapper that calls a function, but refuses symbols, which the function might not handle like numbers."""
 
     @functools.wraps(function_of_numbers)
     def function(*arguments: Any, **options: Any) -> Any:
@@ -173,7 +173,7 @@ def _number_or_symbol(numeric: Any, symbolic: Callable[..., Any]) -> Callable[..
     """Return a function that calls `symbolic` if an argument is or contains a symbol, else `numeric`."""
 
     def function(*arguments: Any) -> Any:
-        if _symbol_in(arguments) is None:
+        if _first_symbol(arguments) is None:
             has_parameters = any(type(x) is Parameter for x in arguments)
             return apply_function(numeric.__name__, *arguments) if has_parameters else numeric(*arguments)
         if any(isinstance(x, np.ndarray) for x in arguments if type(x) is not Affine):
@@ -202,7 +202,7 @@ def _symbolic_conversion(conversion: Any) -> Callable[..., Any]:
     """Return a substitute for `array`, `asarray` or `ascontiguousarray` that also accepts expressions."""
 
     def function(value: Any, dtype: Any = None, **options: Any) -> Any:
-        if _symbol_in(value) is None and not _has_parameters(value):
+        if _first_symbol(value) is None and not _has_parameters(value):
             return conversion(value, dtype, **options)
         if not _is_real_dtype(dtype):
             _refuse_symbols(value, f"makes {np.dtype(dtype).name} of")
@@ -213,7 +213,7 @@ def _symbolic_conversion(conversion: Any) -> Callable[..., Any]:
 
 def _symbolic_full(shape: Any, value: Any, dtype: Any = None) -> Any:
     if (
-        _symbol_in(value) is None
+        _first_symbol(value) is None
         and not _has_parameters(value)
         and not (_is_real_dtype(dtype) and np.asarray(value).dtype == np.float64)
     ):
@@ -224,7 +224,7 @@ def _symbolic_full(shape: Any, value: Any, dtype: Any = None) -> Any:
 
 
 def _symbolic_norm(x: Any, *more: Any, **options: Any) -> Any:
-    if _symbol_in(x) is None:
+    if _first_symbol(x) is None:
         return np.linalg.norm(x, *more, **options)
     if more or options or np.ndim(x) != 1:
         _refuse_symbols(x, "calls numpy.linalg.norm, but of a vector, on")
@@ -267,7 +267,7 @@ TRACING_ORDER = (
     *("gamma", "nonholonomic_gamma"),
 )
 # callbacks that return gamma, the right-hand side of G a = gamma, and those for G and G_t, from which gamma is derived
-OF_ROWS = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
+GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
 class Equations:
@@ -290,18 +290,22 @@ class Equations:
     def __init__(self, system: ConstrainedSystem, parameters: Any = None):
         self.system, self.graph = system, Graph()
         self.parameters = system.parameters if parameters is None else parameters
-        self.watched: Any = next((x.tape.watched for x in self.parameters if type(x) is Parameter), nullcontext)
+        self.running_callback: Any = next(
+            (x.tape.running_callback for x in self.parameters if type(x) is Parameter), nullcontext
+        )
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
-        self._forms: dict[str, Any] = {}
-        self._copied: dict[str, Any] = {}  # results of callbacks that were traced before this graph was copied
+        self._expressions: dict[str, Any] = {}
+        self._results_before_copy: dict[
+            str, Any
+        ] = {}  # results of callbacks that were traced before this graph was copied
 
     def trace_all(self) -> "Equations":
         """Trace the callbacks of the system that can be traced, so that copies share the results; return self."""
         for kind in TRACING_ORDER:
             if not self._is_derived(kind):
-                with suppress(Untraceable):  # `of` raises it again if the callback is needed
-                    self.of(kind)
+                with suppress(Untraceable):  # `expressions` raises it again if the callback is needed
+                    self.expressions(kind)
         return self
 
     def copy(self) -> "Equations":
@@ -309,14 +313,14 @@ class Equations:
         equations = copy.copy(self)
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
-            self.t.on(equations.graph),
-            *([x.on(equations.graph) for x in state] for state in (self.q, self.v)),
+            self.t.on_graph(equations.graph),
+            *([x.on_graph(equations.graph) for x in state] for state in (self.q, self.v)),
         )
-        equations._forms, equations._copied = {}, self.graph.traced
+        equations._expressions, equations._results_before_copy = {}, self.graph.traced
         return equations
 
-    def of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the result of a callback as an array of expressions; of a missing callback, derivatives or zeros.
+    def expressions(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
+        """Return the result of a callback as expressions; of a missing callback, derivatives (C_q, gamma) or zeros.
 
         `v`: expressions to be used as velocities, instead of the inputs `self.v`.
 
@@ -326,41 +330,48 @@ class Equations:
             If a callback does not run on symbols; the message names the callback and the reason.
         """
         if v is not None and "v" in KINDS[kind].state:
-            return self._make(kind, v)
-        if kind not in self._forms:
-            self._forms[kind] = self._make(kind, self.v)
-        return self._forms[kind].copy()
+            return self._derive_or_trace(kind, v)
+        if kind not in self._expressions:
+            self._expressions[kind] = self._derive_or_trace(kind, self.v)
+        return self._expressions[kind].copy()
 
-    def derived(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
+    def derivatives(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
         """Return C_q, C_t or gamma by differentiation, as an array of expressions, even if it has a callback."""
         if kind == "jacobian":
             return self._jacobian()
-        return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
+        return (
+            self._constraint_rate()
+            if kind == "constraint_rate"
+            else self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
+        )
 
-    def _make(self, kind: str, v: Sequence[Affine]) -> Any:
+    def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
         if self._is_derived(kind):
-            return self.derived(kind, v)
-        if kind in self._copied and v is self.v:
-            forms = elementwise(lambda form: form.on(self.graph), [self._copied[kind]])
-            self.graph.traced.setdefault(kind, forms.copy())
-            return forms
-        return self._traced(kind, v)
+            return self.derivatives(kind, v)
+        if kind in self._results_before_copy and v is self.v:
+            exprs = elementwise(lambda expr: expr.on_graph(self.graph), [self._results_before_copy[kind]])
+            self.graph.traced.setdefault(kind, exprs.copy())
+            return exprs
+        return self._trace_callback(kind, v)
 
     def _is_derived(self, kind: str) -> bool:
-        return kind not in self.system.given and kind in ("jacobian", *OF_ROWS)
+        return kind not in self.system.given and kind in ("jacobian", *GAMMA_SOURCES)
 
-    def _traced(self, kind: str, v: Sequence[Affine]) -> Any:
+    def _trace_callback(self, kind: str, v: Sequence[Affine]) -> Any:
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
         out, shape, p = out.astype(object), out.shape, self.parameters.copy()
-        arrays = [symbols({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
+        arrays = [symbol_array({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
         if out.size:
             try:
-                with self.watched():
+                with self.running_callback():
                     if not system.called_in_python:
                         trace(getattr(system.functions, kind), self.t, *arrays, p, out)
                     elif kind in system.python_functions:
-                        function, extra = system.python_functions[kind], (p,) if system.takes_parameters(kind) else ()
-                        out = np.array(trace(function, self.t, *arrays, *extra), dtype=object)
+                        function, parameters_argument = (
+                            system.python_functions[kind],
+                            (p,) if system.takes_parameters(kind) else (),
+                        )
+                        out = np.array(trace(function, self.t, *arrays, *parameters_argument), dtype=object)
                     out = convert_to_expressions(graph, out)
                     if out.shape != shape:
                         raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
@@ -371,28 +382,28 @@ class Equations:
 
     def _jacobian(self) -> Any:
         """Return C_q (n_c, n_q), the derivatives of C with respect to q."""
-        constraint, unit = self.of("constraint"), Affine(self.graph, 1.0, {})
+        constraint, unit = self.expressions("constraint"), Affine(self.graph, 1.0, {})
         jacobian = np.empty((self.system.n_c, self.system.n_q), dtype=object)
         for j, coordinate in enumerate(self.q):
             derivative = Derivative(self.graph, {only_quantity(coordinate): unit})
-            jacobian[:, j] = [derivative.of(form) for form in constraint]
+            jacobian[:, j] = [derivative.differentiate(expr) for expr in constraint]
         return jacobian
 
-    def _rate(self) -> Any:
+    def _constraint_rate(self) -> Any:
         """Return C_t (n_c,), the derivatives of C with respect to t."""
-        constraint, unit = self.of("constraint"), Affine(self.graph, 1.0, {})
-        by_t = Derivative(self.graph, {only_quantity(self.t): unit})
-        return symbols(by_t.of(form) for form in constraint)
+        constraint, unit = self.expressions("constraint"), Affine(self.graph, 1.0, {})
+        time_derivative = Derivative(self.graph, {only_quantity(self.t): unit})
+        return symbol_array(time_derivative.differentiate(expr) for expr in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
         """Return -(dG/dt v + dG_t/dt), total derivatives at constant v; `rows`, `rates`: callbacks for G and G_t."""
         direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
-        gamma = self.of(rates)
-        for i, row in enumerate(self.of(rows)):
-            minus_gamma = total_derivative.of(gamma[i])
+        gamma = self.expressions(rates)
+        for i, row in enumerate(self.expressions(rows)):
+            minus_gamma = total_derivative.differentiate(gamma[i])
             for entry, u in zip(row, v, strict=True):
-                minus_gamma = minus_gamma + total_derivative.of(entry) * u if entry.terms else minus_gamma
+                minus_gamma = minus_gamma + total_derivative.differentiate(entry) * u if entry.terms else minus_gamma
             gamma[i] = -minus_gamma
         return gamma
 
@@ -401,10 +412,10 @@ def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bo
     """Return whether a compiled callback can be traced with these parameters, some of which may be Parameters."""
     equations = Equations(system, parameters)
     state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
-    arrays = [symbols(state[name]) for name in KINDS[kind].state]
+    arrays = [symbol_array(state[name]) for name in KINDS[kind].state]
     outputs = [array.astype(object) for array in system.arrays_of(kind)]
     try:
-        with equations.watched():
+        with equations.running_callback():
             trace(getattr(system.functions, kind), equations.t, *arrays, equations.parameters.copy(), *outputs)
             for array in outputs:
                 convert_to_expressions(equations.graph, array)
@@ -413,9 +424,9 @@ def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bo
     return True
 
 
-def only_quantity(form: Affine) -> int:
+def only_quantity(expr: Affine) -> int:
     """Return the index of the quantity in an expression with a single term."""
-    (quantity,) = form.terms
+    (quantity,) = expr.terms
     return quantity
 
 
@@ -424,7 +435,7 @@ ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]  # entry i is sca
 Evaluator = Callable[[Any], Array]  # evaluates an array of expressions for the parameters of one system
 
 # limits of the random values of parameters in traces: values are of similar size, so that rounding hides no term
-GENERIC = 0.5, 1.5
+GENERIC_RANGE = 0.5, 1.5
 # a parameter is a constant if its magnitude is below this value or above its inverse: powers would under- or overflow
 MIN_MAGNITUDE = 1e-30
 
@@ -439,14 +450,14 @@ class TraceCache:
     parameters : ndarray (n_p,)
         Parameters of one of the systems.
     classes : ndarray of int (n_p,)
-        Class of each parameter: 1, 2, ..., the same number for equal magnitudes, with a minus sign for negative ones.
+        Class of each parameter: 1, 2, ..., the same number for equal magnitudes, with the sign of the parameter.
         0: the parameter is a constant in the traces.
 
     Attributes
     ----------
     parameters : ndarray of float and Parameter (n_p,)
         Parameters with which callbacks are traced.
-    traced : set of str
+    traced_kinds : set of str
         Kinds of callbacks that were traced; as they do not branch, they write to the same entries in all systems.
     within_bounds : set of str
         Kinds of traced callbacks for which `check_bounds` succeeded in one of the systems.
@@ -456,19 +467,21 @@ class TraceCache:
         self._classes = classes
         n_numbers = int(np.abs(self._classes).max(initial=0))
         _, first = np.unique(np.abs(self._classes), return_index=True)
-        self._first = first[self._classes[first] != 0]  # index of the first parameter of each class
-        self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
+        self._first_of_class = first[self._classes[first] != 0]  # index of the first parameter of each class
+        self._tape = ParameterTape(
+            np.random.default_rng(7).uniform(*GENERIC_RANGE, n_numbers).tolist(), range(n_numbers)
+        )
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for i in np.flatnonzero(self._classes).tolist():
             signed_class = int(self._classes[i])
             parameter = self._tape.parameters[abs(signed_class) - 1]
             self.parameters[i] = parameter if signed_class > 0 else -parameter
-        self.traced: set[str] = set()
+        self.traced_kinds: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
         # results of `_scaled_products` by id of the array; the array is stored, too, so that its id is not reused
         self._arrays: dict[int, tuple[Any, ScaledProducts]] = {}
-        self._tracing = RLock()  # one lock for all traces, as they record on one tape
+        self._tracing_lock = RLock()  # one lock for all traces, as they record on one tape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
         """Return the traced callbacks of a system, with their own copy of the graph, which the caller may extend."""
@@ -477,17 +490,17 @@ class TraceCache:
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
-    def numbers(self, parameters: Array) -> Array:
+    def magnitudes(self, parameters: Array) -> Array:
         """Return the magnitude of each class of parameters (entry class - 1) for `parameters` (n_p,) of a system."""
-        return np.abs(parameters[self._first])
+        return np.abs(parameters[self._first_of_class])
 
-    def products(self, parameters: Array) -> Callable[[Powers], Any]:
+    def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
         """Return a function that evaluates Powers (products of powers of atoms) for the parameters of a system."""
-        return self._tape.products(self.numbers(parameters))
+        return self._tape.product_evaluator(self.magnitudes(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
         """Return a function that evaluates arrays of expressions, which must not change, for `parameters` (n_p,)."""
-        product = self.products(parameters)
+        product = self.product_evaluator(parameters)
 
         def evaluate(array: Any) -> Array:
             if array.dtype != object:
@@ -513,49 +526,53 @@ class TraceCache:
             entry = self._arrays[id(array)] = array, scaled
         return entry[1]
 
-    def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
-        """Return the cached result for the key `what`; `make` computes it at the first call."""
-        if what not in self._results:
-            with self._tracing:
-                if what not in self._results:
+    def remembered(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return the cached result for `key`; `make` computes it at the first call."""
+        if key not in self._results:
+            with self._tracing_lock:
+                if key not in self._results:
                     with garbage_collection_off():  # there is no garbage, because all objects stay in the cache
-                        self._results[what] = make()
-        return self._results[what]
+                        self._results[key] = make()
+        return self._results[key]
 
 
 def derive_cached(
-    system: ConstrainedSystem, what: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
+    system: ConstrainedSystem, key: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return the result of `make` for a trace cache, converted for one system by the result's method `of`.
+    """Return the result of `make` for a trace cache, converted for one system by the result's method `for_system`.
 
     The trace cache is shared with other systems. If callbacks cannot be traced with variable parameters, or `check`
     raises Untraceable (a callback may treat variable parameters differently from numbers), it is a cache for this
-    system alone. Results are cached by the key `what`.
+    system alone. Results are cached by `key`.
 
     Raises
     ------
     Untraceable
         If the result cannot be derived from either cache, or `check` raises for it.
     """
-    for cache_for in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
-        cache = system.remembered(("family", cache_for), partial(cache_for, system))
-        derived = system.remembered((what, cache_for), partial(_derive_from, system, cache, what, make))
+    for find_cache in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
+        cache = system.remembered(("family", find_cache), partial(find_cache, system))
+        derived = system.remembered((key, find_cache), partial(_derive_from_cache, system, cache, key, make))
         try:
             if isinstance(derived, Untraceable):
                 raise derived
             check(derived)
-            cache.traced |= derived.kinds
+            cache.traced_kinds |= derived.kinds
             return derived
         except Untraceable as error:
             reason = error
     raise reason
 
 
-def _derive_from(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
+def _derive_from_cache(
+    system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]
+) -> Any:
     """Return the result of `derive_cached` from one trace cache, or the exception that says why there is none."""
     try:
-        result = cache.remembered(what, partial(make, cache))
-        return result.of(system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters)))
+        result = cache.remembered(key, partial(make, cache))
+        return result.for_system(
+            system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters))
+        )
     except Untraceable as error:
         return error.with_traceback(None)
     except (ArithmeticError, RecursionError) as error:
@@ -572,7 +589,7 @@ def share_checked_bounds(system: ConstrainedSystem) -> None:
     """Add the traced kinds in `system.within_bounds` to the trace cache, for other systems with the same traces."""
     if not system.called_in_python:
         cache = shared_cache(system)
-        cache.within_bounds |= cache.traced & system.within_bounds
+        cache.within_bounds |= cache.traced_kinds & system.within_bounds
 
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
@@ -584,8 +601,8 @@ def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
     """Return the trace cache that a system with compiled callbacks shares with others; create it if it is missing."""
     parameters = system.parameters
     classes = _parameter_classes(parameters)
-    fixed = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that the bytes are equal
-    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed.tobytes())
+    fixed_parameters = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that the bytes are equal
+    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed_parameters.tobytes())
     cache: TraceCache | None = _TRACE_CACHES.get(key)
     if cache is None:
         _TRACE_CACHES[key] = cache = TraceCache(parameters, classes)
@@ -616,41 +633,45 @@ class ParameterArrays:
         # arrays of numbers by id of the expressions; these are stored, too, so that the id is not reused
         self._arrays: dict[int, tuple[Any, Array]] = {}
         # flat array of numbers, indices of the entries that vary, and their slice in the values that `write` computes
-        self._places: list[tuple[Array, NDArray[np.int64], slice]] = []
+        self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
-        self._product_of: list[int] = []
-        self._gathered: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
+        self._product_indices: list[int] = []
+        self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
-    def array(self, expressions: Any) -> Array:
+    def array(self, exprs: Any) -> Array:
         """Return the array of numbers that `write` fills for an array of expressions: one for each array object.
 
         If the entries are plain numbers, return the given array.
         """
-        if expressions.dtype != object:
-            return expressions  # type: ignore[no-any-return]
-        if id(expressions) not in self._arrays:
-            self._arrays[id(expressions)] = expressions, self._numbers_for(expressions)
-        return self._arrays[id(expressions)][1]
+        if exprs.dtype != object:
+            return exprs  # type: ignore[no-any-return]
+        if id(exprs) not in self._arrays:
+            self._arrays[id(exprs)] = exprs, self._numbers_for(exprs)
+        return self._arrays[id(exprs)][1]
 
-    def _numbers_for(self, expressions: Any) -> Array:
-        entries, begin = expressions.ravel().tolist(), len(self._scales)
+    def _numbers_for(self, exprs: Any) -> Array:
+        entries, begin = exprs.ravel().tolist(), len(self._scales)
         varying = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in varying:
             self._scales.append(entries[k].scale)
-            self._product_of.append(self._products.setdefault(entries[k].powers, len(self._products)))
+            self._product_indices.append(self._products.setdefault(entries[k].powers, len(self._products)))
             entries[k] = 0.0
         numbers = np.array(entries, dtype=np.float64)
-        self._places.append((numbers, np.array(varying, dtype=np.int64), slice(begin, len(self._scales))))
-        self._gathered = list(self._products), np.array(self._scales), np.array(self._product_of, dtype=np.int64)
-        return numbers.reshape(expressions.shape)
+        self._number_arrays.append((numbers, np.array(varying, dtype=np.int64), slice(begin, len(self._scales))))
+        self._gathered_products = (
+            list(self._products),
+            np.array(self._scales),
+            np.array(self._product_indices, dtype=np.int64),
+        )
+        return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Evaluate all expressions and write their values to the arrays; `product`: see `TraceCache.products`."""
-        if self._gathered is None:
+        """Evaluate all expressions and write their values to the arrays; `product` evaluates Powers."""
+        if self._gathered_products is None:
             return
-        products, scales, product_of = self._gathered
+        products, scales, product_indices = self._gathered_products
         with np.errstate(all="ignore"):
-            values = scales * np.array(list(map(product, products)), dtype=np.float64)[product_of]
-        for numbers, varying, values_slice in self._places:
+            values = scales * np.array(list(map(product, products)), dtype=np.float64)[product_indices]
+        for numbers, varying, values_slice in self._number_arrays:
             numbers[varying] = values[values_slice]

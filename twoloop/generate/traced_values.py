@@ -33,17 +33,17 @@ N_NEARBY = 8  # number of random states near the start at which calls and traces
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 # approximate largest number of compared states: in a chunk of steps, in a run, in a run with callbacks called in Python
-MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
-MAX_ENTRIES = 20_000  # approximate largest number of entries compared at all states of a run: large systems have fewer
+MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
+MAX_ENTRIES = 20_000  # approximate largest number of entries compared in a run: large systems, at fewer states
 # largest difference between call and trace that counts as a rounding error, relative to the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-CLEAR_DIFFERENCE = 1e-6  # largest relative difference that needs a test at neighbouring states to prove a trace wrong
+CLEAR_DIFFERENCE = 1e-6  # relative difference above which a trace is wrong; if smaller, see `_is_systematic`
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
 MARGIN = 0.01  # margin of a CheckedRegion, relative to its ranges: small compared with the steps of a run
 MARGIN_AT_REST = 1e-9  # margin added for coordinates at rest, whose range is 0, relative to the largest range
 
 
-class Traced:
+class CallbackTraces:
     """Traces of callbacks as an operation table, to be compared with calls of the callbacks.
 
     Parameters
@@ -51,46 +51,46 @@ class Traced:
     system : ConstrainedSystem
     graph : Graph
         The graph of the trace, whose first inputs are t, q and v.
-    forms : mapping or None
+    exprs : mapping or None
         Arrays of expressions by kind of callback. None: `graph.traced`, for the callbacks that the system has.
     """
 
-    def __init__(self, system: ConstrainedSystem, graph: Graph, forms: Mapping[str, Any] | None = None):
-        if forms is None:
-            forms = {kind: results for kind, results in graph.traced.items() if kind in system.given}
-        kinds = [kind for kind in KINDS if kind in forms and forms[kind].size]
-        self.places = [(kind, index) for kind in kinds for index in np.ndindex(forms[kind].shape)]
-        self.n_entries = np.array([forms[kind].size for kind in kinds], dtype=np.int64)
+    def __init__(self, system: ConstrainedSystem, graph: Graph, exprs: Mapping[str, Any] | None = None):
+        if exprs is None:
+            exprs = {kind: results for kind, results in graph.traced.items() if kind in system.given}
+        kinds = [kind for kind in KINDS if kind in exprs and exprs[kind].size]
+        self.entry_indices = [(kind, index) for kind in kinds for index in np.ndindex(exprs[kind].shape)]
+        self.n_entries = np.array([exprs[kind].size for kind in kinds], dtype=np.int64)
         self.is_compared = np.array([kind in kinds for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
         self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, compared or not
-        self.trusted = False
-        entries = (forms[kind][index] for kind, index in self.places)
+        self.is_trusted = False
+        entries = (exprs[kind][index] for kind, index in self.entry_indices)
         # the table computes no entries that are always zero
-        results = {k: form for k, form in enumerate(entries) if form.terms or form.constant}
-        self.nonzero_kinds = frozenset(self.places[k][0] for k in results)
-        self.program = OperationTable.of(graph, 1 + 2 * system.n_q, results)
+        results = {k: expr for k, expr in enumerate(entries) if expr.terms or expr.constant}
+        self.nonzero_kinds = frozenset(self.entry_indices[k][0] for k in results)
+        self.program = OperationTable.from_results(graph, 1 + 2 * system.n_q, results)
 
-    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
+    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
         """Return a copy with the coefficients of another system of the same trace cache."""
-        traced = self.with_numbers(evaluate)
+        traced = self.with_coefficients(evaluate)
         traced.name = system.name
         return traced
 
-    def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "Traced":
-        """Return a copy, not trusted yet, with `numbers_for` applied to each array of coefficients in the table."""
+    def with_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
+        """Return a copy, not trusted yet, with `convert` applied to each array of coefficients in the table."""
         traced = copy.copy(self)
-        traced.program = self.program.with_numbers(numbers_for)
-        traced.trusted = False
+        traced.program = self.program.with_coefficients(convert)
+        traced.is_trusted = False
         return traced
 
-    def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
+    def refuse_if_wrong(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
         """Compare calls and traces at states near the start of a run; raise Untraceable if they differ."""
-        refuse_wrong([self], system, t0, t1, q, v)
+        refuse_wrong_traces([self], system, t0, t1, q, v)
 
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
-        """Compare calls and traces at the states `nearby`; set `trusted`, or raise Untraceable if they differ."""
+        """Compare calls and traces at the states `nearby`; set `is_trusted`, or raise Untraceable if they differ."""
         difference = None
         for states in (nearby, *nearby[:, None, :]):  # all states at once; if a call raises, one state after another
             try:
@@ -101,7 +101,7 @@ class Traced:
                 break
         if difference is not None:
             raise Untraceable(difference)
-        self.trusted = not system.called_in_python  # compiled callbacks never change
+        self.is_trusted = not system.called_in_python  # compiled callbacks never change
 
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Return a description of the first difference between calls and traces at states [t, q, v], or None.
@@ -111,8 +111,8 @@ class Traced:
         """
         from twoloop.kernels.evaluation import checks as kernels
 
-        kit, max_states = system.kit, MAX_IN_PYTHON if system.called_in_python else MAX_STATES
-        states = states[:: 1 + max(len(states) // max_states, len(states) * len(self.places) // MAX_ENTRIES)]
+        kit, max_states = system.kit, MAX_STATES_IN_PYTHON if system.called_in_python else MAX_STATES
+        states = states[:: 1 + max(len(states) // max_states, len(states) * len(self.entry_indices) // MAX_ENTRIES)]
         n_different, called, traced, bounds = self._evaluate(kit, states)
         if n_different == 0:
             return None
@@ -120,15 +120,15 @@ class Traced:
         with np.errstate(all="ignore"):
             largest = np.abs(np.where(finite, called, 0.0)).max(axis=0)
             differences = np.abs(called - traced)
-            agree = differences <= kernels.MAX_DIFFERENCE * largest + kernels.ROUNDING_FACTOR * bounds
+            is_agreeing = differences <= kernels.MAX_DIFFERENCE * largest + kernels.ROUNDING_FACTOR * bounds
         if everywhere:
-            agree |= ~finite & ~np.isfinite(traced)
+            is_agreeing |= ~finite & ~np.isfinite(traced)
         else:
-            agree |= ~finite
+            is_agreeing |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
         # for each entry, the largest term of all entries that the same callback returns
         max_term = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
-        for k, entry in np.argwhere(~agree & ~(differences <= ROUNDING_DIFFERENCE * max_term)):
+        for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * max_term)):
             if not differences[k, entry] <= CLEAR_DIFFERENCE * max_term[entry] or self._is_systematic(
                 system, states[k], int(entry)
             ):
@@ -138,7 +138,7 @@ class Traced:
     def _evaluate(self, kit: Kit, states: Array) -> tuple[int, Array, Array, Array]:
         from twoloop.kernels.evaluation import checks as kernels
 
-        called, traced, bounds = np.zeros((3, len(states), len(self.places)))
+        called, traced, bounds = np.zeros((3, len(states), len(self.entry_indices)))
         n_different = entry_point(kernels.compare_traces)(
             kit,
             self.sizes,
@@ -160,11 +160,11 @@ class Traced:
         return bool(np.abs(errors).min() > 0.5 * np.abs(errors).max() and np.abs(errors.sum()) == np.abs(errors).sum())
 
     def _message(self, state: Array, entry: int, called: float, traced: float) -> str:
-        kind, index = self.places[entry]
-        shown = index[0] if len(index) == 1 else tuple(index)
+        kind, index = self.entry_indices[entry]
+        position = index[0] if len(index) == 1 else tuple(index)
         return (
             f"{kind} of {self.name!r} does not give what its operations give, which were recorded once: at t = "
-            f"{state[0]:.10g} entry {shown} is {called:.9g}, and by these {traced:.9g}. It depends on more than its "
+            f"{state[0]:.10g} entry {position} is {called:.9g}, and by these {traced:.9g}. It depends on more than its "
             "arguments (a variable outside that changed after numba compiled it, random numbers, what it keeps from "
             "call to call), or branches unseen"
         )
@@ -174,32 +174,34 @@ class Sample:
     """Sample of the states [t, q, v] of a run so far, evenly thinned out in long runs; `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
-        self._n, self._parts = n, list[Array]()
+        self._n, self._chunks = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add states of a chunk of steps, `rows` [q, v, ...] at times `t`, and its last one, `state` at time `end`."""
-        stride = 1 + len(t) // MAX_OF_CHUNK
+        """Add the states of a chunk of steps: `rows` [q, v, ...] at times `t`, and the last one, `state`, at `end`."""
+        stride = 1 + len(t) // MAX_STATES_OF_CHUNK
         times = t[::stride]
         states = np.empty((len(times) + 1, 1 + self._n))
         states[0, 0], states[0, 1:] = end, state[: self._n]
         states[:0:-1, 0], states[:0:-1, 1:] = times, rows[::stride, : self._n]
-        self._parts.insert(0, states)
-        if len(self._parts) > MAX_STATES:
-            self._parts = self._parts[::2]
+        self._chunks.insert(0, states)
+        if len(self._chunks) > MAX_STATES:
+            self._chunks = self._chunks[::2]
 
-    def end(self, t: float, state: Array) -> None:
+    def end_at(self, t: float, state: Array) -> None:
         """Remove the states after t, the time at which a run ended, and add the state at t."""
         states = self.states()
-        self._parts = [states[states[:, 0] <= t]]
+        self._chunks = [states[states[:, 0] <= t]]
         self.add(states[:0, 0], states[:0], t, state)
 
     def states(self) -> Array:
         """Return the states as rows [t, q, v], the latest first."""
-        return np.concatenate(self._parts)
+        return np.concatenate(self._chunks)
 
 
-def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
+def refuse_wrong_traces(
+    traced: Sequence[CallbackTraces], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array
+) -> None:
     """Compare traces that are not trusted yet with calls at states near the start, at times spread over the run.
 
     Raises
@@ -207,7 +209,7 @@ def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float,
     Untraceable
         If a trace is wrong; the message names the callback and the entry.
     """
-    untrusted = [trace for trace in traced if not trace.trusted]
+    untrusted = [trace for trace in traced if not trace.is_trusted]
     if not untrusted:
         return
     with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -217,10 +219,10 @@ def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float,
             trace.check_near_start(system, nearby)
 
 
-Check = Callable[[Traced], None]  # raises Untraceable if traces are wrong
+Check = Callable[[CallbackTraces], None]  # raises Untraceable if traces are wrong
 
 
-def unchecked(traced: Traced) -> None:
+def accept_traces(traced: CallbackTraces) -> None:
     """Accept any traces: a `Check` for results that no run uses."""
 
 
@@ -261,27 +263,27 @@ class CheckedRegion:
     def __init__(self) -> None:
         self._runs = 0
         self._parameters: tuple[Array, Array] | None = None  # smallest and largest parameters, by component
-        self._box = np.zeros((2, 0))  # smallest and largest value of each component of the states
-        self.bounds = self._box
+        self._ranges = np.zeros((2, 0))  # smallest and largest value of each component of the states
+        self.bounds = self._ranges
 
     def is_comparison_due(self) -> bool:
         """Return whether the next run has to compare callbacks at all sampled states, as runs 1, 2, 4, 8, ... do."""
         return (self._runs + 1) & self._runs == 0
 
-    def count(self) -> None:
+    def count_run(self) -> None:
         """Increase the number of runs by one."""
         self._runs += 1
 
     def states_outside(self, states: Array) -> Array:
         """Return those of `states` (rows [t, q, v]) that are outside `bounds`; all of them if there are no bounds."""
-        if not self._box.size:
+        if not self._ranges.size:
             return states
         smallest, largest = self.bounds
         outside = (states < smallest) | (states > largest)
         return states[outside.any(axis=1)] if outside.any() else states[:0]
 
     def contains_parameters(self, parameters: Array) -> bool:
-        """Return whether all parameters are within the ranges of parameters or the margin of these."""
+        """Return whether all parameters are within the checked ranges, extended by MARGIN."""
         if self._parameters is None:
             return False
         smallest, largest = self._parameters
@@ -297,7 +299,7 @@ class CheckedRegion:
         """Extend the ranges of states, and `bounds`, to states at which calls and traces agreed."""
         if len(states) == 0:
             return
-        checked = np.concatenate([states, self._box]) if self._box.size else states
-        smallest, largest = self._box = np.array([checked.min(axis=0), checked.max(axis=0)])
+        checked = np.concatenate([states, self._ranges]) if self._ranges.size else states
+        smallest, largest = self._ranges = np.array([checked.min(axis=0), checked.max(axis=0)])
         margin = MARGIN * (largest - smallest) + MARGIN_AT_REST * float((largest - smallest)[1:].max())
         self.bounds = np.array([smallest - margin, largest + margin])

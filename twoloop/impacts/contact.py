@@ -9,10 +9,10 @@ import numpy as np
 
 from twoloop.checks.arguments import Array, shown
 from twoloop.generate.derived_callbacks import with_derived_callbacks
-from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.program import MAX_TRACE_DIFFERENCE, N_COMPARED, TIME_SPACING, OperationTable
 from twoloop.generate.trace import convert_to_expressions, trace
-from twoloop.generate.traced_values import unchecked
+from twoloop.generate.traced_values import accept_traces
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.methods.dop853 import DOP853
@@ -52,7 +52,7 @@ class Gaps:
         outputs: list[Affine] = []
         for stop in stops:
             try:
-                value = np.array(trace(getattr(stop, function), t, symbols(q)), dtype=object)
+                value = np.array(trace(getattr(stop, function), t, symbol_array(q)), dtype=object)
                 (gap,) = convert_to_expressions(graph, value.reshape(1))
             except (Untraceable, ValueError) as error:
                 raise ValueError(
@@ -60,8 +60,8 @@ class Gaps:
                     f"branches: {error}"
                 ) from None
             outputs += _with_derivatives(graph, gap, t, q, v)
-        program = OperationTable.of(graph, 1 + 2 * self._n_q, dict(enumerate(outputs)))
-        self._p = np.array(program.flat())
+        program = OperationTable.from_results(graph, 1 + 2 * self._n_q, dict(enumerate(outputs)))
+        self._p = np.array(program.as_floats())
         self._last: tuple[Any, Gap] | None = None
         self._compare(stops, t0, q0)
 
@@ -102,9 +102,9 @@ def _with_derivatives(graph: Graph, gap: Affine, t: Affine, q: Sequence[Affine],
     unit = Affine(graph, 1.0, {})
     (t_input,), q_inputs = t.terms, [next(iter(coordinate.terms)) for coordinate in q]
     direction = {t_input: unit, **dict(zip(q_inputs, v, strict=True))}
-    rate = Derivative(graph, direction).of(gap)
-    bias = Derivative(graph, direction).of(rate)
-    return [gap, rate, bias, *(Derivative(graph, {q_input: unit}).of(gap) for q_input in q_inputs)]
+    rate = Derivative(graph, direction).differentiate(gap)
+    bias = Derivative(graph, direction).differentiate(rate)
+    return [gap, rate, bias, *(Derivative(graph, {q_input: unit}).differentiate(gap) for q_input in q_inputs)]
 
 
 class ContactSystem:
@@ -136,7 +136,7 @@ class ContactSystem:
         self._slides, self._sticking, self._slipping = slides, list(sticking), slipping
         self._offsets = np.array(list(sticking.values()))
         self._zero_velocity = np.zeros(system.n_q)
-        self._derived = with_derived_callbacks(system, unchecked)[0] if slipping else system
+        self._derived = with_derived_callbacks(system, accept_traces)[0] if slipping else system
 
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
         """Return a part of a `Gap` for closed stops, followed by that for the displacements that remain constant."""
@@ -213,7 +213,7 @@ class Accelerations:
     """Compute accelerations and multipliers of a system at any state, as in its runs."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, v: Array, atol: Array):
-        derived, _ = with_derived_callbacks(system, unchecked)
+        derived, _ = with_derived_callbacks(system, accept_traces)
         # any explicit method will do: only the accelerations at the start of its steps are used
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from twoloop.generate.collocation_code import compiles_quickly
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.graph import Untraceable
-from twoloop.generate.series import is_quick, series_for
+from twoloop.generate.series import is_quick_to_trace, series_for
 from twoloop.generate.time_dependence import may_be_steep
-from twoloop.generate.traced_values import Check, unchecked
+from twoloop.generate.traced_values import Check, accept_traces
 from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method, Plan, cached_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
@@ -172,7 +172,7 @@ class Auto:
         return "positions"
 
     def for_system(
-        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
+        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = accept_traces
     ) -> "Auto":
         """Return the method for a system; without `series` if callbacks cannot be traced or `check` refuses traces."""
         sparse = len(system.entries) == 2 and system.n_a == 0
@@ -181,7 +181,7 @@ class Auto:
             lanes = self.lanes if compiles_quickly(code.shared) else None
             lanes = None if lanes is None else lanes.for_system(system, code)
             method = replace(method, lanes=lanes, cost_ratio=_cost_ratio(system))
-        untraced = code is None and (system.called_in_python or not is_quick(system))
+        untraced = code is None and (system.called_in_python or not is_quick_to_trace(system))
         if self.series is None or untraced:
             return method
         try:

@@ -8,7 +8,7 @@ import numpy as np
 from twoloop.generate.collocation_code import compiled_collocation, compiles_quickly, tables
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.time_dependence import may_be_steep
-from twoloop.generate.traced_values import Check, unchecked
+from twoloop.generate.traced_values import Check, accept_traces
 from twoloop.kernels.data.collocation import ORDER
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
@@ -58,7 +58,7 @@ class Lobatto16:
     narrow: bool = True  # whether forces may change much over a distance shorter than a step
 
     def for_system(
-        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
+        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = accept_traces
     ) -> "Lobatto16":
         """Return the method with the generated code of this system.
 
@@ -87,9 +87,12 @@ class Lobatto16:
         collocation = compiled_collocation(self.code)
         options = np.zeros(kernels.N_OPTIONS)
         options[kernels.THETA] = LARGEST_MOVE
-        options[kernels.N_ITERATED], options[kernels.N_ROWS] = len(collocation.code.iterated), collocation.code.n_rows
+        options[kernels.N_ITERATED], options[kernels.N_ROWS] = (
+            len(collocation.code.iterated_coordinates),
+            collocation.code.n_rows,
+        )
         options[kernels.FREE] = 1.0 if self.narrow else 1.0 / LONGEST_GAP
-        sizes = n_q, len(collocation.code.iterated), collocation.code.n_rows
+        sizes = n_q, len(collocation.code.iterated_coordinates), collocation.code.n_rows
         plan = Plan(
             kernels.LOBATTO,
             options,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import shown
 from twoloop.generate.compile_equations import GeneratedCode, generated_code
 from twoloop.generate.graph import Untraceable
-from twoloop.generate.series import is_quick, series_for
+from twoloop.generate.series import is_quick_to_trace, series_for
 from twoloop.generate.traced_values import Check
 from twoloop.kernels.data.indices import ACCELERATIONS, APART, VELOCITIES
 from twoloop.methods.adams import Adams
@@ -149,7 +149,7 @@ def is_small(system: ConstrainedSystem) -> bool:
 
     def takes_few_operations() -> bool:
         try:
-            return is_quick(system) and series_for(system).n_operations <= MAX_OPERATIONS_SMALL
+            return is_quick_to_trace(system) and series_for(system).n_operations <= MAX_OPERATIONS_SMALL
         except Untraceable:
             return False
 
@@ -186,7 +186,7 @@ def plans_for(
             prepared = method.for_system(system, code, check) if hasattr(method, "for_system") else method
         plans = _make_plans(system, prepared, rtol, atol, fixed, code)
         is_final = code is not None or _has_series(prepared) == _has_series(method)
-        if method_key is not None and is_final and all(each.trusted for each in plans[0].traced):
+        if method_key is not None and is_final and all(each.is_trusted for each in plans[0].traced):
             while len(cached) >= MAX_PLANS:  # a loop, because other threads may add plans
                 cached.pop(next(iter(cached.copy())), None)
             cached[key] = plans

@@ -11,7 +11,7 @@ from twoloop.checks.arguments import check_size
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import SeriesProgram, series_for
-from twoloop.generate.traced_values import Check, unchecked
+from twoloop.generate.traced_values import Check, accept_traces
 from twoloop.methods.plan import LARGEST_MOVE, Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 
@@ -92,7 +92,7 @@ class Taylor:
         return "Taylor" if self.order is None else f"Taylor(order={self.order})"
 
     def for_system(
-        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
+        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = accept_traces
     ) -> "Taylor":
         """Return the method with the series program of a system; `code` is not used.
 
@@ -150,8 +150,8 @@ def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
     from twoloop.kernels.steps import taylor_step as kernels
 
     tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]
-    arrays: list[Any] = [*tables[0], *tables[1], *program.rows, program.row_places]
-    arrays += [*program.balance, program.balance_places]
+    arrays: list[Any] = [*tables[0], *tables[1], *program.rows, program.row_indices]
+    arrays += [*program.balance, program.balance_indices]
     arrays = [each.view(np.float64) if each.dtype == np.int64 else each for each in arrays]
     scalars = np.zeros(kernels.N_SCALARS)
     scalars[kernels.ORDER], scalars[kernels.THETA], scalars[kernels.N_NODES] = highest, LARGEST_MOVE, program.n_nodes

@@ -20,10 +20,17 @@ from twoloop.checks.arguments import check_vector
 from twoloop.checks.consistency import StartEvaluation, check_start
 from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.compile_equations import GeneratedCode
-from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
-from twoloop.generate.elimination import BOUNDS, LEAST, RANK, SINGULAR_MASS, DependentColumns, PivotChoice
+from twoloop.generate.derived_callbacks import has_exact_derivatives, with_derived_callbacks
+from twoloop.generate.elimination import (
+    MIN_PIVOTS,
+    RANK_TOL,
+    SINGULAR_MASS,
+    START_LIMITS,
+    DependentColumns,
+    PivotChoice,
+)
 from twoloop.generate.trace import TraceCache, load_checked_bounds, share_checked_bounds, trace_cache_of
-from twoloop.generate.traced_values import Sample, Traced, extreme_states, states_near_start
+from twoloop.generate.traced_values import CallbackTraces, Sample, extreme_states, states_near_start
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.control.loop_state import N_STEP_COLUMNS
 from twoloop.kernels.data import indices
@@ -229,7 +236,7 @@ class CachedIntegrator:
         fields["later"] = partial(
             _deferred_field, data, timed_states, self.run_fields, self.cpu_time, system, t1, self.options
         )
-        region.count()  # runs that `IntegrationLoop` has continued are counted by `compare_callbacks`
+        region.count_run()  # runs that `IntegrationLoop` has continued are counted by `compare_callbacks`
         return fields
 
     def _finish(
@@ -409,12 +416,18 @@ def arrays_of(
     expected, scale = _choice_as_array(choice)
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = DependentColumns(system, () if choice is None else choice.rows)
-    search = dependents.arguments if dependents.find else (none, none, 0, np.zeros(0), none, none)
+    search = dependents.arguments if dependents.choose else (none, none, 0, np.zeros(0), none, none)
     places = np.flatnonzero(memory.view(np.int64))  # indices of numbers with nonzero bits: -0.0 must be restored, too
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     start_constants: tuple[float, ...]
     start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
-    start_constants += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTION
+    start_constants += (
+        np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0),
+        RANK_TOL,
+        weak,
+        scale,
+        CONTRADICTION,
+    )
     start_constants += mass_kind, RECHECK_PIVOT * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
     step_fields = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
@@ -429,7 +442,11 @@ def arrays_of(
         **{"saved": np.empty(numbers.size + lasting_floats.size + run.state.size), "saved_integers": integers.copy()},
         **{"constants": np.array([*start_constants, *step_fields, run.near_threshold, TURN_RATIO, REPEAT_BELOW])},
         lapack=np.array(lapack_addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
-        **{"bounds": BOUNDS, "scratch": np.zeros(pivots.workspace_size(n_rows, system.n_q)), "expected": expected},
+        **{
+            "bounds": START_LIMITS,
+            "scratch": np.zeros(pivots.workspace_size(n_rows, system.n_q)),
+            "expected": expected,
+        },
         **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
         **dict(zip(("kinds", "counted", "_", "search", "search_places", "found"), search, strict=True)),
         **{"last_start": np.zeros(loops.START + 2 + 2 * system.n_q), "start_rows": run.work.rows_v.copy()},
@@ -449,8 +466,8 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
     # kernels do not measure the loss of digits: a choice that depends on this loss must equal none of the kernels
-    index = int(np.searchsorted(-LEAST, -choice.least)) if choice.refined is None else len(LEAST)
-    numbers = index, len(choice.rows), len(choice.added), *choice.rows, *choice.added
+    index = int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot)) if choice.is_refined is None else len(MIN_PIVOTS)
+    numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), choice.scale
 
 
@@ -561,7 +578,7 @@ def set_up(
 def _new_entry(run: Run, code: GeneratedCode | None, t1: float, options: Options) -> CacheEntry | None:
     """Return the cache entry of a run at its start, or None if the run cannot be cached."""
     system, n = run.system, run.system.n_q
-    is_trusted = identity(options.method) is not None and all(traced.trusted for traced in run.traced)
+    is_trusted = identity(options.method) is not None and all(traced.is_trusted for traced in run.traced)
     if not is_trusted or run.starts_singular or run.work.notes.base.size > MAX_WORKSPACE:
         return None
     t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
@@ -621,8 +638,8 @@ def _new_run(
     first_value = first_force(system, t0, q0, v0)
     _check_start(system, t0, q0, v0, options.check_derivatives)
 
-    def check(traced: Traced) -> None:
-        traced.refuse(system, t0, t1, q0, v0)
+    def check(traced: CallbackTraces) -> None:
+        traced.refuse_if_wrong(system, t0, t1, q0, v0)
 
     system, derived = with_derived_callbacks(system, check)
     run, code = _run_from(system, t0, q0, v0, options, derived, check)
@@ -654,8 +671,8 @@ def _run_from(
     q: Array,
     v: Array,
     options: Options,
-    derived: Sequence[Traced],
-    check: Callable[[Traced], None],
+    derived: Sequence[CallbackTraces],
+    check: Callable[[CallbackTraces], None],
 ) -> tuple[Run, GeneratedCode | None]:
     """Create the run from a state, and the machine code that it calls."""
     fixed = options.step_size is not None
@@ -670,6 +687,8 @@ def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, der
     """Check a start, unless it is the start that was checked last; raise if it is refused."""
 
     def check() -> None:
-        check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))
+        check_start(
+            system, t0, q0, v0, derivatives=derivatives, exact=lambda: has_exact_derivatives(system, t0, q0, v0)
+        )
 
     system.remembered_at(("start", derivatives), (t0, q0.tobytes(), v0.tobytes()), check)

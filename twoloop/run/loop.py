@@ -451,7 +451,7 @@ class IntegrationLoop:
             if code != INTERRUPTED:
                 end = time_reached
                 if recorder.end_state is not None:
-                    self.sample.end(*recorder.end_state)
+                    self.sample.end_at(*recorder.end_state)
                     end = recorder.end_state[0]
                 status, message = compare_callbacks(run, self.sample, end, check_derivatives, status, message)
             if self.is_final_attempt and status >= 0:

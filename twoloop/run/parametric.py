@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.structure import has_definite_mass, is_definite
 from twoloop.generate.compile_equations import GeneratedCode
-from twoloop.generate.derived_callbacks import exact_derivatives, exact_near
+from twoloop.generate.derived_callbacks import exact_derivatives, has_exact_derivatives
 from twoloop.generate.trace import ParameterArrays, runs_on_symbols, share_checked_bounds, trace_cache_of
-from twoloop.generate.traced_values import CheckedRegion, refuse_wrong, unchecked
+from twoloop.generate.traced_values import CheckedRegion, accept_traces, refuse_wrong_traces
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.data.indices import AUGMENTED, BANDWIDTH, DIAGONAL_MASS, FORM
 from twoloop.methods.plan import Method, Plan
@@ -60,14 +60,14 @@ class SharedSetup:
         symbolic = copy.copy(system)  # a system whose numbers are expressions in the parameters
         cache = self.trace_cache
         symbolic.derived = {("family", trace_cache_of): cache, ("numbers", cache): lambda array: array}
-        symbolic_code = code_for(symbolic, method, fixed, compiled, t, q, unchecked)
+        symbolic_code = code_for(symbolic, method, fixed, compiled, t, q, accept_traces)
         self.plan, self.interior_plans = plans_for(
-            symbolic, method, run.rtol, run.least_atol, fixed, symbolic_code, unchecked
+            symbolic, method, run.rtol, run.least_atol, fixed, symbolic_code, accept_traces
         )
         self.exact_derivatives = exact_derivatives(symbolic)
         self.has_definite_mass = has_definite_mass(system, t, q)
-        untraced_kinds = system.given.keys() - cache.traced
-        cache.traced |= {kind for kind in untraced_kinds if runs_on_symbols(system, kind, cache.parameters)}
+        untraced_kinds = system.given.keys() - cache.traced_kinds
+        cache.traced_kinds |= {kind for kind in untraced_kinds if runs_on_symbols(system, kind, cache.parameters)}
         share_checked_bounds(system)
         if not cache.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
@@ -106,7 +106,7 @@ class ParametricRun:
         run.traced, run.varied_parameters = run.plan.traced, self._functions.p
         self._initial_cache: dict[Any, Any] = {
             ("family", trace_cache_of): shared.trace_cache,
-            ("derivatives", trace_cache_of): None if exact is None else exact.with_numbers(array),
+            ("derivatives", trace_cache_of): None if exact is None else exact.with_coefficients(array),
             ("kit", id(self._functions)): Kit(self._functions),
             "kits": {},
         }
@@ -124,14 +124,14 @@ class ParametricRun:
     def _fill_arrays(self, system: ConstrainedSystem) -> None:
         self.current_system = system
         self._functions.p[:] = system.functions.p
-        self._expression_arrays.write(self.shared.trace_cache.products(self._functions.p))
+        self._expression_arrays.write(self.shared.trace_cache.product_evaluator(self._functions.p))
         self.system = self.run.system = copy.copy(system)
         self.system.functions, self.system.derived = self._functions, self._initial_cache.copy()
         self.system.within_bounds.update(self.shared.trace_cache.within_bounds)
         self.system.checked, self._mass_agrees = False, not system.constant_mass
         self.system.bandwidth = None  # the banded form is not used by these runs
         for traced in self.run.traced:
-            traced.trusted = False
+            traced.is_trusted = False
 
     def callbacks_agree(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
         """Return whether callbacks agree with traces near the start, and M keeps its structure (definite, diagonal)."""
@@ -142,8 +142,8 @@ class ParametricRun:
             self._mass_agrees = mass_structure == (has_definite_mass(system, t0, q), is_diagonal(mass))
         try:
             if with_derivatives:
-                check_derivatives(system, t0, q, lambda: exact_near(system, t0, q, v))
-            refuse_wrong(run.traced, system, t0, t1, q, v)
+                check_derivatives(system, t0, q, lambda: has_exact_derivatives(system, t0, q, v))
+            refuse_wrong_traces(run.traced, system, t0, t1, q, v)
         except Exception:  # also raised by callbacks; `set_up` will describe the error
             return False
         return self._mass_agrees
@@ -159,7 +159,7 @@ class ParametricRun:
             for name in PLAN_FIELDS
             if plan_fields[name] is not None
         }
-        return plan.changed(traced=tuple(each.with_numbers(array) for each in plan.traced), **changes)
+        return plan.changed(traced=tuple(each.with_coefficients(array) for each in plan.traced), **changes)
 
 
 def _values_of_plans(run: Run) -> list[Any]:

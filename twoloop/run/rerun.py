@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import run_inconsistency
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
-from twoloop.generate.traced_values import CLEAR_DIFFERENCE, MAX_IN_PYTHON, CheckedRegion, Sample
+from twoloop.generate.traced_values import CLEAR_DIFFERENCE, MAX_STATES_IN_PYTHON, CheckedRegion, Sample
 from twoloop.kernels.data import indices
 from twoloop.methods import dop853
 from twoloop.methods.dop853 import DOP853
@@ -44,7 +44,7 @@ def compare_callbacks(
     parameters = run.varied_parameters
     all_states = region.is_comparison_due() or run.system.called_in_python
     all_states = all_states or (parameters is not None and not region.contains_parameters(parameters))
-    region.count()
+    region.count_run()
     if not all_states and end <= run.compared_until[0]:
         return status, message
     old_status = status
@@ -86,7 +86,7 @@ def compare_callbacks_at(
             status, message = _check_derivatives(run, states, first_state, status, message)
         status, message = _check_traces(run, states, status, message)
         if status == old_status and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
-            difference = find_nondeterminism(run.system, states[:: 1 + len(states) // MAX_IN_PYTHON])
+            difference = find_nondeterminism(run.system, states[:: 1 + len(states) // MAX_STATES_IN_PYTHON])
             if difference is not None:
                 status, message = Status.WRONG_TRACE, f"In the run {difference}. {message}"
     if status == old_status:

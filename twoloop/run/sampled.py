@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import check_finite, check_real, shown
 from twoloop.checks.consistency import check_start
 from twoloop.checks.structure import dependent_rows, parts_of
-from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
-from twoloop.generate.traced_values import Traced
+from twoloop.generate.derived_callbacks import has_exact_derivatives, with_derived_callbacks
+from twoloop.generate.traced_values import CallbackTraces
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
@@ -97,10 +97,12 @@ class SampledRun:
             )
         if isinstance(method, Auto):
             method = replace(method, series=None, n_rows=system.n_c + system.n_a)
-        check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))
+        check_start(
+            system, t0, q0, v0, derivatives=derivatives, exact=lambda: has_exact_derivatives(system, t0, q0, v0)
+        )
 
-        def check(traced: Traced) -> None:
-            traced.refuse(system, t0, t0 + 1.0, q0, v0)
+        def check(traced: CallbackTraces) -> None:
+            traced.refuse_if_wrong(system, t0, t0 + 1.0, q0, v0)
 
         self._derived_system, _ = with_derived_callbacks(system, check)
         self._plan = method.plan(system.n_q, rtol, float(atol.min()), False)

@@ -60,7 +60,7 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 # KEEP: 1 if consecutive steps evaluate the series about the first state, to interpolate within a step. After the
 # scalars, `options` contains the offsets of the program's arrays, then these arrays, with integers as bit patterns
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
-# indices of the arrays of a table of operations, and of a list of sums, see `Table`, `Sums` in twoloop.generate.series
+# indices of the arrays of OperationGroups, and of Sums, see twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
 SUM_INDICES = N_SUMS  # index, after the arrays of a list of sums, of the array of indices at which sums are stored
