@@ -607,9 +607,9 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
     elif type(cached[key]) is type(functions) and cached[key] is not functions:
         entry = _new_entry(run, code, t1, options)
         if entry is not None and entry.idle is not None:
-            fixed = options.step_size is not None
+            has_fixed_step = options.step_size is not None
             with suppress(ValueError):
-                shared = SharedSetup(entry.run, code, options.method, fixed, options.compiled)
+                shared = SharedSetup(entry.run, code, options.method, has_fixed_step, options.compiled)
                 cached[key] = entry._replace(shared=shared)
                 return
         cached[key] = None
@@ -632,7 +632,7 @@ def _new_run(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, GeneratedCode | None]:
     """Check a start, derive callbacks, generate code, choose a plan; return a new run at the start, and the code."""
-    fixed, original, new = options.step_size is not None, system, not system.checked
+    has_fixed_step, original, new = options.step_size is not None, system, not system.checked
     if new:
         load_checked_bounds(system)
     first_value = first_force(system, t0, q0, v0)
@@ -646,14 +646,14 @@ def _new_run(
     if run.static_form is None:
         branch = branch_at(system, t0, run.state, run.rank, options.atol + options.rtol * np.abs(v0).max())
         run.starts_singular = branch is not None
-        if isinstance(branch, Branch) and not fixed:
+        if isinstance(branch, Branch) and not has_fixed_step:
             beside, other = _run_from(system, t0, branch.q, branch.v, options, derived, check)
             if beside.rank == branch.rank and beside.static_form is None:
                 run, code = beside, other
                 run.move_to_singular_start(t0, q0, v0, branch.a, branch.first_size)
     if new:
         share_checked_bounds(original)
-    if system.called_in_python and not fixed:
+    if system.called_in_python and not has_fixed_step:
         difference = find_nondeterminism(system, states_near_start(t0, t1, q0, v0))
         if difference is not None:
             raise ValueError(difference)
@@ -675,9 +675,11 @@ def _run_from(
     check: Callable[[CallbackTraces], None],
 ) -> tuple[Run, GeneratedCode | None]:
     """Create the run from a state, and the machine code that it calls."""
-    fixed = options.step_size is not None
-    code = code_for(system, options.method, fixed, options.compiled, t, q, check)
-    plan, interiors = plans_for(system, options.method, options.rtol, float(options.atol.min()), fixed, code, check)
+    has_fixed_step = options.step_size is not None
+    code = code_for(system, options.method, has_fixed_step, options.compiled, t, q, check)
+    plan, interiors = plans_for(
+        system, options.method, options.rtol, float(options.atol.min()), has_fixed_step, code, check
+    )
     if derived:
         plan = plan.changed(traced=(*plan.traced, *derived))
     return Run(system, plan, t, q, v, options.rtol, options.atol, options.step_size, interiors), code

@@ -389,14 +389,14 @@ class Interpolator:
 
     def fill_accelerations(self, times: Array, states: Array, out: Array) -> None:
         """Store [a, lam] in `out` for states on the constraints, given `times` and rows [q, v]; NaN on failure."""
-        complete, times, states = (
+        compute, times, states = (
             entry_point(self.kernels.fill_accelerations),
             *map(np.ascontiguousarray, (times, states)),
         )
-        failures = complete(self.kit, self.work, times, states, out)
+        failures = compute(self.kit, self.work, times, states, out)
         if failures > 0 and self.static_form is not None:
             self._switch_to_dense_form()
-            failures = complete(self.kit, self.work, times, states, out)
+            failures = compute(self.kit, self.work, times, states, out)
         self.failures = failures
         if failures > 0 and self.warns:
             _warn_of_lost_rank(

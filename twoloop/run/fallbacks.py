@@ -172,9 +172,9 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     from twoloop.kernels.steps.crossing_step import BACKWARD_FRACTION, NODE_GAP
 
     plan = crossing_plan(run.system.n_q)
-    earliest, fixed = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
+    earliest, has_fixed_step = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
     base, run.mirrored_size = None, 0.0
-    if not fixed:
+    if not has_fixed_step:
         base, run.mirrored_size = _find_base(run, [place for place in past if place[0] >= earliest])
     # try several origins: earlier nodes may be before a jump of a force; near the start or the end of the run there may
     # be too few nodes; the polynomial from an old base may be too long
@@ -183,7 +183,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     near_end = compiled and clock[a.T] + LARGER_RATIOS[-1] * h_long > run.t1
     origins = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
     run.origins = [*[Origin(*start) for start in origins], Origin(np.inf, None)]
-    if not fixed:
+    if not has_fixed_step:
         variants = [(limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]]
         run.origins += [Origin(*start, *variant) for variant in variants[1:] for start in origins]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])

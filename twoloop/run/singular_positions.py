@@ -193,8 +193,8 @@ def _format_times(ratios: dict[float, float]) -> str:
 
 
 def _describe_ratio(ratios: dict[float, float]) -> str:
-    least = min(ratios.values())
-    return f"the smallest singular value of the constraint Jacobian comes down to {least:.1g} of the largest"
+    least_ratio = min(ratios.values())
+    return f"the smallest singular value of the constraint Jacobian comes down to {least_ratio:.1g} of the largest"
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
