@@ -19,11 +19,11 @@ from twoloop.kernels.control.singular_positions import (
     SHORT_STEP,
     check_partition,
     comes_near_singular,
-    ends_at_singular,
-    fails_at_singular,
-    near_singular,
+    ends_near_singular,
+    is_near_singular,
+    is_too_short_near_singular,
+    prepare_projected_repetition,
     record_pivot_at_output,
-    retry_projected,
 )
 from twoloop.kernels.control.step_size import (
     EQUAL_SPACINGS,
@@ -156,15 +156,15 @@ def _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, st
 def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
     """Prepare the repetition of a failed step and return CONTINUE, or return an end code.
 
-    The step is repeated with a smaller size, with a new partition, or with both. A step of fixed size is repeated once,
-    with a new partition; `t_repeated` is the beginning (s) of the last step repeated in this way.
+    The step is repeated with a smaller size, with a new partition, or with both. A step of fixed size is repeated only
+    once, with a new partition; `t_repeated` (s) is the time at which the last step of fixed size to be repeated begins.
     """
     n = w.Q.size
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
-    if code == NEEDS_DENSE or fails_at_singular(f, clock, size):
+    if code == NEEDS_DENSE or is_too_short_near_singular(f, clock, size):
         return at.NEEDS_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
-    if retry_projected(f, w, control, clock, size):
+    if prepare_projected_repetition(f, w, control, clock, size):
         return at.CONTINUE
     clock[at.FAILURE_CODE] = code
     clock[at.H_FAILED] = size
@@ -172,9 +172,9 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
         return at.SWITCH_METHOD
     if control[at.FIXED_STEP] > 0.0:
         if not needs_partition or t == t_repeated:
-            return at.NEAR_SINGULAR if near_singular(f, w, control, clock, t, state[:n]) else at.FIXED_STEP_FAILED
+            return at.NEAR_SINGULAR if is_near_singular(f, w, control, clock, t, state[:n]) else at.FIXED_STEP_FAILED
     else:
-        if size < SHORT_STEP * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
+        if size < SHORT_STEP * clock[at.H_LONG] and is_near_singular(f, w, control, clock, t, state[:n]):
             return at.NEAR_SINGULAR
         clock[at.H_LIMIT] = control[at.LIMIT_FACTOR] * size
         clock[at.LIMIT_AGE] = 0.0
@@ -193,12 +193,12 @@ def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
     n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
-    if retry_projected(f, w, control, clock, size):
+    if prepare_projected_repetition(f, w, control, clock, size):
         return at.CONTINUE
     clock[at.H_NEXT] = min(proposed_size, MAX_RATIO_AFTER_REJECTION * size, size - np.spacing(abs(t + size)))
-    if fails_at_singular(f, clock, size):
+    if is_too_short_near_singular(f, clock, size):
         return at.NEEDS_DENSE
-    if size < SHORT_STEP * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
+    if size < SHORT_STEP * clock[at.H_LONG] and is_near_singular(f, w, control, clock, t, state[:n]):
         return at.NEAR_SINGULAR
     return at.CONTINUE
 
@@ -307,10 +307,10 @@ def advance(
         # where a force jumps, an error estimate may be small by chance: `error_factor` enlarges it until ROUGH_TO
         error_factor = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * error_factor <= 1.0
-        if accepted and not reaches_goal and ends_at_singular(f, w, control, clock):
+        if accepted and not reaches_goal and ends_near_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
-            if not retry_projected(f, w, control, clock, size):
+            if not prepare_projected_repetition(f, w, control, clock, size):
                 clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
         if (

@@ -35,9 +35,9 @@ MAX_VELOCITY_ROUNDING = 10.0
 # pivot within an interval, relative to the larger one of the pivots at its ends, below which the position is singular
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5  # pivot below which any position is singular; for pivots see min_pivot_ratio in partition.py
-# a position whose pivot is below WEAK_PIVOT is singular, too, if the velocities of the polynomials nearly satisfy the
-# constraints: if their violation, about pivot times change by the projection, is below RESIDUAL tolerances
-RESIDUAL, WEAK_PIVOT = 10.0, 0.05
+# a position with a pivot below WEAK_PIVOT is singular, too, if velocities of the polynomials violate the constraints by
+# at most MAX_VIOLATION tolerances; the violation is about the pivot times the change by the projection
+MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
 @merged
@@ -138,7 +138,7 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
             largest = max(largest, min_pivot_ratio(f, w, t[r], states[r, :n]))
     code = renew_partition(f, w, time, q)
     pivot = min_pivot_ratio(f, w, time, q) if code == DONE else 0.0
-    return pivot < max(SINGULAR_PIVOT_RATIO * largest, SINGULAR_PIVOT, min(RESIDUAL / change, WEAK_PIVOT))
+    return pivot < max(SINGULAR_PIVOT_RATIO * largest, SINGULAR_PIVOT, min(MAX_VIOLATION / change, WEAK_PIVOT))
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))

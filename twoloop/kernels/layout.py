@@ -29,9 +29,9 @@ class Static(NamedTuple):
     dense_jacobian: bool  # whether a callback fills a full matrix with C_q, from which the entries are copied
 
 
-# arguments of _layout: n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T is used, whether the augmented
-# matrix is used, number of nodes of the traced programs, sizes of the static form (None: another form), length of
-# `matrices`
+# arguments of _create_layout: n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T is used, whether the
+# augmented matrix is used, number of nodes of the traced programs, sizes of the static form (None: another form),
+# length of `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
@@ -73,7 +73,7 @@ def copy_workspace(work: Work) -> Work:
 
 def lasting_arrays(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return views of the floats and of the integers of a workspace that keep data from one step to the next."""
-    layout = _layout(*work.sizes)
+    layout = _create_layout(*work.sizes)
     return work.notes.base[: layout.n_lasting], work.counters.base[: layout.n_lasting_integers]
 
 
@@ -86,7 +86,7 @@ def _take_unused_workspace(sizes: Sizes) -> Work | None:
 
 
 def _allocate_workspace(sizes: Sizes) -> Work:
-    layout = _layout(*sizes)
+    layout = _create_layout(*sizes)
     numbers, integers = np.zeros(layout.n_numbers), np.zeros(layout.n_integers, dtype=np.int64)
     arrays: dict[str, Any] = {name: numbers[a:b].reshape(shape) for name, a, b, shape in layout.numbers}
     arrays |= {name: integers[a:b].reshape(shape) for name, a, b, shape in layout.integers}
@@ -166,7 +166,7 @@ def _static_shapes(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[
 
 
 @cache
-def _layout(
+def _create_layout(
     n_q: int,
     n_c: int,
     n_a: int,

@@ -103,8 +103,8 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 29)
 
-# constants of the power iterations for rho (1/s), the largest rate of a motion, an eigenvalue (or the root of one) of
-# the derivatives of the accelerations; used in stiffness.py and run/messages.py
+# constants of the power iterations in stiffness.py and run/messages.py, which estimate rho (1/s), the largest rate of
+# the motion; it follows from eigenvalues of dF/dq and dF/dv, where F are the accelerations
 DISPLACEMENT = 1e-6  # displacement in finite differences, relative to the largest coordinate or velocity
 INNER_TOL = 1e-8  # tolerance of Newton's method for positions that are projected onto the constraints
 

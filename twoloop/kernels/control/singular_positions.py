@@ -32,10 +32,12 @@ STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivo
 # with projected stages
 REPEAT_PIVOT = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
-GIVE_UP_BELOW = 0.001  # smallest step size near a singular position, relative to the longest of the last steps
+MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, relative to the longest recent step
 # ratio of the smallest pivot to its largest value so far below which rounding determines accelerations, and a run ends
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that steps (generated code) do not use
+CHECK_INTERVAL = (
+    16  # number of accepted steps between two checks of a partition, if steps (generated code) do not use it
+)
 # the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
 # freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
@@ -53,11 +55,11 @@ MIN_END_RATIO = 0.25
 
 
 @merged
-def near_singular(f, w, control, clock, t, q):
+def is_near_singular(f, w, control, clock, t, q):
     """Return whether control[BRIDGE] is 1 and a singular position was near when the partition was chosen.
 
-    Steps of generated code do not use the partition, which may be old. It is renewed first, at (t, q), if the run has
-    come near a singular position before.
+    Steps of generated code do not use the partition, which may then be old: it is first renewed at (t, q) if the run
+    has come near a singular position before.
     """
     if control[at.BRIDGE] != 1.0:
         return False
@@ -68,8 +70,8 @@ def near_singular(f, w, control, clock, t, q):
 
 
 @merged
-def ends_at_singular(f, w, control, clock):
-    """Return whether a step of the static form ends so near a singular position that no step should begin there.
+def ends_near_singular(f, w, control, clock):
+    """Return whether a step of the static form ends so near a singular position that no step should begin at its end.
 
     A singular position inside a step, away from both ends, does no harm.
     """
@@ -79,15 +81,15 @@ def ends_at_singular(f, w, control, clock):
 
 
 @merged
-def fails_at_singular(f, clock, size):
+def is_too_short_near_singular(f, clock, size):
     """Return whether a failed step of the static form, near a singular position, is too short to be repeated."""
     is_near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
-    return f.flags[FORM] == STATIC and is_near and size < GIVE_UP_BELOW * clock[at.H_LONG]
+    return f.flags[FORM] == STATIC and is_near and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG]
 
 
 @merged
-def retry_projected(f, w, control, clock, size):
-    """Return whether to repeat a rejected step of the static form with projected stages; if so, set clock[H_NEXT].
+def prepare_projected_repetition(f, w, control, clock, size):
+    """Return whether a rejected step of the static form is repeated with projected stages; if so, set clock[H_NEXT].
 
     Near a singular position, accelerations of stages off the constraints have large errors. A long step that ends well
     beyond the position may succeed where shorter steps fail: the first repetition has at least the size H_LONG.
@@ -110,7 +112,7 @@ def near_pivot_ratio(tolerances):
 
 
 @compiled
-def _least_pivot_within(f, w, t, size, before, end, state, new_state):
+def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
     """Return the smallest pivot of C_q within a step, and its largest change between neighbouring samples.
 
     The samples are on the cubic through the states at the ends of the step, whose pivots are `before` and `end`.
@@ -132,7 +134,8 @@ def _least_pivot_within(f, w, t, size, before, end, state, new_state):
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
     """Return whether an accepted step comes so near a singular position that a crossing step must replace it.
 
-    Rounding errors of its stages may then change the result by more than the tolerances without a large error estimate.
+    Rounding errors of its stages may then change the result by more than the tolerances, though its error estimate is
+    small.
     """
     bridge = control[at.BRIDGE]
     if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
@@ -146,7 +149,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
     if min(before, end) > MAX_UNCHECKED_PIVOT * largest:
         control[at.BRIDGE] = 1.0
         return False
-    least, change = _least_pivot_within(f, w, t, size, before, end, state, new_state)
+    least, change = _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state)
     if bridge == at.SUSPENDED:
         min_ratio = max(least / largest, EPS)
         clock[at.PIVOT_PASSED] = min_ratio if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], min_ratio)
@@ -208,10 +211,12 @@ def check_partition(f, w, control, clock, size, at_output, state):
         w.notes[SENSITIVITY] = 1.0  # as far from singular positions: then the partition is renewed again soon
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
-    if is_short and size < GIVE_UP_BELOW * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
+    if is_short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
         # the partition may have been chosen at a distant state: with a new one an implicit method may still continue
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step can cross the singular position, where rounding would determine velocities
-    return at.NEAR_SINGULAR if is_short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE
+    return (
+        at.NEAR_SINGULAR if is_short and is_near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE
+    )

@@ -210,23 +210,23 @@ def _largest_rate(f, w, memory, t, state, new_state):
     n = w.Q.size
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-    squared = damping = 0.0
+    growth_by_q = growth_by_v = 0.0
     # with generated code the partition may be an old one, whose independent coordinates hardly move
-    explicit = memory[PHASE] == EXPLICIT
-    if explicit and f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
+    is_explicit = memory[PHASE] == EXPLICIT
+    if is_explicit and f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
     for _ in range(N_POWER_ITERATIONS):
-        squared = _power_iteration(f, w, t, state, by_q, False, Q, V, A)
+        growth_by_q = _power_iteration(f, w, t, state, by_q, False, Q, V, A)
     for _ in range(N_POWER_ITERATIONS):
-        damping = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
-        if damping * memory[H_MEAN] < NEGLIGIBLE_DAMPING:
+        growth_by_v = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
+        if growth_by_v * memory[H_MEAN] < NEGLIGIBLE_DAMPING:
             break
     for m in range(n):  # a component is zero if its coordinate was dependent in all estimates so far
         if by_q[m] == 0.0:
             by_q[m] = ZERO_REPLACEMENT
         if by_v[m] == 0.0:
             by_v[m] = ZERO_REPLACEMENT
-    return max(np.sqrt(squared), damping)
+    return max(np.sqrt(growth_by_q), growth_by_v)
 
 
 @compiled

@@ -90,8 +90,8 @@ class Work(NamedTuple):
     index_a: Any  # program that factors the augmented matrix; its SIZE is 0 until the program is written
     values_a: Any  # the factors of the augmented matrix; empty in other forms
     right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix, and scratch
-    order: Any  # (n_q) scratch: column order of the full pivoting
-    row_order: Any  # (n_c + n_a) scratch: row order of the full pivoting
+    order: Any  # (n_q) scratch: order of the columns in the full pivoting
+    row_order: Any  # (n_c + n_a) scratch: order of the rows in the full pivoting
     counters: Any  # (N_COUNTERS) numbers of steps, iterations and evaluations in the run, see indices.py
     lapack: Any  # addresses of band.ROUTINES; 0 where linear algebra is dense
     predicted: Any  # (r) dependent positions predicted by the integration formula, before they are projected
@@ -102,7 +102,7 @@ class Work(NamedTuple):
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
     is_independent: Any  # (n_c) 1 for independent rows, else 0
-    factors: Any  # numbers of the factors, in the slots of the program
+    factors: Any  # entries of the factors, at the indices that the program gives
     pivot_sizes: Any  # (N) squared norms of the rows, to which pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (N) right-hand side on entry to a solver, solution on return
     solutions: Any  # (3 N) scratch, then (n_c) factors by which rows stiffen M, see linalg/sparse_ldl.py
@@ -403,7 +403,7 @@ def faulty_callback(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-SLACK = 1e-9  # largest excess of a step size over GAP, relative to GAP, that counts as a rounding error
+GAP_SLACK = 1e-9  # largest excess of a step size over GAP, relative to GAP, that counts as a rounding error
 
 
 @merged
@@ -415,7 +415,7 @@ def allowed_error(tolerances, m, x, x1):
 @merged
 def is_beyond_gap(tolerances, h):
     """Return whether a step of size h is longer than tolerances[GAP]."""
-    return h > tolerances[GAP] * (1.0 + SLACK)
+    return h > tolerances[GAP] * (1.0 + GAP_SLACK)
 
 
 @merged

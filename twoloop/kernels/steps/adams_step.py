@@ -268,10 +268,10 @@ def _choose_order(memory, h, k, table, d, n):
     order, expected = k, error
     if (k > 2 and max(below, far_below) <= error) or (k == 2 and below <= 0.5 * error):
         order, expected = k - 1, below
-    starting = memory[STARTING] == 1.0 and order == k and k < HIGHEST
+    is_starting = memory[STARTING] == 1.0 and order == k and k < HIGHEST
     if error <= 1.0:
-        memory[STARTING] = 1.0 if starting else 0.0
-        if starting:
+        memory[STARTING] = 1.0 if is_starting else 0.0
+        if is_starting:
             order, expected = k + 1, error
         elif order == k and k < HIGHEST and memory[AGE] >= k + 1 and memory[DEPTH] > k:
             above = _error(g, G, h, k + 1, v3, q3)
@@ -286,7 +286,7 @@ def _choose_order(memory, h, k, table, d, n):
     if error > 1.0:
         return error, max(SAFETY * error ** (-1.0 / (k + 1.0)), SHRINKAGE)
     error_root = expected ** (1.0 / (order + 1.0))
-    return error, SAFETY / min(max(error_root, SAFETY / (START_GROWTH if starting else GROWTH)), 1.0)
+    return error, SAFETY / min(max(error_root, SAFETY / (START_GROWTH if is_starting else GROWTH)), 1.0)
 
 
 @kernel(ATTEMPT, vectorized=True)

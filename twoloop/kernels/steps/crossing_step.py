@@ -39,7 +39,7 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# indices of the scalars in `options`, followed by A, A A and Legendre coefficients (S, S each), b, b A and c (S each)
+# indices of the scalars in `options`, followed by A, A @ A and Legendre coefficients (S, S each), b, b @ A, c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of Gauss nodes, which are the stages
 # the iteration has converged when a sweep changes accelerations by at most CONVERGED_CHANGE tolerances

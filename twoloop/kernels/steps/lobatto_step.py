@@ -23,9 +23,9 @@ from twoloop.kernels.data import collocation as field
 from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REFUSED, array_offsets
 from twoloop.kernels.data.common import (
     ATTEMPT,
+    GAP_SLACK,
     MANY,
     SETTLE,
-    SLACK,
     Attempt,
     Step,
     allowed_error,
@@ -116,7 +116,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     """
     is_first, is_estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[LOOK] / CHECKED_GAP
-    if is_estimated and h > h_max * (1.0 + SLACK):
+    if is_estimated and h > h_max * (1.0 + GAP_SLACK):
         return REFUSED, h / h_max, h_max / h
     data[field.T], data[field.H], data[field.DEFECT] = t, h, -1.0
     data[field.MAY_GUESS] = 0.0
@@ -143,7 +143,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     max_factor = GROWTH_EARLY if data[field.N_STEPS] < N_EARLY else GROWTH
     if max_factor > GROWTH and n_sweeps == 1:
         max_factor = GROWTH_ONE_SWEEP
-    if h > options[FREE] * tolerances[LOOK] * (1.0 + SLACK):
+    if h > options[FREE] * tolerances[LOOK] * (1.0 + GAP_SLACK):
         w.counters[N_EVALUATIONS] += LANES
         defect = f.audit_nodes(data, state, f.own_numbers)
         if defect < 0.0:

@@ -19,9 +19,9 @@ MAX_STEP_RATIO = 3.0
 # force between an end of the step and the nearest stage
 END_ERROR_WEIGHT = 0.01
 
-# indices of the scalars in `options`. After the scalars, `options` contains A (s, s), A A (s, s), b (s), b A (s), c (s)
-# and the weights (s) that extrapolate from the nodes to 0 and to 1. EXTRAPOLATION: 1 / (2^order - 1), or 0 for no
-# extrapolation; OUTER_TEST: argument `outer_test` of options_array; POWER: order - 1
+# indices of the scalars in `options`. After the scalars, `options` contains A and A @ A (s, s each), b, b @ A and c (s
+# each), and the weights (s) that extrapolate from the nodes to 0 and to 1. EXTRAPOLATION: 1 / (2^order - 1), or 0 for
+# no extrapolation; OUTER_TEST: argument `outer_test` of options_array; POWER: order - 1
 STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
 
 
@@ -54,7 +54,7 @@ def _lagrange_values(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64
 
 @inlined
 def tableau_of(options):
-    """Return the number of stages s, and views of `options`: A, A A, b, b A, c."""
+    """Return the number of stages s, and views of `options`: A, A @ A, b, b @ A, c."""
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))

@@ -22,8 +22,8 @@ import numpy as np
 from twoloop.kernels.control.step_size import defect_ratio, departure, store_prediction
 from twoloop.kernels.data.common import (
     ATTEMPT,
+    GAP_SLACK,
     SETTLE,
-    SLACK,
     Attempt,
     Step,
     compiled,
@@ -539,7 +539,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
         error = x / memory[ALLOWED_SIZE]  # an upper bound of the error, which is a power of this ratio
-        if error > 1.0 + SLACK:
+        if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
         was_near_singular = w.notes[NEARLY_SINGULAR] != 0.0  # true from the first singular position of the run on
