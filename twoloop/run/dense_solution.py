@@ -535,15 +535,15 @@ class DenseSolution:
     Between accepted steps q and v are Hermite polynomials; the inner loop then restores the dependent coordinates, so
     that the constraints hold to rounding. At an accepted step the state is the stored one. The polynomials go through
     q, v and a of four neighbouring states (order 12). Where Newton's method solved the outer loop, they go through q
-    and v (order 8), because a has the noise of vibrations that are stepped over. For `BDF` and `Newmark`, v has a
-    polynomial of its own, through v and a (order 8).
+    and v (order 8), because a has the noise of vibrations that are stepped over. For `Lobatto16`, `BDF` and `Newmark`,
+    v has a polynomial of its own, through v and a (order 8).
 
-    The steps of `RungeKutta` of order 6 and more (by Newton's method of order 7 and more) and of `Taylor`, in `auto`
-    too, are too long for such polynomials. Each is divided into 2 to 6 equal steps of the method when a time within it
-    is first evaluated; this costs about as much as the run. If the last of its states changes a polynomial by more than
-    the tolerances, the polynomial is compared with the constraints and the equations at two times in the interval.
-    Beside a singular position, or a force that jumps, a polynomial may violate them. Then the interval gets the
-    interior states of a step across the position, or of four steps of `DOP853` (or a Radau method, where Newton's
+    The steps of `RungeKutta` of order 6 and more (by Newton's method of order 7 and more), of `Taylor` and `Lobatto16`,
+    in `auto` too, are too long for such polynomials. Each is divided into 2 to 6 equal steps of the method when a time
+    within it is first evaluated; this costs about as much as the run. If the last of its states changes a polynomial by
+    more than the tolerances, the polynomial is compared with the constraints and the equations at two times in the
+    interval. Beside a singular position, or a force that jumps, a polynomial may violate them. Then the interval gets
+    the interior states of a step across the position, or of four steps of `DOP853` (or a Radau method, where Newton's
     method was used), or none, whichever fits best. The evaluations for all this are not counted.
 
     The solution takes 8 (2 + 3 n_q) bytes of memory per step.
