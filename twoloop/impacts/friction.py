@@ -92,12 +92,12 @@ def solve_bounded(D: Array, c: Array, n: int, limit: Array) -> Array:
 
 
 def holding_forces(D: Array, c: Array, n: int, limit: Array) -> Array:
-    """Return forces of n stops and of joints held by friction up to `limit`, for accelerations c without these."""
+    """Return forces of n stops and of joints held by friction up to `limit`; c: accelerations without these forces."""
     return solve_bounded(D, c, n, limit) if len(limit) else solve_complementarity(D, c)
 
 
 def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tuple[Array, NDArray[np.int64]]:
-    """Return forces at stops, in joints at rest, and at stops with friction; and the sliding directions of the latter.
+    """Return forces (at stops, in joints at rest, of friction at stops), and the directions in which stops slide.
 
     The forces of stops are non-negative and complementary to the accelerations (or velocities) D x + c. Friction
     opposes sliding with its coefficient times the force of the stop; at rest it is less than that. Fixed-point

@@ -74,7 +74,7 @@ class Impacts:
         self.noise, self.min_rates, self.n_stops = noise, min_rates, len(restitution)
 
     def joint_impulses(self, stops: NDArray[np.int64], rates: Array, restitution: Array) -> Array:
-        """Return the impulses of an impact at these stops at once, by Moreau's law."""
+        """Return the impulses (k + n_tangents,) of one impact that all of these stops share, by Moreau's law."""
         P = np.zeros(len(rates))
         index_of_stop = {int(k): i for i, k in enumerate(stops)}
         friction_indices = [i for i, k in enumerate(self.tangents.normal.tolist()) if k in index_of_stop]

@@ -219,7 +219,7 @@ class CachedIntegrator:
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, timed_states = n, None  # one row for each step, unless `_finish` is called
+        n_rows, timed_states = n, None  # one row for each step, unless `_finish_run` is called
         rows_differ = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent_rows
         all_steps = output.times is None and not output.dense
         if n < 0 or rows_differ or due or not all_steps or parametric is not None:
@@ -227,7 +227,7 @@ class CachedIntegrator:
                 return None
             interrupts.install_handlers()
             n_rows, n = arrays.filled.tolist()
-            finished = self._finish(system, t1, q0, v0, output, interrupts, due, fields)
+            finished = self._finish_run(system, t1, q0, v0, output, interrupts, due, fields)
             if not isinstance(finished, tuple):
                 return finished
             (timed_states,) = finished
@@ -239,7 +239,7 @@ class CachedIntegrator:
         region.count_run()  # runs that `IntegrationLoop` has continued are counted by `compare_callbacks`
         return fields
 
-    def _finish(
+    def _finish_run(
         self,
         system: ConstrainedSystem,
         t1: float,
@@ -674,7 +674,7 @@ def _run_from(
     derived: Sequence[CallbackTraces],
     check: Callable[[CallbackTraces], None],
 ) -> tuple[Run, GeneratedCode | None]:
-    """Create the run from a state, and the machine code that it calls."""
+    """Return a new run that begins at a state, and the generated code that it calls."""
     has_fixed_step = options.step_size is not None
     code = code_for(system, options.method, has_fixed_step, options.compiled, t, q, check)
     plan, interiors = plans_for(

@@ -192,12 +192,12 @@ class Interpolator:
         source, group = (divided, divided_groups) if len(divided_groups) else (table, other_groups)
         time, out = np.empty(1), np.empty((1, 2 * self.system.n_q))
 
-        def row(t: float) -> Array:
+        def row_at(t: float) -> Array:
             time[0] = t
             self._record_failures(self._interpolate(source, group, time, out), 1)
             return out[0].copy()
 
-        return row
+        return row_at
 
     def _record_failures(self, failures: int, n_times: int) -> None:
         self.failures = failures
@@ -379,7 +379,7 @@ class Interpolator:
             yield t, states
 
     def restore_interior_states(self, t: Array, states: Array) -> None:
-        """Replace the cached interior states by those that `interior_plans` yielded; compute no others from now on."""
+        """Replace the cached interior states by those that `interior_blocks` yielded; compute no others from now on."""
         self.parts, self.may_divide = t.shape[1] - 1, False
         self._allocate_scratch()
         sizes = np.isfinite(t).sum(axis=1).tolist()
@@ -410,7 +410,7 @@ def _blocks_of_groups(groups: Groups) -> list[Groups]:
 
 
 def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
-    """Return groups, rows of indices for kernels, of `intervals` (indices); the indices of output times are 0."""
+    """Return a group (row of indices for kernels) of each of `intervals`; its indices of output times are 0."""
     groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
     groups[:, indices.KIND] = table.kinds[intervals]

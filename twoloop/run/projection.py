@@ -132,7 +132,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
 def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
-    """Return (q, v) projected onto the constraints by sparse factors; None if these, or the assembly, are in doubt."""
+    """Return (q, v) projected by sparse factors; None if the result or its assembly is in doubt."""
     form = static_form(system, t, q)
     if form is None:
         return None
@@ -162,7 +162,7 @@ def project_sparsely(
 
 
 def _other_guesses_agree(projection: _SparseProjection, position: Array, change: Array) -> bool:
-    """Return whether three guesses, as far from `position` as `change`, are projected nearly to where C_q predicts."""
+    """Return whether three guesses about max|change| from `position` are projected near the predictions by C_q."""
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     at_rest = np.zeros(len(position))
@@ -433,7 +433,7 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = LSTSQ_CUTOFF
 ) -> tuple[Array | None, float, int]:
-    """Return the projected q (None: diverged), its violation over the allowed violation, and the iteration count."""
+    """Return the projected q (None: diverged), its violation relative to the allowed one, and the iteration count."""
     least_excess, best_q, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
@@ -457,7 +457,7 @@ def _gauss_newton(
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff: float = LSTSQ_CUTOFF) -> Array:
-    """Return the smallest change (n_q,) of q in its `free` coordinates with C_q times the change equal to `values`."""
+    """Return the smallest change dq (n_q,), in the `free` coordinates only, with C_q dq = values."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
     change = np.zeros(jacobian.shape[1])

@@ -241,7 +241,7 @@ class Recorder:
             self._search_intervals(len(self._t) - WINDOW)
 
     def correct_last_state(self, t: float, row: Array) -> None:
-        """Replace [q, v, a] of the last state, as a node of interpolation, by `row`, if the time of this state is t."""
+        """If the last state is at t, replace its [q, v, a] by `row`, so that later interpolations use `row`."""
         if self.request.between_steps and len(self._t) and self._t[-1] == t:
             self._rows[-1, : len(row)] = row
 
@@ -568,7 +568,7 @@ class Record:
 
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
-    """Return a record with the attributes `fields`; the constructor, of a large frozen dataclass, would be slow."""
+    """Return a record with the attributes `fields`; faster than the constructor of such a large frozen dataclass."""
     instance = _new_object(kind)
     _set_fields(instance, fields)
     return instance

@@ -198,7 +198,7 @@ class Run:
         filled: NDArray[np.int64],
         active: tuple[Plan, Array, Kit] | None = None,
     ) -> int:
-        """Take compiled steps to the last output time, or until Python must act; return a code for why steps ended.
+        """Take compiled steps to the last output time, or until Python must act; return the code of the reason.
 
         Parameters
         ----------

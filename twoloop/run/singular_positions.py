@@ -163,7 +163,7 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return `singular_ratio` of the rows as scaled by `scaled_to_unit_masses`, so that it does not depend on units."""
+    """Return `singular_ratio` of rows scaled by `scaled_to_unit_masses`: it does not depend on units."""
     values = np.linalg.svd(scaled_to_unit_masses(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 

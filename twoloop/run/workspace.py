@@ -160,7 +160,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
-    """Return a copy of `form` with the program of Newton's matrix; None if sparse factors of this do not pay."""
+    """Return a copy of `form` with the program of Newton's matrix; None if sparse factors of this matrix do not pay."""
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
     cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
