@@ -263,7 +263,7 @@ def from_lagrangian(
     tangents : bool
         If True, derive the Jacobians of the forces and reactions for Newton's method. Useful for stiff forces: they
         replace finite differences, but double or triple the code. Fixed steps with large rotations converge better
-        without.
+        without. No effect with `nonholonomic`.
     name : str
         Used in messages.
 
