@@ -131,7 +131,7 @@ MAX_OPERATIONS = 5000  # largest number of operations of the equations: code of 
 MIN_DIVISOR = 1e-300  # smallest divisor, and smallest allowed error, which replaces 0
 INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
-# number of further steps that eliminate M first, after a step whose accelerations by the shorter program were invalid
+# number of next steps whose elimination begins with M, after a step in which the shorter program was not valid
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
@@ -143,11 +143,11 @@ MAX_CONTRACTION = 0.8  # contraction at or above which a step is rejected in its
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # lower and upper bound that replace a measured contraction outside of them
 # smallest and largest contraction with which the guessed size of the first step is accepted
 FAST_START, SLOW_START = 0.04, 0.3
-# contraction at or above which changes below NOISE, relative to the values, count as rounding errors
+# contraction at or above which changes below MAX_ROUNDING, relative to the values, count as rounding errors
 STAGNATION_RATIO = 0.5
-# in steps of fixed size: values that replace KAPPA, NOISE (forces may have rounding errors) and the limit of sweeps
-KAPPA_OF_FIXED, NOISE_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
-LEAST_CHANGE = 1e-30  # added to the ratio of the iteration error to KAPPA, whose logarithm would be infinite at 0
+# values that replace KAPPA, MAX_ROUNDING and the limit of sweeps in steps of fixed size
+KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
+LEAST_CHANGE = 1e-30  # added to the ratio of the iteration error to KAPPA, because its logarithm is computed
 ERROR_WEIGHT = 0.5  # factor by which the error estimate is multiplied
 # allowed defect at the midpoints between nodes, relative to the tolerances: most of its effect averages out in a step
 ALLOWED_DEFECT = 16.0
@@ -198,18 +198,18 @@ class CollocationCode:
         ) = mem.array_offsets(self.n, len(self.iterated_coordinates), self.n_rows)
 
         if self.split_functions is None:
-            outputs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
+            programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
         else:  # the digest of `shared` covers the other programs
-            outputs = self.equations.accelerations[:1]
+            programs = self.equations.accelerations[:1]
         numbers = self.numbers
-        description = [[each.sizes, *numbers.structure(each)] for each in outputs]
+        description = [[each.sizes, *numbers.structure(each)] for each in programs]
         self.structure = hashlib.sha256(repr([shared.digest, description]).encode()).hexdigest()
 
     def _find_iterated(self) -> list[int]:
         graph, exprs = self.equations.graph, []
-        for outputs in self.equations.accelerations:
-            exprs += outputs.expressions
-            exprs += [expr for i in outputs.quantities() for expr in graph.arguments(i)]
+        for program in self.equations.accelerations:
+            exprs += program.expressions
+            exprs += [expr for i in program.quantities() for expr in graph.arguments(i)]
         inputs = {i for expr in exprs for i in expr.terms if graph.operations[i] is None}
         return sorted({(i - 1) % self.n for i in inputs if i > 0})
 
@@ -232,8 +232,8 @@ class CollocationCode:
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
             if self.split_functions is not None and not self.has_reduced:
                 return self._evaluator(emit, work, 0)(inputs)
-            outputs, lowering = self.equations.accelerations[0], Lowering(emit, self.numbers)
-            (exprs,), graph = outputs.arrays.values(), self.equations.graph
+            program, lowering = self.equations.accelerations[0], Lowering(emit, self.numbers)
+            (exprs,), graph = program.arrays.values(), self.equations.graph
             for quantity, value in enumerate(inputs):
                 lowering.define(quantity, value)
 
@@ -245,8 +245,8 @@ class CollocationCode:
 
             def store_others() -> Value:
                 store_accelerations(self.other_coordinates)
-                lowering.expressions(graph, [expr for pair in outputs.conditions for expr in pair])
-                return lowering.is_valid(outputs, self._accelerations(emit, work))
+                lowering.expressions(graph, [expr for pair in program.conditions for expr in pair])
+                return lowering.is_valid(program, self._accelerations(emit, work))
 
             store_accelerations(self.iterated_coordinates)
             return store_others
@@ -342,7 +342,7 @@ class CollocationCode:
             )
             scaled_v = wide.multiply(iterated_weight, wide.fma(length, a, v))
             largest = [wide.maximum(*pair) for pair in zip((weight, iterated_weight, scaled_v), largest, strict=True)]
-        max_weight, max_iterated_weight, scaled_v = (wide.largest_lane(each) for each in largest)
+        max_weight, max_iterated_weight, scaled_v = (wide.max_over_lanes(each) for each in largest)
         if self.iterated_coordinates:
             num.store(num.divide(max_weight, max_iterated_weight), work, mem.STRICTER)
             num.store(scaled_v, work, mem.SIZE)
@@ -411,7 +411,7 @@ class CollocationCode:
         max_sweeps = builder.select(has_estimate, num.add(target, number(EXTRA_SWEEPS)), number(MAX_SWEEPS_OF_FIXED))
         kappa, noise = (
             builder.select(has_estimate, number(usual), number(fixed))
-            for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (mem.MAX_ROUNDING, NOISE_OF_FIXED))
+            for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (mem.MAX_ROUNDING, ROUNDING_OF_FIXED))
         )
         noise = num.multiply(noise, num.multiply(num.load(work, mem.SIZE), stricter))
         may_guess = builder.compare("fcmp ogt", num.load(work, mem.MAY_GUESS), llvm_code.ZERO)
@@ -517,9 +517,9 @@ class CollocationCode:
             error = wide.maximum(wide.multiply(wide.multiply(largest_78, weight), decay), error)
             curved = wide.maximum(wide.multiply(largest_56, weight), curved)
         h = num.load(work, mem.H)
-        error = num.multiply(num.multiply(wide.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
+        error = num.multiply(num.multiply(wide.max_over_lanes(error), h), constant(DOUBLE, ERROR_WEIGHT))
         num.store(error, work, mem.ERROR)
-        num.store(num.multiply(wide.largest_lane(curved), h), work, mem.CURVED)
+        num.store(num.multiply(wide.max_over_lanes(curved), h), work, mem.CURVED)
         log_error = num.multiply(
             builder.extract(vec2.logarithm(vec2.broadcast(error)), 0), constant(DOUBLE, 1.0 / mem.ORDER)
         )
@@ -558,7 +558,7 @@ class CollocationCode:
             largest = emit.maximum(emit.multiply(emit.function("fabs", value), weight), largest)
         beyond_noise = emit.fma(emit.constant(-mem.MAX_ROUNDING), largest, max_error)
         scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED_DEFECT)))
-        defect = num.maximum(emit.largest_lane(scaled), llvm_code.ZERO)
+        defect = num.maximum(emit.max_over_lanes(scaled), llvm_code.ZERO)
         vec2 = LaneEmitter(builder, 2)
         log_factor = vec2.multiply(
             vec2.logarithm(vec2.broadcast(num.maximum(defect, constant(DOUBLE, 1e-9)))), vec2.constant(-1.0 / 9)
@@ -633,7 +633,7 @@ class CollocationCode:
         `worst`: errors of the predictions of degree 1 to 8 at the end of the step.
         """
         builder, num = emit.builder, Emitter(emit.builder)
-        least = num.negate(emit.largest_lane(emit.negate(max_error)))
+        least = num.negate(emit.max_over_lanes(emit.negate(max_error)))
         is_good = builder.compare("fcmp ole", max_error, emit.broadcast(num.multiply(least, constant(DOUBLE, 1.2))))
         bits = builder.convert("zext", builder.convert("bitcast", is_good, f"i{LANES}"), INTEGER)
         bits = builder.operation("or", bits, integer(1 << LANES - 1))
@@ -660,12 +660,12 @@ class CollocationCode:
 
     # methods that write parts of the functions
 
-    def _project(self, emit: LaneEmitter, work: Value, numbers: Value, outputs: Program) -> None:
+    def _project(self, emit: LaneEmitter, work: Value, numbers: Value, program: Program) -> None:
         emit.numbers = emit.constants = numbers
         inputs = [load_lanes(emit, work, self.end_offset + LANES * k) for k in range(1 + 2 * self.n)]
-        lowering, arrays = lower_program(emit, outputs, inputs, self.numbers)
-        values = dict(zip(outputs.arrays, arrays, strict=True))
-        is_valid = lowering.is_valid(outputs, [value for array in arrays for value in array])
+        lowering, arrays = lower_program(emit, program, inputs, self.numbers)
+        values = dict(zip(program.arrays, arrays, strict=True))
+        is_valid = lowering.is_valid(program, [value for array in arrays for value in array])
         for name, place in self._end_offsets().items():
             for k, value in enumerate(values.get(name, [])):
                 store_lanes(emit, value, work, place + LANES * k)
@@ -708,7 +708,7 @@ class CollocationCode:
             weight = emit.broadcast(num.load(num.pointer(work, i), mem.WEIGHTS))
             change = emit.function("fabs", emit.subtract(v, before))
             new.append(emit.maximum(emit.multiply(change, weight), largest))
-        return emit.largest_lane(new[0])
+        return emit.max_over_lanes(new[0])
 
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]

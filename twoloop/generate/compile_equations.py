@@ -509,5 +509,5 @@ def _stamp() -> str:
     from twoloop.generate import elimination, llvm_code, llvm_text, null_space, program
     from twoloop.kernels.data.common import KIT
 
-    writers = (elimination, null_space, program, llvm_code, llvm_text)
-    return digest_of(repr(KIT), __file__, *writers)
+    modules = (elimination, null_space, program, llvm_code, llvm_text)
+    return digest_of(repr(KIT), __file__, *modules)

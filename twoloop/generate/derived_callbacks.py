@@ -31,7 +31,7 @@ class DerivedPrograms:
     ----------
     programs : dict
         By kind of callback: the program, and the flat indices, in the callback's array, of the results of the program.
-    traced : Traced
+    traced : CallbackTraces
         The traces from which the programs were derived.
     """
 

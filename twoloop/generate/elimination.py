@@ -31,8 +31,8 @@ from twoloop.generate.null_space import (
     Factors,
     ReductionFailed,
     loses_digits,
-    reduced_accelerations,
     solve,
+    solve_reduced_system,
     solve_refined,
 )
 from twoloop.generate.parameter_expressions import elementwise
@@ -65,7 +65,7 @@ MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by 
 # system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
 
-Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
+PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class PivotChoice:
     added_rows: tuple[int, ...]
     scale: float
     min_pivot: float
-    blocks: Blocks = ()
+    blocks: PivotBlocks = ()
     is_refined: bool | None = None
 
     @classmethod
@@ -141,7 +141,7 @@ class DependentColumns:
             self.choose, self._blocks = entry_point(choose_dependent_columns), blocks
             self.arguments = kinds, np.array(rows, np.int64), len(rows), scratch, work, blocks
 
-    def blocks(self, G: Array) -> Blocks:
+    def blocks(self, G: Array) -> PivotBlocks:
         """Return the pivot blocks (`PivotChoice.blocks`) for the values of G (n_c + n_a, n_q) at a position."""
         if self.choose is None:
             return ()
@@ -385,7 +385,7 @@ class Elimination:
         force, gamma = self._right_sides(self.v)
         try:
             dependent = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, max_cost)
-            a, conditions = reduced_accelerations(self.mass, force, dependent)
+            a, conditions = solve_reduced_system(self.mass, force, dependent)
             reduced = Program(self.graph, {"a": a}, [*dependent.conditions, *conditions])
         except ReductionFailed:
             reduced = None
@@ -447,7 +447,7 @@ class Elimination:
 
     @cached_property
     def projection(self) -> Program:
-        """Return the program for the projected q and v, their "a", and their "lam" of least norm."""
+        """Return the program for projected "q" and "v", and for "a" and "lam" at this v; "lam" has the least norm."""
         arrays = self.basic_projection.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
         lam = multipliers_of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
@@ -456,7 +456,7 @@ class Elimination:
 
     @cached_property
     def basic_projection(self) -> Program:
-        """Return the program for the projected q and v, their "a", and their "lam", which is 0 for dependent rows."""
+        """Return the program for projected "q" and "v", and "a" and "lam" at this v; "lam" is 0 for dependent rows."""
         n, position = self.system.n_q, self.position_projection.arrays
         v = [(u + change).as_term() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
         solution = self._accelerations(v)

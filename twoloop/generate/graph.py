@@ -32,7 +32,7 @@ MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
 
 # functions of `math` that also accept Parameters
-SIN, COS, EXP, LOG, ATAN, ROOT = map(math_function, ("sin", "cos", "exp", "log", "atan", "sqrt"))
+SIN, COS, EXP, LOG, ATAN, SQRT = map(math_function, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
 _equal = float.__eq__  # comparison of the current values of floats or Parameters, which refuse ==
 _magnitude = float.__abs__  # absolute value as a plain float, also for a Parameter
@@ -212,7 +212,7 @@ class Affine:
     def __init__(self, graph: Graph, constant: float, terms: dict[int, float]):
         self.graph, self.constant, self.terms = graph, constant, terms
         self.cached_key: tuple[Any, ...] | None = None
-        self.cached_identifier: int | None = None  # identifier, see Graph.number
+        self.cached_identifier: int | None = None  # see Graph.identifier
 
     def on_graph(self, graph: Graph) -> "Affine":
         """Return this expression in terms of the quantities of `graph`, which must be a copy of self.graph."""
@@ -351,7 +351,7 @@ class Affine:
 
     def square_root(self) -> "Affine":
         """Return the square root of this expression."""
-        return self._function(op.SQUARE_ROOT, ROOT)
+        return self._function(op.SQUARE_ROOT, SQRT)
 
     def exponential(self) -> "Affine":
         """Return the exponential of this expression."""
@@ -386,18 +386,18 @@ class Affine:
             return Affine(self.graph, ATAN(self.constant), {})
         return self.graph.operation(op.ARCTANGENT, self, self * self + 1.0)
 
-    def _refuse_number(self, *_: Any) -> Any:
+    def _refuse_numeric_use(self, *_: Any) -> Any:
         """Refuse an operation that needs a definite value: comparison, conversion, rounding, hash or pickling."""
         self.graph.refuse(BRANCHING_REASON)
 
     def __float__(self) -> float:
         self.graph.refuse(CONVERSION_REASON)
 
-    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __int__ = __abs__ = _refuse_number
+    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __int__ = __abs__ = _refuse_numeric_use
     __index__ = __complex__ = __floordiv__ = __mod__ = __divmod__ = __rfloordiv__ = __rmod__ = __rdivmod__ = (
-        _refuse_number
+        _refuse_numeric_use
     )
-    __round__ = __trunc__ = __floor__ = __ceil__ = __hash__ = __reduce_ex__ = _refuse_number  # type: ignore[assignment]
+    __round__ = __trunc__ = __floor__ = __ceil__ = __hash__ = __reduce_ex__ = _refuse_numeric_use  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         if self.graph.is_tracing:
@@ -433,7 +433,7 @@ class Affine:
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
         function = OPERATORS.get(ufunc.__name__) or FUNCTIONS.get(ufunc.__name__)
         if ufunc.__name__ in COMPARISONS:
-            self._refuse_number()
+            self._refuse_numeric_use()
         if function is None or method != "__call__" or options or (out is not None and out[0].dtype != object):
             self.graph.refuse(f"it calls numpy.{ufunc.__name__} on what depends on t, q or v")
         return elementwise(function, inputs, out)

@@ -233,7 +233,7 @@ class LaneSteps:
         emit.store(error, work, lanes.OFF)
 
     def singular_passage_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return a mask of the lanes that may have passed a singular position in this step; None: no check."""
+        """Return a mask of the lanes whose step may have passed a singular position; None if steps are not checked."""
         return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
@@ -315,7 +315,7 @@ def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
 
 
 def clear_fine_unless(emit: LaneEmitter, work: Value, is_valid: Value) -> None:
-    """Clear FINE in the lanes in which a condition does not hold."""
+    """Clear FINE in the lanes in which `is_valid` is false."""
     store_mask(emit, work, lanes.FINE, emit.builder.bitwise_and(is_set(emit, work, lanes.FINE), is_valid))
 
 
@@ -551,9 +551,8 @@ class LaneCode(LaneSteps):
             description += list(self.recurrences.structure)
             programs.append(self.solution.factor_program)
         else:
-            programs.append(
-                self._row_program
-            )  # its coefficients must get indices, also if the code is read from the disk
+            # coefficients of this program must get indices, also if the code is read from the disk
+            programs.append(self._row_program)
         for outputs in programs:
             description += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
@@ -602,7 +601,7 @@ class LaneCode(LaneSteps):
         offset = emit.multiply(
             emit.subtract(emit.multiply(two, shift), one), emit.maximum(emit.subtract(gap, part_size), zero)
         )
-        n_parts = builder.convert("fptosi", emit.largest_lane(n_lane_parts), INTEGER)
+        n_parts = builder.convert("fptosi", emit.max_over_lanes(n_lane_parts), INTEGER)
         with emit.loop(integer(1), n_parts, [zero]) as (index, (max_defect,), new):
             part = emit.to_double(index)
             is_inside = builder.compare("fcmp olt", part, n_lane_parts)
@@ -646,7 +645,7 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.FINE, builder.operation("or", has_finished, converged))
 
     def _project(self, emit: LaneEmitter, outputs: Program, field: int, memory: LaneMemory) -> tuple[Value, Value]:
-        """Correct NEW by a projection program, in the lanes in which the field `field` is 1.
+        """Correct NEW by a projection program, in the lanes in which `field` is 1.
 
         Return a mask of the lanes whose correction is valid, and the largest change of a position in each lane.
         """
@@ -750,7 +749,7 @@ class LaneConstraints(LaneSteps):
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._program.quantities())
 
     def rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store C, C_t and the entries of C_q, at the state NEW and the time AHEAD, in the memory `Places.series`."""
+        """Store C, C_t and the entries of C_q, at the state NEW and the time AHEAD, in `LaneMemory.series`."""
         memory = self.memory(emit, order, control, work)
         inputs = [emit.load(work, lanes.AHEAD), *(emit.load(memory.new, i) for i in range(2 * self.n))]
         lowering, arrays = lower_program(emit, self._program, inputs, self.numbers)

@@ -62,7 +62,7 @@ class LaneEmitter(Emitter):
         return self.broadcast(super().load_constant(value))
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal or loaded Coefficient: with a value for each lane if it varies, else one for all lanes."""
+        """Return a literal, or a loaded Coefficient, which has the same value in all lanes unless it varies."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.gep(self.constants, integer(number.index))
@@ -99,7 +99,7 @@ class LaneEmitter(Emitter):
             result = self.builder.insert(result, scalar.function(name, self.builder.extract(x, lane)), lane)
         return result
 
-    def largest_lane(self, x: Value) -> Value:
+    def max_over_lanes(self, x: Value) -> Value:
         """Return the largest number of all lanes; LLVM's reduction, which treats NaN exactly, would be sequential."""
         width = self.lanes
         while width > 2:
@@ -526,7 +526,7 @@ class _Row:
 
 
 class _PartialSums(NamedTuple):
-    """Sums over 1 < j < k for the orders k and k + 1, and the rows with the factors of the terms j = 1 and j = k."""
+    """Sums over 1 < j < k for the orders k and k + 1, and rows with the factors of the terms j = 1 and j = k."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._write_sums`
     first_row: Value  # pointer to the row of order 1, or to a row of zeros if k is 1

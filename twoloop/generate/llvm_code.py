@@ -137,7 +137,7 @@ class Emitter:
         return self.builder.convert("sitofp", whole, DOUBLE)
 
     def function(self, name: str, x: Value) -> Value:
-        """Return the function `name` of x, computed by its LLVM intrinsic if there is one, else by libm."""
+        """Return the value at x of the function `name`, computed by its LLVM intrinsic if it has one, else by libm."""
         intrinsic = INTRINSICS.get(name)
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
@@ -396,7 +396,7 @@ class Lowering(Algebra[Value]):
         return self._sines_and_cosines[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], places: Mapping[int, Location] = NO_LOCATIONS) -> None:
-        """Write code that computes quantities in this order, and stores those that have a location in `places`."""
+        """Write code that computes quantities in the given order, and stores those that have a location in `places`."""
         if not places:
             return super().run(graph, quantities)
         for i in quantities:

@@ -130,7 +130,7 @@ class Module:
         self._tables.append(f"{name} = internal constant {kind} [{entries}]")
         return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
 
-    def add_far_number(self, number: float) -> int:
+    def add_number(self, number: float) -> int:
         """Add a number to the array from which `Builder.load_constant` loads; return the index of the number."""
         self._numbers.append(number)
         return len(self._numbers) - 1
@@ -179,7 +179,7 @@ class Builder:
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
     def append_block(self) -> Block:
-        """Return a new block, which is not part of the function until `position_at_end` adds it."""
+        """Return a new block; `position_at_end` adds it to the function."""
         self._n_blocks += 1
         return Block(f"b{self._n_blocks - 1}")
 
@@ -232,7 +232,7 @@ class Builder:
         return self.operation("and", a, b)
 
     def convert(self, name: str, a: Value, kind: str) -> Value:
-        """Return a value converted to the type `kind` by an instruction `name`, such as "sitofp" or "bitcast"."""
+        """Return a value converted to the type `kind` by the instruction `name`, such as "sitofp" or "bitcast"."""
         return self._append_value(kind, f"{name} {a.type} {a.text} to {kind}")
 
     def compare(self, name: str, a: Value, b: Value) -> Value:
@@ -245,7 +245,7 @@ class Builder:
         return self._append_value(a.type, f"select {condition}, {a}, {b}")
 
     def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
-        """Return the result of calling the function `name`, and declare the function. `flags`: fast-math flags."""
+        """Write a call of the function `name`, and a declaration; return the result. `flags`: fast-math flags."""
         self.module.add_declaration(name, kind, [value.type for value in arguments])
         return self._append_value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
@@ -263,12 +263,12 @@ class Builder:
         return pointer
 
     def load_constant(self, number: float) -> Value:
-        """Return a number loaded just before its use: a literal would occupy a register or stack memory for long."""
+        """Return a number loaded from memory just before its use: a literal would occupy a register for long."""
         if self._far_pointer is None:
             self._far_pointer = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
             self._n_allocated += 1
-        return self.load(self.gep(self._far_pointer, integer(self.module.add_far_number(number))))
+        return self.load(self.gep(self._far_pointer, integer(self.module.add_number(number))))
 
     def return_false_unless(self, condition: Value) -> None:
         """Write code that returns false from the function if a condition is false."""
@@ -292,11 +292,11 @@ class Builder:
         self._append_line(f"store {value}, {pointer}, align {align}")
 
     def insert(self, vector: Value, value: Value, index: int) -> Value:
-        """Return a vector whose element number `index` is replaced by `value`."""
+        """Return a copy of a vector in which the element with this index is replaced by `value`."""
         return self._append_value(vector.type, f"insertelement {vector}, {value}, {WORD} {index}")
 
     def extract(self, vector: Value, index: int) -> Value:
-        """Return the element number `index` of a vector."""
+        """Return the element with this index of a vector."""
         return self._append_value(element_of(vector.type), f"extractelement {vector}, {WORD} {index}")
 
     def shuffle(self, a: Value, b: Value, indices: Sequence[int]) -> Value:

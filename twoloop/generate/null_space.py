@@ -193,7 +193,7 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
     return new_neighbours
 
 
-Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
+PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
 Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
 # smallest allowed square of each of three ratios: of a pivot to the norm of the entries that it divides, of a pivot to
@@ -216,7 +216,7 @@ class DependentCoordinates:
     gamma : sequence of Affine
     blocks : sequence of (rows, columns)
         Rows and columns of the pivots, in the order of elimination.
-    max_added : int
+    max_added_operations : int
         Largest number of operations that may be added to the graph.
 
     Attributes
@@ -237,7 +237,7 @@ class DependentCoordinates:
     """
 
     def __init__(
-        self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, max_added_operations: int
+        self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: PivotBlocks, max_added_operations: int
     ):
         self._n, graph = len(rows[0]), rows[0][0].graph
         self._graph, self._max_operations = graph, len(graph.operations) + max_added_operations
@@ -339,7 +339,7 @@ class DependentCoordinates:
         self.T[j], self.g[j] = _nonzero(entries), rhs.as_term()
 
 
-def reduced_accelerations(
+def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
     """Return the accelerations (n_q,) for M and Q, and conditions under which T^T M T is not nearly singular."""

@@ -21,9 +21,8 @@ Powers = tuple[tuple[int, float], ...]
 
 MAX_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
-CANCELLATION_LIMIT = (
-    8.0 * 2.0**-52
-)  # largest sum of two terms, relative to one of them, that counts as zero: rounding error
+# largest sum of two terms, relative to one of them, that counts as zero: such a sum is a rounding error
+CANCELLATION_LIMIT = 8.0 * 2.0**-52
 NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY_FUNCTIONS, "hypot", "power")}
@@ -110,7 +109,7 @@ class ParameterTape(Symbolic):
             self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return the atom with a definition (sum or function) as Powers; add it unless an equal one exists."""
+        """Return the atom with a definition (a sum or a function) as Powers; if there is no such atom, add it."""
         if definition not in self._atom_indices:
             self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)

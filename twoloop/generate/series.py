@@ -31,7 +31,7 @@ USED_CALLBACKS = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate"
 
 
 class Sums(NamedTuple):
-    """Affine expressions as arrays: first terms and constants, one per expression, and all further terms."""
+    """Affine expressions as arrays: first term and constant of each expression, and all terms after the first ones."""
 
     column: Integers  # quantity in the first term of each expression
     coefficient: Array  # coefficient of the first term of each expression
@@ -43,15 +43,15 @@ class Sums(NamedTuple):
 
 @dataclass(frozen=True)
 class OperationGroups:
-    """Table of operations in the order of their computation; their results are consecutive quantities.
+    """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
     Attributes
     ----------
     groups : ndarray (n, 7)
-        One row for each group of independent operations of one kind: the kind, and first and end index of the
-        operations, of the further terms in their first arguments, and of the further terms in their second arguments.
-        A group of sines includes the cosines of the same angles. The last group contains the products whose second
-        factors depend on the solution of the linear system.
+        One row for each group of independent operations of one kind: the kind, then three ranges, each as first and
+        end index: of the operations, and of the further terms in `first` and in `second` (all terms after the first
+        one of a sum, see `Sums`). A group of sines includes the cosines of the same angles. The last group contains the
+        products whose second factors depend on the solution of the linear system.
     first, second : Sums
         Arguments of the operations.
     """
@@ -72,12 +72,12 @@ class SeriesProgram:
         Early operations; the last ones are the products in G v.
     late : Table
         Late operations; the last ones are the products in G^T lam + M a.
-    rows, row_places : Sums, ndarray
-        G v + G_t without the terms that are a constant times v_i: the rows that are then not zero, and their indices.
-    balance, balance_places : Sums, ndarray
-        Q - G^T lam - M a without the terms that are a constant times lam_i or a_i: the entries that are then not zero,
-        and their indices.
-    traced : Traced or None
+    rows, row_indices : Sums, ndarray
+        G v + G_t without terms that are a constant times v_i: the rows that are not zero, and their indices.
+    balance, balance_indices : Sums, ndarray
+        Q - G^T lam - M a without terms that are a constant times lam_i or a_i: the entries that are not zero, and their
+        indices.
+    traced : CallbackTraces or None
         Traces of the callbacks.
     """
 

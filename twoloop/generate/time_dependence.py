@@ -49,7 +49,7 @@ class ShortForces(NamedTuple):
 
 
 class Dependence(NamedTuple):
-    """Result of the analysis of callbacks; the systems of a trace cache share it."""
+    """Result of the analysis of the callbacks of systems; all systems of a trace cache share it."""
 
     short_forces: ShortForces
     is_steep: bool  # whether forces or drives may be steep, see `may_be_steep`

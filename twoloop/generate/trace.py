@@ -593,7 +593,7 @@ def share_checked_bounds(system: ConstrainedSystem) -> None:
 
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return `trace_cache_of` a system, stored with the system at the first call."""
+    """Return the trace cache of a system, see `trace_cache_of`; the system stores it at the first call."""
     return system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
