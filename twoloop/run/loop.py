@@ -155,7 +155,7 @@ BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
 CHUNK_TO_EVENT = 16  # number of attempts in a chunk if an event may end the run: steps beyond the event are wasted
 CHUNK_TIME = 0.05  # CPU time of a chunk, s, from which on the next chunk is not larger, so that Ctrl-C is noticed soon
 # statuses whose message may say that stability limited the steps
-STATUSES_OF_LONG_RUNS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
+STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 MAX_BASE_CANDIDATES = 16  # largest number of last states that may be the base of a step across a singular position
 # attempts across a singular position need not end at t1, but at t1 + CROSSING_OVERSHOOT times the run's duration
 CROSSING_OVERSHOOT = 100.0
@@ -458,7 +458,7 @@ class IntegrationLoop:
                 message += warn_of_missed_changes(run) + warn_of_passage_by_ordinary_steps(run)
             if status >= 0 and run.start_warning:
                 message += warn_user(run.start_warning)
-            if status in STATUSES_OF_LONG_RUNS:
+            if status in STATUSES_WITH_STIFFNESS_NOTE:
                 message += describe_stiffness(self.stiffness_monitor, run.kit, run.work)
         except KeyboardInterrupt:
             code = INTERRUPTED
