@@ -78,11 +78,11 @@ class ForceSampling:
             values = np.empty((len(times), len(q[rows]), len(forces)))
             for k, force in enumerate(forces):
                 values[..., k] = force
-            is_short[rows] = _are_short(values, rtol)
+            is_short[rows] = _have_short_changes(values, rtol)
         return is_short
 
 
-def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
+def _have_short_changes(values: Array, rtol: float) -> NDArray[np.bool_]:
     """Return a mask of the runs in which a value jumps twice within two samples, or is not finite.
 
     values : (n_times, n_runs, n)

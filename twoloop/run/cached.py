@@ -429,7 +429,7 @@ def arrays_of(
         CONTRADICTION,
     )
     start_constants += mass_kind, RECHECK_PIVOT * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
-    step_fields = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
+    step_limits = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
     block = np.empty(loops.N_HEAD + 1 + (1 + columns) * n_attempts + width * (1 + n_attempts))
     report_part, states = np.split(block, [len(block) - width * (1 + n_attempts)])
@@ -440,7 +440,7 @@ def arrays_of(
         **{"clock": run.clock, "control": run.control, "tolerances": run.tolerances, "options": run.plan.options},
         **{"state": run.state, "new_state": run.new_state, "lasting": lasting_floats, "lasting_integers": integers},
         **{"saved": np.empty(numbers.size + lasting_floats.size + run.state.size), "saved_integers": integers.copy()},
-        **{"constants": np.array([*start_constants, *step_fields, run.near_threshold, TURN_RATIO, REPEAT_BELOW])},
+        **{"constants": np.array([*start_constants, *step_limits, run.near_threshold, TURN_RATIO, REPEAT_BELOW])},
         lapack=np.array(lapack_addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
         **{
             "bounds": START_LIMITS,
