@@ -58,7 +58,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-# in methods with a trend, a ratio of step sizes from 1 to KEEP_BELOW_RATIO becomes 1, which saves a factorization
+# in methods with a trend, step sizes are kept if their proposed ratio is from 1 to this, which saves a factorization
 KEEP_BELOW_RATIO = 1.2
 
 
@@ -126,7 +126,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, left, crosses_jump):
-    """Return the size of a step, at most about h, and whether it reaches its goal, which is `left` seconds ahead."""
+    """Return the size (s) of a step, at most about h, and whether the step reaches the goal, `left` seconds ahead."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:
@@ -142,7 +142,7 @@ H_LONG_DECAY = 0.98  # factor by which H_LONG, the longest of the last steps, de
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step; update the largest defect and gap in w.notes; fill `out_step`, a row of out_steps."""
+    """Count an accepted step; update largest defect and widest gap in w.notes; fill `out_step`, a row of out_steps."""
     w.counters[N_ACCEPTED] += 1
     if w.notes[DEFECT] >= 0.0:
         w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
@@ -167,20 +167,20 @@ def count_step(w, tolerances, control, clock, size, out_step):
 FRACTION_OF_MOTION = 0.1
 FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if the sign of det C_qd changes in the step
 LEAST = 1e-300  # lower bound of the allowed error, which avoids a division by zero
-# part of the allowed error of a predicted position, in tolerances, that does not depend on the motion in the step
+# the part, in tolerances, of the allowed error of a predicted position that does not depend on the motion in the step
 FIXED_FRACTION = 0.01
 
 
 @merged
 def store_prediction(w, q1):
-    """Store the dependent positions of q1 (n_q), as predicted by the formula of the method, in w.predicted."""
+    """Store the dependent positions in q1 (n_q), which the formula of the method predicts, in w.predicted."""
     for k in range(w.dependent.size):
         w.predicted[k] = q1[w.dependent[k]]
 
 
 @merged
 def departure(w, tolerances, h, q, v, q1):
-    """Return the largest difference of a dependent position in w.predicted from q1, relative to the allowed difference.
+    """Return the largest difference of w.predicted from the dependent positions in q1, relative to the allowed one.
 
     The allowed difference is the smaller of two: the tolerance, and about FRACTION_OF_MOTION times the motion.
     The factors of C_qd in `w` must be those at q1. With steps of fixed size the result is 0.
@@ -204,7 +204,7 @@ def departure(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Project (q1, v1), predicted by a step of size h from (q, v), onto the constraints; return code and departure."""
+    """Project (q1, v1), predicted by a step of size h from (q, v), onto the constraints; return code and `departure`."""
     store_prediction(w, q1)
     code = restore_constraints(f, w, t, q1, v1, inner_tol)
     return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0

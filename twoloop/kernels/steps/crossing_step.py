@@ -48,7 +48,8 @@ CONVERGED_CHANGE = 0.01
 # STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
 MAX_SWEEPS, FEW_SWEEPS = 40, 12  # largest number of sweeps, and number of sweeps after which more nodes are left out
-DISTANCE_FACTOR = 2.0  # increase of the pivot below which nodes are left out, if FEW_SWEEPS sweeps do not converge
+# factor on the limit of the pivot below which nodes are left out, after FEW_SWEEPS sweeps that have not converged
+DISTANCE_FACTOR = 2.0
 MAX_LEFT_OUT_NODES = 9  # number of left-out nodes above which the step fails
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of
 # `begin_polynomial`. BEGIN, DURATION, END (s): those of the polynomial of the last converged attempt; END = -inf: none
@@ -64,8 +65,8 @@ PROJECTION_WEIGHT = (
 )
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning
-# smallest allowed ratio of the pivot at the end of a step to the pivot below which nodes are left out; the pivot may be
-# smaller if it is not smaller than at the beginning
+# smallest allowed pivot at the end of a step, relative to the limit below which nodes are left out; a smaller pivot is
+# allowed, too, if it is at least that at the beginning of the step
 END_MARGIN = 4.0
 # error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
 REPEAT_FACTOR = 2.0

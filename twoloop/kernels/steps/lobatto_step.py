@@ -73,17 +73,17 @@ MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as s
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations count as hardly varying within a step
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
 MIN_PIVOT_RATIO = 0.4  # ratio of a pivot within a step to that at its beginning below which a singular position is near
-# smallest tolerance with which this method goes on after a singular position: with smaller ones, five more runs of the
-# benchmark A02 were wrong, so another method takes over
+# smallest tolerance with which this method continues after a singular position; with smaller tolerances, another method
+# takes over, because five more runs of the benchmark A02 were wrong
 TIGHT_TOLERANCE = 1e-8
-# value of the field FAILURES at which another method takes over: a step whose iteration does not converge adds 2, an
-# accepted step subtracts 1
+# value of the field FAILURES at which another method takes over; a step whose iteration does not converge adds 2 to the
+# field, an accepted step subtracts 1
 MAX_FAILURES = 12.0
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
-LEAST_TREND = 0.4  # lower bound of the trend: the ratio of successive values of the step size that the error allows
+LEAST_TREND = 0.4  # lower bound of the trend, the ratio of step sizes that the error allows in successive steps
 MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
 _array_offsets = merged(array_offsets)
 
@@ -184,7 +184,7 @@ def _accept_polynomial(data):
 
 @merged
 def _must_change_method(w, data, tolerances):
-    """Return whether another method has to take over: near a singular position, or if stiffness limits the steps."""
+    """Return whether another method has to take over, because stiffness limits steps or a singular position is near."""
     is_stiff = data[field.LIMITED] >= MAX_LIMITED or data[field.FAILURES] >= MAX_FAILURES
     is_near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
     return is_stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and is_near)
@@ -211,7 +211,7 @@ def _passes_singular_position(f, w, t, h, state, new_state):
 
 @kernel(SETTLE)
 def settle_lobatto(f, w, options, memory, tolerances, accepted):
-    """Update `memory` so that the polynomial of an accepted attempt predicts the next step; discard a rejected one."""
+    """Keep the polynomial of an accepted attempt to predict the next step; discard that of a rejected attempt."""
     data = _aligned_view(memory)
     if accepted and data[field.TRIED] == 1.0:
         _accept_polynomial(data)
@@ -239,7 +239,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if code == DONE:
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
     if code == DONE and error <= 1.0 and w.notes[NEARLY_SINGULAR] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        w.notes[NEAR_NOW] = 2.0  # 2: `check_partition` renews the partition, and checks its pivots, after the step
+        w.notes[NEAR_NOW] = 2.0  # after the step, `check_partition` renews the partition and checks its pivots
         if _passes_singular_position(f, w, t, h, state, new_state):
             code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)
@@ -249,8 +249,8 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
     """Project the states in the first n_ends rows of `out_state` onto the constraints, each in one lane of `data`.
 
-    The lanes get the projected states, their accelerations and multipliers, and 1 in the field FINE if the projection
-    converges, otherwise 0.
+    Each lane receives its projected state, the accelerations and multipliers, and in the field FINE 1 if the projection
+    converges, else 0.
     """
     begin_ends = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
@@ -280,8 +280,8 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
     """Copy the projected state in lane k of `data` to `row` and `state`; return False if the state is invalid.
 
     The state is invalid if its projection has failed or has changed positions in `row` by more than the tolerances, or
-    if it violates redundant rows. If constraints depend on time (`driven`), the change of velocities is checked, too:
-    a large one may be due to a discontinuity of the drive between the nodes, see discontinuities.py.
+    if it violates redundant rows. If constraints depend on time (`driven`), velocities must not change by more than the
+    tolerances, either: this would show a discontinuity of the drive between the nodes, see discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if data[field.FINE + k] == 0.0:
@@ -308,7 +308,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return whether another step, of size h, may be taken before the integrator has checked the last step."""
+    """Return whether a step of size h may follow before the integrator has checked the step that was taken last."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False

@@ -78,13 +78,13 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     NEXT_UNIT,  # unit of time of the series about the end of the last attempt, s
     ALLOWED_SIZE,  # step size that the current series allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
-    TRIED,  # 1: the last attempt computed the series about its end, which becomes the current one if it is accepted
+    TRIED,  # 1: the last attempt has computed the series about its end, the current series if the attempt is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
     TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
     # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_DISTANCE; 0: not known yet
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts, which determines the times within a step at which the defect is evaluated
-    SUSPECTED,  # 1: a step was rejected because of its defect at the time SUSPECT, which the run has not passed yet
+    SUSPECTED,  # 1: the run has not passed the time SUSPECT yet, at which the defect of a rejected step was too large
     SUSPECT,  # time at which the defect was too large, s
     N_MEMORY_SCALARS,
 ) = range(14)
@@ -538,12 +538,12 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
-        error = x / memory[ALLOWED_SIZE]  # an upper bound of the error, which is a power of this ratio
+        error = x / memory[ALLOWED_SIZE]  # if at most 1, this bounds the error, which is a higher power of the ratio
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
         was_near_singular = w.notes[NEARLY_SINGULAR] != 0.0  # true from the first singular position of the run on
-        checks_defect = w.notes[NEAR_NOW] == 0.0  # not near singular positions, where accelerations of stages are wrong
+        checks_defect = w.notes[NEAR_NOW] == 0.0  # near singular positions, accelerations off the constraints are wrong
         w.notes[NEAR_NOW] = 0.0 if checks_defect else 2.0
         ratio_to_gap = gap_ratio(tolerances, h)
         if ratio_to_gap > 0.0 and was_near_singular:
