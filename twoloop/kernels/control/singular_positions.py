@@ -22,9 +22,8 @@ from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a singular position is suspected
-COLLAPSED_STEP = (
-    0.2  # step size, relative to the longest of the last steps, below which pivots of C_q are computed anew
-)
+# step size, relative to the longest of the last steps, below which pivots of C_q are computed anew
+COLLAPSED_STEP = 0.2
 # ratio of the smallest pivot of C_q to its largest value so far below which a singular position is near
 SINGULAR_PIVOT = 0.2
 STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
@@ -35,9 +34,8 @@ SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to th
 MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, relative to the longest recent step
 # ratio of the smallest pivot to its largest value so far below which rounding determines accelerations, and a run ends
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = (
-    16  # number of accepted steps between two checks of a partition, if steps (generated code) do not use it
-)
+# number of accepted steps between two checks of a partition, if steps (generated code) do not use it
+CHECK_INTERVAL = 16
 # the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
 # freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32

@@ -204,7 +204,7 @@ def departure(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Project (q1, v1), predicted by a step of size h from (q, v), onto the constraints; return code and `departure`."""
+    """Project (q1, v1), predicted by a step of size h from (q, v), onto the constraints; return code and departure."""
     store_prediction(w, q1)
     code = restore_constraints(f, w, t, q1, v1, inner_tol)
     return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0

@@ -94,7 +94,7 @@ TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial whose cost is not measured
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # ratio of the costs per second (before to on trial) above which the method on trial replaces the other
+MIN_GAIN = 1.2  # ratio of the cost per second before a trial to that on trial above which the trial has succeeded
 N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial

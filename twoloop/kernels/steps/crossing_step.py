@@ -60,9 +60,8 @@ SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 NODE_GAP = 0.0767
 BACKWARD_FRACTION = 0.4  # duration of the polynomial before the beginning of the step, relative to its whole duration
 ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error in the step size, and factor on the error estimate
-PROJECTION_WEIGHT = (
-    0.5  # factor on the largest change of a stage by its projection, which counts as an error of the step
-)
+# factor on the largest change of a stage by its projection, which counts as an error of the step
+PROJECTION_WEIGHT = 0.5
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning
 # smallest allowed pivot at the end of a step, relative to the limit below which nodes are left out; a smaller pivot is

@@ -266,7 +266,11 @@ def _fill_second_factors(options, table, values, y):
 
 @inlined
 def array_views(options, memory, n, n_rows):
-    """Return views of `memory`: coefficients of quantities (N), arguments (X1 to Y2), sums of products; r (n), c."""
+    """Return views N, X1, Y1, X2, Y2, total1, total2, r and c of `memory`.
+
+    N contains the coefficients of the quantities, X1 to Y2 those of the arguments of early and late operations, total1
+    and total2 sums of products; r (n) and c (n_rows) are right-hand sides.
+    """
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
     n_orders = order + 2
