@@ -794,7 +794,7 @@ def _compile(shared: SharedCode) -> Collocation:
         return list(writers), str(module)
 
     functions = DeferredFunctions(
-        lambda: generated_functions("collocation", _stamp(), code.structure, write, passes=not is_split)
+        lambda: generated_functions("collocation", _stamp(), code.structure, write, optimise=not is_split)
     )
     return Collocation(functions, code, numbers)
 

@@ -423,7 +423,7 @@ class SharedCode:
         structure = repr(list(self._structure()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
         # optimization passes of LLVM do not make the code faster, and take up to a quarter of the time to compile
-        self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, passes=False)
+        self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, optimise=False)
 
     def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
         """Return the GeneratedCode of one system, with coefficients for its parameters."""

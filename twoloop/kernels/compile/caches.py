@@ -37,7 +37,7 @@ from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
 from twoloop.kernels.compile.dependencies import Digest, NotDigestible, closure_values, reachable_names
-from twoloop.kernels.compile.linking import forget_compiled, jitable_templates
+from twoloop.kernels.compile.linking import discard_compiled_code, jitable_templates
 
 ACCESS_ADVICE = (
     "Code is loaded only from what belongs to you or root and no other user can write: take that right away (chmod "
@@ -477,7 +477,7 @@ def _use_twoloop_cache(helper: Any) -> None:
         _COMPILED_DIGESTS[helper] = digests
     if jitable_templates(helper):
         if has_changed or compiled is None:
-            forget_compiled(helper)
+            discard_compiled_code(helper)
         return
     if isinstance(helper._cache, FunctionCache) and (
         has_changed or not isinstance(helper._cache, _CompiledFunctionCache)

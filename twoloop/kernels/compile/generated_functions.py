@@ -68,7 +68,7 @@ def generated_functions(
     stamp: str,
     key: str,
     write: Callable[[], tuple[list[str], str]],
-    passes: bool = True,
+    optimise: bool = True,
 ) -> GeneratedFunctions:
     """Return the functions of a module from memory or from the disk, or compile the text that `write` returns.
 
@@ -80,7 +80,7 @@ def generated_functions(
         Digest of the Python code that generates the functions, and digest of the expressions that they compute.
     write : callable
         Returns the names of the functions and the text of the LLVM module.
-    passes : bool
+    optimise : bool
         Whether LLVM optimises the code.
     """
     if (functions := _FUNCTIONS_IN_MEMORY[kind].get(key)) is not None:
@@ -92,7 +92,7 @@ def generated_functions(
         names_and_content = None
     if names_and_content is None:
         names, text = write()
-        names_and_content = names, object_code(text, passes)
+        names_and_content = names, object_code(text, optimise)
         try:
             files.save(disk_key, names_and_content)
         except OSError:
@@ -117,12 +117,12 @@ def _disk_key(key: str) -> Any:
     return (*cpu_target.target_context.codegen().magic_tuple(), key)
 
 
-def object_code(text: str, passes: bool = True) -> bytes:
-    """Compile the text of an LLVM module to object code for this processor; with `passes`, optimise it first."""
+def object_code(text: str, optimise: bool = True) -> bytes:
+    """Compile the text of an LLVM module to object code for this processor; with `optimise`, optimise it first."""
     machine = _shared_target_machine()
     target = f'target triple = "{_target_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
-    if passes:
+    if optimise:
         manager, builder = _two_pass_manager() if HAS_SINGLE_PASSES else _all_pass_manager()
         manager.run(module, builder)
     content: bytes = machine.emit_object(module)
@@ -140,10 +140,10 @@ def _two_pass_manager() -> tuple[Any, Any]:
 
     The two passes make the code of small mechanisms a tenth faster; all other passes together gain no further speed.
     """
-    passes = binding.create_new_module_pass_manager()
-    passes.add_reassociate_pass()
-    passes.add_instruction_combine_pass()
-    return passes, _pass_builder()
+    manager = binding.create_new_module_pass_manager()
+    manager.add_reassociate_pass()
+    manager.add_instruction_combine_pass()
+    return manager, _pass_builder()
 
 
 def _all_pass_manager() -> tuple[Any, Any]:

@@ -39,7 +39,7 @@ from numba.core.types.functions import BaseFunction, Function
 from numba.core.untyped_passes import InlineClosureLikes
 from numba.np import arrayobj
 
-__all__ = ["Dispatcher", "add_signature", "cgutils", "forget_compiled", "jitable_templates", "options_of"]
+__all__ = ["Dispatcher", "add_signature", "cgutils", "discard_compiled_code", "jitable_templates", "options_of"]
 
 
 def jitable_templates(function: Any) -> list[Any]:
@@ -79,7 +79,7 @@ def options_of(helper: Any) -> dict[str, Any]:
     return helper.targetoptions if isinstance(helper, Dispatcher) else jitable_templates(helper)[0]._jit_options
 
 
-def forget_compiled(function: Any) -> None:
+def discard_compiled_code(function: Any) -> None:
     """Discard the compiled code of a function decorated by `register_jitable`: numba compiles it at the next call."""
     for template in jitable_templates(function):
         template._impl_cache.clear()
@@ -88,7 +88,7 @@ def forget_compiled(function: Any) -> None:
 _numba_fix_index = arrayobj.fix_integer_index
 
 
-def _resolved_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+def _emit_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
     """Emit code for an index of an array; in kernels and helpers, code for negative indices is left out."""
     if kind.signed and isinstance(context.active_code_library, _HelperLibrary | _KernelLibrary):
         return context.cast(builder, index, kind, types.intp)
@@ -98,7 +98,7 @@ def _resolved_index(context: Any, builder: Any, kind: Any, index: Any, size: Any
 _numba_basic_indexing: Any = arrayobj.basic_indexing
 
 
-def _element_address(
+def _emit_element_address(
     context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any
 ) -> Any:
     """Emit code for the address of an element of a contiguous array, without the code that only slices need.
@@ -211,8 +211,8 @@ def _without_lock_events(report: Any) -> Any:
 # functions of numba that are replaced, as attributes of their owner: owner, name and replacement
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (Function, "get_call_type", _cached_call_type),
-    (arrayobj, "fix_integer_index", _resolved_index),
-    (arrayobj, "basic_indexing", _element_address),
+    (arrayobj, "fix_integer_index", _emit_index),
+    (arrayobj, "basic_indexing", _emit_element_address),
     (BaseContext, "get_abi_sizeof", _cached_type_size),
     (InlineWorker, "run_untyped_passes", _cached_inlined_code),
     (ir.Inst, "_rec_list_vars", _variables_of_statement),
@@ -271,7 +271,7 @@ class _HelperLibrary(CPUCodeLibrary):
         pass  # the code is optimised as part of the callers
 
     def _get_module_for_linking(self) -> Any:
-        """Return the module itself; numba would return a copy, which is not needed, because nothing else uses it."""
+        """Return the module itself; numba's own method returns a copy, but nothing else uses this module."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:

@@ -226,7 +226,7 @@ def _index_of_near_position(q, rows, n_c, records):
 
 @exact
 def _is_consistent(C, rate, rows, q, v, records, tolerance):
-    """Return whether (q, v) satisfies the constraints up to rounding; C, `rows` and `rate` are their values there.
+    """Return whether (q, v) satisfies the constraints up to rounding; `rows`: C_q with A, `rate`: C_t with b.
 
     The size of a coordinate counts as at least its size in `records` (see `evaluate_start`), and at least the rounding
     error of the largest coordinate: if all coordinates of a constraint are rounding errors of zero, as coordinates out

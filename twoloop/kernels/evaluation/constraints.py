@@ -77,7 +77,7 @@ def constraint_rates(f, w, t, q, rate):
 
 @merged
 def kinematics(f, w, t, q, v):
-    """Store C, C_q with A, C_t with b, and Gamma of the rows of C_q at (t, q, v) in w, by the fused callback."""
+    """Store in w, by the fused callback, C, C_q with A, C_t with b, and Gamma of the rows of C_q, at (t, q, v)."""
     n_c, n_rows = w.C.size, w.Rate.size
     clear_rows(f, w)
     w.C[:] = 0.0
@@ -138,7 +138,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(notes, t, e):
-    """Return 0 for central differences or, if C_t or b jumps near t, 1 for differences after t, -1 for before t."""
+    """Return 0 for central differences or, if C_t or b jumps near t, 1 (after t) or -1 (before t): one-sided."""
     since_jump, until_jump = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0

@@ -55,13 +55,13 @@ from twoloop.kernels.evaluation.partition import (
     MAX_ITERATIONS,
     MIN_CORRECTION,
     ROUNDING_OF_CORRECTIONS,
+    adopt_partition_of_midpoint,
     check_all_rows,
     choose_oriented_partition,
     evaluate_and_factor_columns,
     factor_dependent_columns,
     find_null_space,
     is_on_constraints,
-    partition_of_midpoint,
     record_entries,
     restore_positions,
     restore_velocities,
@@ -286,7 +286,7 @@ def _do_other_task(f, w, task, t, q, v):
     if task == tasks.RENEW_PARTITION:
         return choose_oriented_partition(f, w, t, q)
     if task == tasks.ADOPT_MIDPOINT:
-        return partition_of_midpoint(f, w, t, q, v)
+        return adopt_partition_of_midpoint(f, w, t, q, v)
     if task == tasks.VERIFY_PATTERN:
         return _verify_pattern(w)
     return check_all_rows(f, w, t, q, v)
@@ -394,7 +394,7 @@ def renew_partition(f, w, t, q):
 
 @merged
 def adopt_midpoint_partition(f, w, t_mid, state, new_state):
-    """Adopt the partition that pivoting chooses at the middle of a step; return the code of `partition_of_midpoint`."""
+    """Adopt the partition that pivoting chooses at the middle of a step, see partition.py; return a code."""
     return f.inner(f, w, tasks.ADOPT_MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 

@@ -206,7 +206,7 @@ def _copy_in_ascending_order(source, target):
 
 @compiled
 def _adopt_pivot_order(w):
-    """Store the partition with the pivot order in w, and write its programs; return False if C_qd is singular."""
+    """Store the partition of w.row_order and w.order, and write its programs; return False if C_qd is singular."""
     rank, rank_v = w.rows.size, w.rows_v.size
     # indices are stored in ascending order, so that equal sets of coordinates are equal partitions
     _copy_in_ascending_order(w.row_order[:rank], w.rows)
@@ -254,7 +254,7 @@ def _record_columns_of_entries(w):
 
 @compiled
 def record_entries(w):
-    """Set w.pattern to 1 where w.G is not zero; return whether this changes w.pattern: then rewrite the programs."""
+    """Set w.pattern to 1 where w.G is not zero; return whether this changes w.pattern, so that programs are invalid."""
     if not update_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -286,7 +286,7 @@ def choose_partition(f, w, t, q):
 
 
 @compiled
-def partition_of_midpoint(f, w, t_mid, state, new_state):
+def adopt_partition_of_midpoint(f, w, t_mid, state, new_state):
     """Adopt the partition that full pivoting chooses at the middle of a step; return a code.
 
     The code is PARTITION_CHANGED, DONE or SINGULAR. The reversed step has the same middle, so that the partition, and

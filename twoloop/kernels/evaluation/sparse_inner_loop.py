@@ -279,7 +279,7 @@ MAX_SOLUTIONS = 30  # largest number of linear solutions in the refinement of mu
 
 
 @compiled
-def _load_least_norm_matrix(program, jacobian, n_q, weights, values):
+def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
     """Store the entries of the matrix [W G^T; G -1] in `values`, in the slots of the program; `weights` is scratch."""
     rows, columns, slots = jacobian_entries_of(program)
     for j in range(n_q):
@@ -330,7 +330,7 @@ def least_norm(f, w, lam):
         force[j] = 0.0
     for k in range(rows.size):
         force[columns[k]] += w.jacobian_values[k] * lam[rows[k]]
-    _load_least_norm_matrix(program, w.jacobian_values, n_q, weights, values)
+    _fill_least_norm_matrix(program, w.jacobian_values, n_q, weights, values)
     for i in range(lam.size):
         is_independent[i], no_stiffness[i] = 1.0, 0.0
     if not factor(program, is_independent, values, w.pivot_sizes, 0.0) > 0.0:

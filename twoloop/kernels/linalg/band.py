@@ -153,19 +153,19 @@ def lu_band(numbers, n, b):
 
 
 @inlined
-def _border(numbers, n, n_c, b):
+def _border_view(numbers, n, n_c, b):
     begin = n * (3 * b + 1)
     return numbers[begin : begin + n_c * n].reshape((n_c, n))
 
 
 @inlined
-def _schur_complement(numbers, n, n_c, b):
+def _schur_complement_view(numbers, n, n_c, b):
     begin = n * (3 * b + 1) + n_c * n
     return numbers[begin : begin + n_c * n_c].reshape((n_c, n_c))
 
 
 @inlined
-def _scratch(numbers, n, n_c, b):
+def _scratch_view(numbers, n, n_c, b):
     begin = n * (3 * b + 1) + n_c * (n + n_c)
     return numbers[begin : begin + n_c]
 
@@ -181,12 +181,12 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
     exchanges = pivots[: n - n_c].view(np.int32)
     if call_lapack(w.lapack[factorize], (n, n, b, b, band, 3 * b + 1, exchanges)) != 0:
         return SINGULAR
-    border = _border(numbers, n, n_c, b)
+    border = _border_view(numbers, n, n_c, b)
     for i in range(n_c):
         for j in range(n):
             border[i, j] = Cq[i, j]
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, n_c, band, 3 * b + 1, exchanges, border, n))
-    S = _schur_complement(numbers, n, n_c, b)
+    S = _schur_complement_view(numbers, n, n_c, b)
     for i in range(n_c):
         for k in range(n_c):
             S[i, k] = 0.0
@@ -201,13 +201,13 @@ def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
     n_c, n = Cq.shape
     band, exchanges = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, exchanges, x, n))
-    mu = _scratch(numbers, n, n_c, b)
+    mu = _scratch_view(numbers, n, n_c, b)
     for i in range(n_c):
         mu[i] = 0.0
         for j in range(n):
             mu[i] += Cq[i, j] * x[j]
-    lu_solve(_schur_complement(numbers, n, n_c, b), pivots[n - n_c :], mu)
-    border = _border(numbers, n, n_c, b)
+    lu_solve(_schur_complement_view(numbers, n, n_c, b), pivots[n - n_c :], mu)
+    border = _border_view(numbers, n, n_c, b)
     for i in range(n_c):
         for j in range(n):
             x[j] -= border[i, j] * mu[i]

@@ -73,8 +73,8 @@ def columns_of(index):
 
 
 @inlined
-def pivots_of(index):
-    """Return the row exchanges of dense factors."""
+def row_exchanges_of(index):
+    """Return the row exchanges of dense factors, see `lu_factor`."""
     return index[N_HEAD + 2 * index[SIZE] : N_HEAD + 3 * index[SIZE]]
 
 
@@ -369,7 +369,7 @@ def factor(entries, index, values):
         for i in range(r):
             for k in range(r):
                 A[i, k] = entries[rows[i] * index[WIDTH] + columns[k]]
-        return lu_factor(A, pivots_of(index))
+        return lu_factor(A, row_exchanges_of(index))
     source = index_of_entries(r) + 2 * index[N_SLOTS]
     for s in range(index[N_SLOTS]):
         values[s] = entries[index[source + s]]
@@ -415,7 +415,7 @@ def determinant_sign(index, values):
     """Return the sign of the determinant of the factored matrix, with rows and columns in ascending order."""
     r = index[SIZE]
     if index[DENSE] == 1:
-        return lu_sign(values[: r * r].reshape((r, r)), pivots_of(index))
+        return lu_sign(values[: r * r].reshape((r, r)), row_exchanges_of(index))
     sign = 1.0 if index[SIGN] == 1 else -1.0
     for k in range(r):
         if values[k] < 0.0:
@@ -428,7 +428,7 @@ def solve(index, values, x):
     """Replace x, the right-hand side in the order of rows_of, by the solution, in the order of columns_of."""
     r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
     if index[DENSE] == 1:
-        lu_solve(values[: r * r].reshape((r, r)), pivots_of(index), x)
+        lu_solve(values[: r * r].reshape((r, r)), row_exchanges_of(index), x)
         return
     row_list, column_list = index_of_entries(r), index_of_entries(r) + n_slots
     for s in range(first_lower, n_slots):
@@ -451,7 +451,7 @@ def solve_transposed(index, values, x):
     """Replace x, a right-hand side in the order of columns_of, by the solution with the transposed matrix."""
     r = index[SIZE]
     if index[DENSE] == 1:
-        A, pivots = values[: r * r].reshape((r, r)), pivots_of(index)
+        A, pivots = values[: r * r].reshape((r, r)), row_exchanges_of(index)
         for k in range(r):
             x[k] *= A[k, k]
             for j in range(k + 1, r):

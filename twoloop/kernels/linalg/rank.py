@@ -273,7 +273,7 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return whether the matrix with the factors A has fewer negative eigenvalues after scale g g^T is added to it.
+    """Return whether adding scale g g^T to the matrix with the factors A reduces its number of negative eigenvalues.
 
     This is so if the determinant changes its sign. `x` is scratch.
     """
@@ -390,7 +390,7 @@ def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scr
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
-    """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; bound the pivots.
+    """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; return an index or a code.
 
     Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Rows are added to
     M if it has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: no rows are added. `chosen`, of

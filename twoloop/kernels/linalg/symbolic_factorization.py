@@ -164,7 +164,7 @@ def elimination_order(
         pairs = {(body_of[i], body_of[j]) for i, j in zip(*couplings, strict=True)}
         single_coordinate_bodies = {hub for hub in hubs if len(coordinates[hub]) == 1}
     sizes = [len(node) for node in nodes]
-    for node in _minimum_degree(joints, joints_of, sorted(hubs), sizes, n_q, pairs, single_coordinate_bodies):
+    for node in _minimum_degree_order(joints, joints_of, sorted(hubs), sizes, n_q, pairs, single_coordinate_bodies):
         order += nodes[node]
     order += rows_of_hubs
     return np.array(order, dtype=np.int64)
@@ -186,7 +186,7 @@ def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], body_groups: It
     return representatives.tolist()  # type: ignore[no-any-return]
 
 
-def _minimum_degree(
+def _minimum_degree_order(
     joints: Sequence[frozenset[int]],
     joints_of: Sequence[Sequence[int]],
     hubs: Sequence[int],
@@ -302,7 +302,7 @@ def program_in_order(
     column_of = np.repeat(np.arange(n), sizes)
     entry_keys = column_of * n + row_of  # one ascending number for each entry of L
 
-    def slots(column: Integers, row: Integers) -> Integers:
+    def slots_of(column: Integers, row: Integers) -> Integers:
         off_diagonal_slots = n + np.searchsorted(entry_keys, column * n + row)
         return np.where(column == row, column, off_diagonal_slots)
 
@@ -312,8 +312,8 @@ def program_in_order(
         first_rows_by_column.append(rows_in_column[i])
         second_rows_by_column.append(rows_in_column[j])
     first_of, second_of = np.concatenate(first_rows_by_column), np.concatenate(second_rows_by_column)
-    runs = _update_runs(slots(first_of, second_of), first_of == second_of)
-    entry_slots = slots(low, high)
+    runs = _update_runs(slots_of(first_of, second_of), first_of == second_of)
+    entry_slots = slots_of(low, high)
     n_mass = len(mass[0])
     # entries of M above the diagonal get slots of U, or, with symmetric factors, a slot that is never read
     is_above = rows[:n_mass] < columns[:n_mass]
@@ -327,7 +327,7 @@ def program_in_order(
         product_rows,
         first,
         second,
-        slots(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b)),
+        slots_of(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b)),
     ]
     head = [n_q, n, n_off_diagonal, len(first_of), len(runs), n_mass, len(jacobian[0]), len(product_rows)]
     parts = [
