@@ -68,7 +68,7 @@ def _method(kind: str) -> Callable[..., Any]:
     self_parameter = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
     method.__signature__ = signature.replace(parameters=[self_parameter, *parameters])  # type: ignore[attr-defined]
     method.__name__, method.__qualname__ = kind, f"ConstrainedSystem.{kind}"
-    method.__doc__ = f"{entry.meaning[0].upper()}{entry.meaning[1:]}, {entry.size}.\n\nSee `evaluate`."
+    method.__doc__ = f"{entry.meaning[0].upper()}{entry.meaning[1:]}, {entry.shapes_text}.\n\nSee `evaluate`."
     return method
 
 
@@ -80,8 +80,8 @@ def _with_entries(text: str | None, plain: bool) -> str | None:
 def _entry(kind: str, plain: bool, indent: str) -> str:
     """Return the lines about a kind of callback for the section Parameters of a docstring."""
     entry = KINDS[kind]
-    called = f"{kind}({', '.join(('t', *entry.state))}) -> {entry.size}: " if plain else ""
-    text = f"{called}{entry.meaning}{'' if plain else ', ' + entry.size}. {entry.note}"
+    called = f"{kind}({', '.join(('t', *entry.state))}) -> {entry.shapes_text}: " if plain else ""
+    text = f"{called}{entry.meaning}{'' if plain else ', ' + entry.shapes_text}. {entry.note}"
     if plain and kind == "mass":
         text += " Or an array: a constant matrix, factored once."
     head = f"{kind} : {'callable' if plain else 'compiled callback'}{', optional' if entry.optional else ''}"

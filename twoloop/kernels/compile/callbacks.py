@@ -186,7 +186,7 @@ class CallbackKind:
         return numba.types.void(f8, *[input_type] * len(self.state), input_type, *output_types)
 
     @property
-    def size(self) -> str:
+    def shapes_text(self) -> str:
         """Return the shapes of the outputs as text, such as "(n_c, n_q)"."""
         return ", ".join(f"({', '.join(shape)}{',' if len(shape) == 1 else ''})" for _, shape in self.outputs)
 

@@ -393,7 +393,7 @@ class FunctionCopier:
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.copies[id(helper)] = self.wrap(copy, helper)  # its values, replaced below, may include the helper itself
+        self.copies[id(helper)] = self.wrap(copy, helper)  # stored first: the values may include the helper itself
         for name in used_names & set(own_globals):
             own_globals[name] = self.replacement_of(own_globals[name], names)
         if function.__defaults__ is not None:

@@ -118,7 +118,7 @@ def _disk_key(key: str) -> Any:
 
 
 def object_code(text: str, optimise: bool = True) -> bytes:
-    """Compile the text of an LLVM module to object code for this processor; with `optimise`, optimise it first."""
+    """Compile the text of an LLVM module to object code for this processor; optimise the module if `optimise`."""
     machine = _shared_target_machine()
     target = f'target triple = "{_target_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)

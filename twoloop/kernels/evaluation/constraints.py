@@ -108,7 +108,7 @@ N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, e
 ROUNDING_DISAGREEMENT = 1e-9  # largest relative difference of Gamma with the steps e and 2 e that rounding may cause
 # the step e is doubled if the relative difference of Gamma with the steps e and 2 e is smaller than this, because
 # rounding errors are smaller with a larger step
-ENLARGE_STEP_BELOW = 1e-11
+NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 # step of one-sided differences, relative to that of central differences, whose order is higher, 4 instead of 2
@@ -246,7 +246,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
             return DONE  # the caller reports values that are not finite; without a scale, errors cannot be judged
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
-        if disagreement < ENLARGE_STEP_BELOW * w.notes[GAMMA_SCALE]:
+        if disagreement < NEGLIGIBLE_DISAGREEMENT * w.notes[GAMMA_SCALE]:
             w.notes[GAMMA_STEP_RATIO] = min(1.0, 2.0 * w.notes[GAMMA_STEP_RATIO])
         if disagreement <= _max_disagreement(w.notes):
             return DONE

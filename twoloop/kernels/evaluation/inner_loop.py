@@ -294,7 +294,7 @@ def _do_other_task(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task`, a number of tasks.py, at (t, q, v); return a code. The functions below explain the tasks."""
+    """Do `task`, one of the numbers in tasks.py, at (t, q, v); return a code. Functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
         return _do_other_task(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION) and w.notes[TIME_IS_UP] == 1.0:

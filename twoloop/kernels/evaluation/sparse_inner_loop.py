@@ -496,12 +496,12 @@ def _check_redundant_rows(f, w, t, q, v):
     copy(w.Rate, w.g)
     _add_jacobian_times(f, w, v, w.g)
     rows, _, _ = jacobian_entries_of(f.static_program)
-    largest = w.solutions[: w.g.size]
-    largest[:] = 0.0
+    row_maxima = w.solutions[: w.g.size]
+    row_maxima[:] = 0.0
     for k in range(rows.size):
-        largest[rows[k]] = max(largest[rows[k]], abs(w.jacobian_values[k]))
+        row_maxima[rows[k]] = max(row_maxima[rows[k]], abs(w.jacobian_values[k]))
     for i in range(w.g.size):
-        if abs(w.C[i]) > MAX_VIOLATION * size * largest[i] or abs(w.g[i]) > MAX_VIOLATION * speed * largest[i]:
+        if abs(w.C[i]) > MAX_VIOLATION * size * row_maxima[i] or abs(w.g[i]) > MAX_VIOLATION * speed * row_maxima[i]:
             w.notes[CONTRADICTION] = i
             return ROWS_CONTRADICT
     return DONE

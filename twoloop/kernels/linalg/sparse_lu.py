@@ -49,11 +49,11 @@ def newton_program(
     `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
-    begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
+    group_begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
     order = elimination_order(n_q, n_rows, mass, jacobian, body_groups, stiff_rows, tangents)
     entries = np.concatenate([mass[0], tangents[0]]), np.concatenate([mass[1], tangents[1]])
     program = program_in_order(order, n_q, entries, jacobian, stiff_rows, unsymmetric=True)
-    return None if program is None else np.concatenate([program, begins]).astype(np.int32)
+    return None if program is None else np.concatenate([program, group_begins]).astype(np.int32)
 
 
 def grouped_entries(tangents: Entries, n_q: int) -> Entries:
@@ -84,10 +84,10 @@ def tangent_entries_of(program):
 
     The last index is the number of entries.
     """
-    begins = program[end_of_sections(program) :]
+    group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
-    n_mass = rows.size - begins[begins.size - 1]
-    return rows[n_mass:], columns[n_mass:], begins
+    n_mass = rows.size - group_begins[group_begins.size - 1]
+    return rows[n_mass:], columns[n_mass:], group_begins
 
 
 @compiled
