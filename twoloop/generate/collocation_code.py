@@ -29,7 +29,7 @@ from twoloop.generate.lane_series import (
     LaneEmitter,
     gather_lane,
     load_lanes,
-    loop_over,
+    loop_over_coordinates,
     store_lanes,
     two_sums,
     vector_index,
@@ -147,7 +147,7 @@ FAST_START, SLOW_START = 0.04, 0.3
 STAGNATION_RATIO = 0.5
 # values that replace KAPPA, MAX_ROUNDING and the limit of sweeps in steps of fixed size
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
-LEAST_CHANGE = 1e-30  # added to the ratio of the iteration error to KAPPA, because its logarithm is computed
+SMALLEST_RATIO = 1e-30  # added to the ratio of the iteration error to KAPPA, because its logarithm is computed
 ERROR_WEIGHT = 0.5  # factor by which the error estimate is multiplied
 # allowed defect at the midpoints between nodes, relative to the tolerances: most of its effect averages out in a step
 ALLOWED_DEFECT = 16.0
@@ -298,11 +298,11 @@ class CollocationCode:
     def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
         """Return a context for instructions that run only if `condition` is true and return from the function."""
         builder = emit.builder
-        leave, go_on = builder.append_block(), builder.append_block()
-        builder.branch(condition, leave, go_on)
-        builder.position_at_end(leave)
+        return_block, next_block = builder.append_block(), builder.append_block()
+        builder.branch(condition, return_block, next_block)
+        builder.position_at_end(return_block)
         yield
-        builder.position_at_end(go_on)
+        builder.position_at_end(next_block)
 
     def _call(self, emit: LaneEmitter, name: str, write: Callable[..., None], arguments: Sequence[Value]) -> None:
         """Write a call of a function of the module that returns nothing; if it is missing, `write` writes its body."""
@@ -356,7 +356,7 @@ class CollocationCode:
         # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
-        with loop_over(emit, self.iterated_coordinates) as (k, i, _, _):
+        with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
             scaled = emit.multiply(load_lanes(emit, num.pointer(polynomial, vector_index(emit, k))), used_powers)
             store_lanes(emit, scaled, work, mem.SCALED)
             terms = [num.load(num.pointer(state, i), 2 * n), *(num.load(work, mem.SCALED + j) for j in range(LANES))]
@@ -494,7 +494,7 @@ class CollocationCode:
         )
         vec2 = LaneEmitter(builder, 2)
         error_to_kappa = num.divide(num.multiply(rho, change), constant(DOUBLE, KAPPA))
-        error_to_kappa = num.add(error_to_kappa, constant(DOUBLE, LEAST_CHANGE))
+        error_to_kappa = num.add(error_to_kappa, constant(DOUBLE, SMALLEST_RATIO))
         logs = vec2.logarithm(vec2.vector([error_to_kappa, rho]))
         exponent = num.fma(num.subtract(target, n_sweeps), builder.extract(logs, 1), builder.extract(logs, 0))
         log_convergence = num.divide(num.add(exponent, llvm_code.ONE), num.add(target, constant(DOUBLE, 2.0)))
@@ -570,7 +570,7 @@ class CollocationCode:
     def store_prediction(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Store the polynomial of a rejected step, which predicts the shorter step taken instead."""
         num, old_polynomial = Emitter(emit.builder), self._polynomial_pointer(emit, work, other=False)
-        with loop_over(emit, self.iterated_coordinates) as (k, i, _, _):
+        with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
             a0 = num.load(num.pointer(state, i), 2 * self.n)
             store_lanes(
                 emit,
@@ -587,7 +587,7 @@ class CollocationCode:
         last, h = LANES - 1, num.load(work, mem.H)
         powers, new = load_lanes(emit, work, mem.POWERS), self._polynomial_pointer(emit, work, other=True)
         old_polynomial, zero = self._polynomial_pointer(emit, work, other=False), emit.constant(0.0)
-        with loop_over(emit, self.iterated_coordinates, [zero]) as (k, i, (max_error,), carried):
+        with loop_over_coordinates(emit, self.iterated_coordinates, [zero]) as (k, i, (max_error,), carried):
             stage = num.pointer(work, vector_index(emit, k))
             target = num.pointer(new_state, i)
             a0, a1 = (
@@ -616,7 +616,7 @@ class CollocationCode:
         if self.other_coordinates:
             last_weights = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
             weights_0 = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
-            with loop_over(emit, self.other_coordinates) as (_, i, _, _):
+            with loop_over_coordinates(emit, self.other_coordinates) as (_, i, _, _):
                 first, target = num.pointer(state, i), num.pointer(new_state, i)
                 a = load_lanes(emit, num.pointer(work, vector_index(emit, i)), self.a_offset)
                 q, v, a0 = (num.load(first, m * n) for m in range(3))
@@ -700,7 +700,7 @@ class CollocationCode:
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
         """Store positions and velocities at the nodes; return the largest change of a velocity since the last sweep."""
         num = Emitter(emit.builder)
-        with loop_over(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
+        with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, num.pointer(work, vector_index(emit, k)), self.v_offset)
             terms = self._node_accelerations(emit, num.load(num.pointer(state, i), 2 * self.n), work, i)
             sums = [self._weighted_sum(emit, table, terms) for table in (tables().velocities, tables().positions)]

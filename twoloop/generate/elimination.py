@@ -47,13 +47,13 @@ Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # ratio of the smallest to the largest eigenvalue of M below which rows of G are added to M
 RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
-RELATIVE_BOUND = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
+PIVOT_FRACTION = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
 # possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to its pivot without
 # the other rows; with pivots below the last value, rounding errors would dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
 # MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] at or below the smallest pivot at the start; if there is
 # none, MIN_PIVOTS[-1] is chosen
-START_LIMITS = MIN_PIVOTS[:-1] / RELATIVE_BOUND
+START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 N_FEW_COORDINATES = 24  # largest number of coordinates for which MIN_INDEX_FEW, not MIN_INDEX_MANY, applies
 # smallest index in MIN_PIVOTS, i.e. largest pivots, at which all rows of G may be added to M:
 # MIN_INDEX_FEW (pivots below 1e-3) with up to N_FEW_COORDINATES coordinates; MIN_INDEX_FEW_SINGULAR if M is singular as
@@ -107,7 +107,7 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G)
-        # larger pivots are not tested: with them random models kept 10 digits; added rows set `is_refined` in any case
+        # larger pivots need no test: with them, random models kept 10 digits; added rows have set `is_refined` already
         if choice.rows and choice.min_pivot <= MIN_PIVOTS[-1] and choice.is_refined is None:
             choice = replace(choice, is_refined=loses_digits(mass, G, choice))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
@@ -151,7 +151,7 @@ class DependentColumns:
 
 
 def _entry_kinds(system: ConstrainedSystem) -> Any:
-    """Return an array with the kind of each entry of G: 0: always zero, 1: constant, 2: varies; None if unknown."""
+    """Return the kinds of the entries of G (0: always zero, 1: constant, 2: varies), or None if they are unknown."""
     if system.called_in_python:  # a function called in Python may store its arguments: it is traced as late as possible
         return None
 
@@ -301,9 +301,9 @@ class Elimination:
         self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # `_n_reduced`: operations of `reduced_program`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
-        self.mass = self._terms_of("mass")
-        rows = [self._terms_of("jacobian"), self._terms_of("nonholonomic")]
-        rates = [self._terms_of("constraint_rate"), self._terms_of("nonholonomic_rate")]
+        self.mass = self._callback_terms("mass")
+        rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]
+        rates = [self._callback_terms("constraint_rate"), self._callback_terms("nonholonomic_rate")]
         self.all_rows, independent = np.vstack(rows), list(choice.rows)
         self.rows, self.rates = self.all_rows[independent], np.concatenate(rates)[independent]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
@@ -322,12 +322,12 @@ class Elimination:
         if len(self.graph.operations) - self._n_reduced > MAX_OPERATIONS:
             raise Untraceable(f"its equations are more than {MAX_OPERATIONS} operations")
 
-    def _terms_of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
+    def _callback_terms(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
         return elementwise(Affine.as_term, [self.equations.expressions(kind, v)])
 
     def _redundant_rows(self, rates: Any) -> Program:
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
-        violations = self._terms_of("constraint")
+        violations = self._callback_terms("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
         scale_q, scale_v = (sum((x * x for x in state), unit) for state in (self.q, self.v))
         for k in redundant:
@@ -366,7 +366,10 @@ class Elimination:
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
         """Return Q (n_q,), and the right-hand sides (n_c + n_a,) of all rows of G a = gamma, at velocities v."""
-        return list(self._terms_of("force", v)), [*self._terms_of("gamma", v), *self._terms_of("nonholonomic_gamma", v)]
+        return list(self._callback_terms("force", v)), [
+            *self._callback_terms("gamma", v),
+            *self._callback_terms("nonholonomic_gamma", v),
+        ]
 
     @cached_property
     def mass_first_program(self) -> Program:
@@ -424,7 +427,7 @@ class Elimination:
     @cached_property
     def position_errors(self) -> Program:
         """Return the program for "c", the right-hand sides -C of position corrections; 0 for dependent rows and A."""
-        errors = [*(-violation for violation in self._terms_of("constraint")), *[self.zero] * self.system.n_a]
+        errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._for_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property

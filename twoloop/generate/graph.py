@@ -14,7 +14,7 @@ from twoloop.generate.parameter_expressions import (
     CANCELLATION_LIMIT,
     OPERATORS,
     Parameter,
-    Symbolic,
+    SymbolicObject,
     as_number,
     elementwise,
     math_function,
@@ -42,7 +42,7 @@ CONVERSION_REASON = (
 )
 
 
-class Graph(Symbolic):
+class Graph(SymbolicObject):
     """Graph of quantities, numbered from 0.
 
     Attributes
@@ -86,8 +86,8 @@ class Graph(Symbolic):
             if operation is None
             else (
                 operation[0],
-                operation[1].on_graph(graph),
-                None if operation[2] is None else operation[2].on_graph(graph),
+                operation[1].copy_to_graph(graph),
+                None if operation[2] is None else operation[2].copy_to_graph(graph),
             )
             for operation in self.operations
         ]
@@ -214,7 +214,7 @@ class Affine:
         self.cached_key: tuple[Any, ...] | None = None
         self.cached_identifier: int | None = None  # see Graph.identifier
 
-    def on_graph(self, graph: Graph) -> "Affine":
+    def copy_to_graph(self, graph: Graph) -> "Affine":
         """Return this expression in terms of the quantities of `graph`, which must be a copy of self.graph."""
         copy = Affine(graph, self.constant, self.terms)
         copy.cached_key = self.cached_key

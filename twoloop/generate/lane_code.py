@@ -287,7 +287,7 @@ class LaneSteps:
         """Return the pointers to the arrays in `work`; store the pointers to coefficients in `emit`."""
         *fixed, series = lanes.array_offsets(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
-        emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
+        emit.constants = emit.builder.advance(control, integer(lanes.ATOL + self.n))
         series_memory = emit.pointer(work, series)
         n_coefficients = emit.builder.add(order, integer(1))
         scratch = emit.pointer(series_memory, emit.builder.mul(n_coefficients, integer(self.n)))
@@ -301,7 +301,7 @@ def _triples(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
 
 def broadcast_entry(emit: LaneEmitter, control: Value, index: int) -> Value:
     """Return entry `index` of the array `control`, broadcast to all lanes."""
-    return emit.broadcast(emit.builder.load(emit.builder.gep(control, integer(index))))
+    return emit.broadcast(emit.builder.load(emit.builder.advance(control, integer(index))))
 
 
 def is_set(emit: LaneEmitter, work: Value, field: int) -> Value:
@@ -319,10 +319,10 @@ def clear_fine_unless(emit: LaneEmitter, work: Value, is_valid: Value) -> None:
     store_mask(emit, work, lanes.FINE, emit.builder.bitwise_and(is_set(emit, work, lanes.FINE), is_valid))
 
 
-Rows = list[dict[int, Value]]  # the nonzero entries of each row, by column
+SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by column
 
 
-def orientation_change_mask(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
+def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: SparseRows) -> Value:
     """Return a mask of the lanes where det G1 G0^T <= 0, whose steps may have passed a singular position.
 
     G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula
@@ -399,10 +399,10 @@ class LaneStages:
         with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
             coordinate = _Coordinate(self, emit, memory, j, len(b))
             new_state = coordinate.store_state(b, b @ A, x)
-            atol_pointer = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
+            atol_pointer = emit.builder.advance(control, emit.builder.add(j, integer(lanes.ATOL)))
             atol = emit.broadcast(emit.builder.load(atol_pointer))
             error_weights = [
-                coordinate.error_weight(atol, rtol, *each) for each in zip(coordinate.before, new_state, strict=True)
+                coordinate.error_weight(atol, rtol, *each) for each in zip(coordinate.old_state, new_state, strict=True)
             ]
             for largest, weights in ((e, fine_weights), (d, coarse_weights)):
                 of_q, of_v = emit.multiply(x, coordinate.sum(weights @ A)), coordinate.sum(weights)
@@ -429,7 +429,7 @@ class _Coordinate:
     def __init__(self, stages: LaneStages, emit: LaneEmitter, memory: LaneMemory, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(memory.new, j), stages.n
         series_pointer = emit.pointer(memory.series, j)
-        self.before = tuple(emit.load(series_pointer, lanes.BEGIN * n + place) for place in (0, n))
+        self.old_state = tuple(emit.load(series_pointer, lanes.BEGIN * n + place) for place in (0, n))
         self._acceleration_locations = [(series_pointer, (lanes.SLOPES + k) * n) for k in range(count)]
         self._loaded: dict[int, Value] = {}
         if count > 1:  # the acceleration of the last stage was just computed, and is not stored yet
@@ -454,8 +454,8 @@ class _Coordinate:
         return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, magnitude)))
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Store q and v at a stage in NEW; return both. `weights`, `position_weights`: of accelerations in v, in q."""
-        emit, (q, v) = self.emit, self.before
+        """Store q and v at a stage in NEW; return both. Accelerations have `weights` in v, `position_weights` in q."""
+        emit, (q, v) = self.emit, self.old_state
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
         q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(position_weights)))))
         v = emit.add(v, emit.multiply(x, self.sum(weights)))

@@ -65,7 +65,7 @@ class LaneEmitter(Emitter):
         """Return a literal, or a loaded Coefficient, which has the same value in all lanes unless it varies."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
-        pointer = self.builder.gep(self.constants, integer(number.index))
+        pointer = self.builder.advance(self.constants, integer(number.index))
         return self.broadcast(self.builder.load(pointer, constant=True))
 
     def to_double(self, whole: Value) -> Value:
@@ -78,7 +78,7 @@ class LaneEmitter(Emitter):
             offset = (
                 integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
             )
-            base = self.builder.gep(base, offset)
+            base = self.builder.advance(base, offset)
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
@@ -182,14 +182,14 @@ def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value
 
 
 @contextmanager
-def loop_over(
+def loop_over_coordinates(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
     """Return a context for a loop over `coordinates`: it yields k, coordinates[k], and the lists of `Emitter.loop`."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.add_table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
-        i = k if table is None else builder.convert("sext", builder.load(builder.gep(table, k), 4), INTEGER)
+        i = k if table is None else builder.convert("sext", builder.load(builder.advance(table, k), 4), INTEGER)
         yield k, i, values, new
 
 

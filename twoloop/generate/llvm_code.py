@@ -144,7 +144,7 @@ class Emitter:
     def pointer(self, base: Value, *places: Value | int) -> Value:
         """Return the pointer `base` advanced by the sum of `places`, counted in doubles."""
         for place in places:
-            base = self.builder.gep(base, integer(place) if isinstance(place, int) else place)
+            base = self.builder.advance(base, integer(place) if isinstance(place, int) else place)
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:

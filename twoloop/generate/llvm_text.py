@@ -268,17 +268,17 @@ class Builder:
             self._far_pointer = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
             self._n_allocated += 1
-        return self.load(self.gep(self._far_pointer, integer(self.module.add_number(number))))
+        return self.load(self.advance(self._far_pointer, integer(self.module.add_number(number))))
 
     def return_false_unless(self, condition: Value) -> None:
         """Write code that returns false from the function if a condition is false."""
-        go_on, leave = self.append_block(), self.append_block()
-        self.branch(condition, go_on, leave)
-        self.position_at_end(leave)
+        next_block, return_block = self.append_block(), self.append_block()
+        self.branch(condition, next_block, return_block)
+        self.position_at_end(return_block)
         self.ret(Value(BIT, "false"))
-        self.position_at_end(go_on)
+        self.position_at_end(next_block)
 
-    def gep(self, base: Value, index: Value) -> Value:
+    def advance(self, base: Value, index: Value) -> Value:
         """Return the pointer `base` advanced by `index` elements."""
         return self._append_value(base.type, f"getelementptr inbounds {base.type[:-1]}, {base}, {index}")
 

@@ -232,7 +232,7 @@ class DependentCoordinates:
 
     Raises
     ------
-    NotReduced
+    ReductionFailed
         If a pivot is always zero, or if the elimination takes more than `max_added_operations` operations.
     """
 
@@ -289,7 +289,7 @@ class DependentCoordinates:
             raise ReductionFailed
 
     def _inverse(self, block: list[list[Affine]]) -> tuple[Affine, list[list[Affine]]]:
-        """Return the determinant and the inverse of a 1x1 or 2x2 block; raise NotReduced if it is always singular."""
+        """Return determinant and inverse of a 1x1 or 2x2 block; raise ReductionFailed if it is always singular."""
         if len(block) == 1:
             ((determinant,),) = block
         else:

@@ -51,7 +51,7 @@ class Refusal(BaseException):
     """Exception that ends a callback that cannot be traced; `except Exception` in the callback does not catch it."""
 
 
-class Symbolic:
+class SymbolicObject:
     """Base of the objects that replace numbers while a callback is traced.
 
     Attributes
@@ -83,7 +83,7 @@ class Symbolic:
             raise Untraceable(f"{self.refusal_reason}, and catches the exception that says so")
 
 
-class ParameterTape(Symbolic):
+class ParameterTape(SymbolicObject):
     """Record of how numbers were computed from parameters.
 
     Numbers are multiples of products of powers of atoms. An atom is a parameter, a sum of numbers, or a function of

@@ -68,9 +68,9 @@ class SeriesProgram:
     Attributes
     ----------
     n_q, n_rows : int
-    early : Table
+    early : OperationGroups
         Early operations; the last ones are the products in G v.
-    late : Table
+    late : OperationGroups
         Late operations; the last ones are the products in G^T lam + M a.
     rows, row_indices : Sums, ndarray
         G v + G_t without terms that are a constant times v_i: the rows that are not zero, and their indices.
@@ -301,12 +301,15 @@ def _assemble_program(
 def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any]]:
     """Return the operations that `exprs` need, as (quantity, operation), each sine with the cosine of its angle."""
     needed = set(graph.quantities_for(exprs))
-    trigonometric = (SINE, COSINE)
-    angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trigonometric}
+    trigonometric_kinds = (SINE, COSINE)
+    angles = {
+        each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trigonometric_kinds
+    }
     return [
         (i, operation)
         for i, operation in enumerate(graph.operations)
-        if operation is not None and (i in needed or (operation[0] in trigonometric and operation[1].key in angles))
+        if operation is not None
+        and (i in needed or (operation[0] in trigonometric_kinds and operation[1].key in angles))
     ]
 
 

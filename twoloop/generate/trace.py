@@ -55,8 +55,8 @@ NUMPY_FUNCTIONS = {
     *("vstack", "zeros_like", "ones_like", "empty_like", "full_like"),
 }
 # functions of NumPy that are replaced so that the arrays they return can contain expressions
-CONSTRUCTORS = ("zeros", "ones", "empty")
-CONVERSIONS = ("array", "asarray", "ascontiguousarray")
+ARRAY_CONSTRUCTORS = ("zeros", "ones", "empty")
+ARRAY_CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 
 
 def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
@@ -248,9 +248,9 @@ class _Mathematics:
             return _number_or_symbol(original, FUNCTIONS.get(name) or OPERATORS[name])
         if name in ("pow", "power"):
             return lambda x, y: x**y
-        if self._module is np and name in CONSTRUCTORS:
+        if self._module is np and name in ARRAY_CONSTRUCTORS:
             return _symbolic_constructor(original)
-        if self._module is np and name in CONVERSIONS:
+        if self._module is np and name in ARRAY_CONVERSIONS:
             return _symbolic_conversion(original)
         if original is np.full:
             return _symbolic_full
@@ -313,8 +313,8 @@ class Equations:
         equations = copy.copy(self)
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
-            self.t.on_graph(equations.graph),
-            *([x.on_graph(equations.graph) for x in state] for state in (self.q, self.v)),
+            self.t.copy_to_graph(equations.graph),
+            *([x.copy_to_graph(equations.graph) for x in state] for state in (self.q, self.v)),
         )
         equations._expressions, equations._results_before_copy = {}, self.graph.traced
         return equations
@@ -349,7 +349,7 @@ class Equations:
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:
-            exprs = elementwise(lambda expr: expr.on_graph(self.graph), [self._results_before_copy[kind]])
+            exprs = elementwise(lambda expr: expr.copy_to_graph(self.graph), [self._results_before_copy[kind]])
             self.graph.traced.setdefault(kind, exprs.copy())
             return exprs
         return self._trace_callback(kind, v)
