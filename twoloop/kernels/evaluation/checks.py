@@ -158,10 +158,10 @@ def _set_to_zero(A):
 @exact
 def _has_empty_row(rows):
     """Return whether one of the rows contains only zeros."""
-    has_empty = False
+    has_empty_row = False
     for i in range(len(rows)):
-        has_empty = has_empty or largest_of(rows[i]) == 0.0
-    return has_empty
+        has_empty_row = has_empty_row or largest_of(rows[i]) == 0.0
+    return has_empty_row
 
 
 @exact

@@ -50,7 +50,7 @@ def call_lapack(typing_context, address, arguments):
     the address of a 32-bit copy. The copy also serves as a character, because all machines of numba are little-endian.
     """
 
-    def generate(context, builder, signature, values):
+    def emit_call(context, builder, signature, values):
         routine, packed = values
         pointers = []
         for position, kind in enumerate(arguments.types):
@@ -66,7 +66,7 @@ def call_lapack(typing_context, address, arguments):
         builder.call(builder.inttoptr(routine, function_type.as_pointer()), pointers)
         return builder.sext(builder.load(info), ir.IntType(64))
 
-    return types.int64(address, arguments), generate
+    return types.int64(address, arguments), emit_call
 
 
 # smallest number of coordinates for which Newton steps by banded algebra count as faster than by dense algebra: the

@@ -232,15 +232,15 @@ def _minimum_degree_order(
             continue  # a hub that supports its parts is a neighbour, and pushes the joint again when it is eliminated
         is_eliminated[node] = True
         order.append(node)
-        affected = neighbours[node]
-        for neighbour in affected:
-            neighbours[neighbour] |= affected
+        affected_nodes = neighbours[node]
+        for neighbour in affected_nodes:
+            neighbours[neighbour] |= affected_nodes
             neighbours[neighbour] -= {node, neighbour}
         if node < n_joints:
             supports.eliminate_joint(node)
         else:
             supports.eliminate_hub(hubs[node - n_joints])
-        for neighbour in affected:
+        for neighbour in affected_nodes:
             heapq.heappush(heap, (degree(neighbour), neighbour))
     return order
 
@@ -401,8 +401,8 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 @inlined
 def end_of_sections(program):
     """Return the index at which the sections of a program end."""
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
-    return first + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
+    begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
+    return begin + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 
 
 @inlined
@@ -417,40 +417,40 @@ def factor_columns_of(program):
 
     Rows are numbered in the order of elimination.
     """
-    first = N_HEAD + program[N_PIVOTS]
-    middle = first + program[N_PIVOTS] + 1
-    return program[first:middle], program[middle : middle + program[N_OFF_DIAGONAL]]
+    begin = N_HEAD + program[N_PIVOTS]
+    middle = begin + program[N_PIVOTS] + 1
+    return program[begin:middle], program[middle : middle + program[N_OFF_DIAGONAL]]
 
 
 @inlined
 def update_runs_of(program):
     """Return [length, first slot] of the runs of off-diagonal updates, in the order in which `factor` uses them."""
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
-    return program[first : first + program[N_RUNS]]
+    begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
+    return program[begin : begin + program[N_RUNS]]
 
 
 @inlined
 def mass_entries_of(program):
     """Return the rows, columns and slots of the entries of M."""
     n = program[N_OF_MASS]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
-    return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
+    begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
+    return program[begin : begin + n], program[begin + n : begin + 2 * n], program[begin + 2 * n : begin + 3 * n]
 
 
 @inlined
 def jacobian_entries_of(program):
     """Return the rows, columns and slots of the entries of G."""
     n = program[N_OF_JACOBIAN]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS] + 3 * program[N_OF_MASS]
-    return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
+    begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS] + 3 * program[N_OF_MASS]
+    return program[begin : begin + n], program[begin + n : begin + 2 * n], program[begin + 2 * n : begin + 3 * n]
 
 
 @inlined
 def stiffening_products_of(program):
     """Return, for each product of two entries of G that stiffens M: row, indices of both entries, and slot."""
     n = program[N_STIFFENED]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
-    first += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
-    middle = first + 2 * n
+    begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
+    begin += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
+    middle = begin + 2 * n
     slots = program[middle + n : middle + 2 * n]
-    return program[first : first + n], program[first + n : middle], program[middle : middle + n], slots
+    return program[begin : begin + n], program[begin + n : middle], program[middle : middle + n], slots
