@@ -58,7 +58,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-# in methods with a trend, step sizes are kept if their proposed ratio is from 1 to this, which saves a factorization
+# methods with a trend keep the step size, which saves a factorization, if its proposed increase is below this ratio
 KEEP_BELOW_RATIO = 1.2
 
 

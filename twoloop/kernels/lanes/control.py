@@ -69,7 +69,7 @@ MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that 
 END_ROUNDING = 1e-10
 LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of the last failed step, as in `Plan`
 LIMIT_MEMORY = 10.0  # number of accepted steps after which H_LIMIT no longer applies, as in `Plan`
-LEAST_FIRST_STEP = 20.0 * SHORTEST  # smallest size of the first step, relative to |t0|
+LEAST_FIRST_STEP = 20.0 * SHORTEST  # lower bound of the first step size, relative to |t0|
 # number of successive rejected steps after which a run leaves its lane, because the motion may be stiff
 MAX_REJECTED = 30
 MOST_STEPS = 100_000  # largest number of steps of a run in a lane, because the user cannot interrupt runs in lanes

@@ -225,8 +225,8 @@ MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
-# displacements of other guesses from the projected positions, as two factors: that of `correction` (the change from the
-# first guess to the projected positions), and that of the weakest direction
+# displacements of other guesses from the projected positions, as two factors: that of `change_from_guess`, the change
+# from the first guess to the projected positions, and that of the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
@@ -242,9 +242,9 @@ def offsets_in_memory(n, n_rows, n_entries, n_redundant):
     G = 2 * n_rows
     x = G + n_entries
     change = x + n_rows
-    nearest = change + n
-    correction = nearest + n
-    weakest_direction = correction + n
+    nearest_positions = change + n
+    change_from_guess = nearest_positions + n
+    weakest_direction = change_from_guess + n
     displacement = weakest_direction + n
     row = displacement + n
     factors_at_nearest = row + n
@@ -254,8 +254,8 @@ def offsets_in_memory(n, n_rows, n_entries, n_redundant):
         G,
         x,
         change,
-        nearest,
-        correction,
+        nearest_positions,
+        change_from_guess,
         weakest_direction,
         displacement,
         row,
@@ -356,8 +356,8 @@ def _project_velocities(code, settings, control, pattern, moves, work):
 
 
 @compiled
-def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest_direction):
-    """Store the weakest direction in `weakest_direction` (n), scaled to the largest entry of `correction`.
+def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, change_from_guess, weakest_direction):
+    """Store the weakest direction in `weakest_direction` (n), scaled to the largest entry of `change_from_guess`.
 
     Clear RUNNING in lanes with dependent rows.
     """
@@ -372,7 +372,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
     for k in range(LANES):
         if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` is now the smallest eigenvalue
             work[RUNNING * LANES + k] = 0.0
-        factor = _largest_value(work, correction, n, k) / max(
+        factor = _largest_value(work, change_from_guess, n, k) / max(
             _largest_value(work, weakest_direction, n, k), DIAGONAL_SHIFT
         )
         for j in range(n):
@@ -384,20 +384,27 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
     """Clear RUNNING in lanes in which another guess has a projection far from its linear prediction by C_q."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
-    _, x, change, nearest, correction, weakest_direction, displacement, _, factors_at_nearest, _, _ = _memory_offsets(
-        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
+    _, x, change, nearest_positions, change_from_guess, weakest_direction, displacement, _, factors_at_nearest, _, _ = (
+        _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     )
-    x, change, nearest, correction = memory + x, memory + change, memory + nearest, memory + correction
+    x, change, nearest_positions, change_from_guess = (
+        memory + x,
+        memory + change,
+        memory + nearest_positions,
+        memory + change_from_guess,
+    )
     weakest_direction, displacement, factors = (
         memory + weakest_direction,
         memory + displacement,
         memory + factors_at_nearest,
     )
-    _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest_direction)
+    _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, change_from_guess, weakest_direction)
     for by_correction, by_weakest in OTHER_GUESSES:
         for j in range(n * LANES):
-            shift = by_correction * work[correction * LANES + j] + by_weakest * work[weakest_direction * LANES + j]
-            work[displacement * LANES + j], work[new * LANES + j] = shift, work[nearest * LANES + j] + shift
+            shift = (
+                by_correction * work[change_from_guess * LANES + j] + by_weakest * work[weakest_direction * LANES + j]
+            )
+            work[displacement * LANES + j], work[new * LANES + j] = shift, work[nearest_positions * LANES + j] + shift
         _gauss_newton(code, settings, control, pattern, moves, work)
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
@@ -405,10 +412,15 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
         # `change` becomes the component of the displacement that is normal to the constraints
         solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
-            distance, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, nearest, n, k)
+            distance, rounding = (
+                0.0,
+                ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, nearest_positions, n, k),
+            )
             for j in range(n):
                 m = j * LANES + k
-                expected = work[nearest * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
+                expected = (
+                    work[nearest_positions * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
+                )
                 distance = max(distance, abs(work[new * LANES + m] - expected))
             if not distance <= MAX_CURVATURE * _largest_value(work, displacement, n, k) + rounding:
                 work[RUNNING * LANES + k] = 0.0
@@ -426,7 +438,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = offsets_in_work(n, n_rows, numbers.shape[1])
-    _, _, _, nearest, correction, _, _, row, _, _, _ = _memory_offsets(
+    _, _, _, nearest_positions, change_from_guess, _, _, row, _, _, _ = _memory_offsets(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
     fill_field(work, AHEAD, control[T0])
@@ -442,16 +454,16 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
                 work[(own + i) * LANES + k] = numbers[run, i]
         _gauss_newton(code, settings, control, pattern, moves, work)
         _project_velocities(code, settings, control, pattern, moves, work)
-        copy_vectors(work, new, memory + nearest, n)
+        copy_vectors(work, new, memory + nearest_positions, n)
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
             for j in range(n):
-                work[(memory + correction + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
+                work[(memory + change_from_guess + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
         _check_other_guesses(code, settings, control, pattern, moves, work)
         for k in range(min(LANES, n_runs - first)):
             fine[first + k] = int(work[RUNNING * LANES + k])
             for j in range(n):
-                q[first + k, j] = work[(memory + nearest + j) * LANES + k]
+                q[first + k, j] = work[(memory + nearest_positions + j) * LANES + k]
                 v[first + k, j] = work[(new + n + j) * LANES + k]
 
 

@@ -86,7 +86,10 @@ def _coefficient_row(memory, which):
 
 @inlined
 def _difference_table(memory, n, which):
-    """Return a view (N_TERMS + 1, n padded) of table `which` of differences: phi_i is row i - 1 plus the last row."""
+    """Return a view of table number `which` of differences, N_TERMS + 1 rows of n entries, padded.
+
+    The difference phi_i is row i - 1 plus the last row.
+    """
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
     return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))
@@ -174,7 +177,7 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
-    """Store the predicted state in q1 and v1, and the differences that belong to it in the table `new`."""
+    """Store the predicted state in q1 and v1, and the differences predicted by table `old` in the table `new`."""
     beta, g, G = (
         _coefficient_row(memory, BETA),
         _coefficient_row(memory, G_VELOCITY),
