@@ -228,7 +228,7 @@ ROUNDINGS = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # limits in 
 
 
 class ConstraintWarning(UserWarning):
-    """Warning: constraints depend on one another, or something changes so briefly that a run may have missed it.
+    """Warning: dependent constraints, a singular position, or a change so brief that a run may have missed it.
 
     Dependent rows are left out of the solution but checked; their multipliers are not unique.
 
