@@ -39,7 +39,7 @@ from numba.misc.appdirs import AppDirs
 from twoloop.kernels.compile.dependencies import Digest, NotDigestible, closure_values, reachable_names
 from twoloop.kernels.compile.linking import discard_compiled_code, jitable_templates
 
-ACCESS_ADVICE = (
+ADVICE = (
     "Code is loaded only from what belongs to you or root and no other user can write: take that right away (chmod "
     "go-w) or set NUMBA_CACHE_DIR to a folder of your own in folders that others cannot write"
 )
@@ -61,7 +61,7 @@ def read_trusted(path: Path) -> bytes:
     """
     with path.open("rb") as file:
         if reason := _reason_of_mode(os.fstat(file.fileno())):
-            _warn_first(f"twoloop: {path} {reason}, and is not loaded but compiled again. {ACCESS_ADVICE}")
+            _warn_first(f"twoloop: {path} {reason}, and is not loaded but compiled again. {ADVICE}")
             raise UntrustedFile(f"{path} {reason}")
         return file.read()
 
@@ -93,9 +93,7 @@ def trusted_folder(folder: Path) -> Path:
     replacement = Path(AppDirs(appname="twoloop", appauthor=False).user_cache_dir) / "code" / subfolder
     if reason_to_distrust(replacement):
         replacement = Path(_temporary_folder()) / subfolder
-    _warn_first(
-        f"twoloop: no code is loaded from {folder}: {reason}. It is kept in {replacement} instead. {ACCESS_ADVICE}"
-    )
+    _warn_first(f"twoloop: no code is loaded from {folder}: {reason}. It is kept in {replacement} instead. {ADVICE}")
     return replacement
 
 
@@ -245,7 +243,7 @@ UNWRITABLE_CACHE_WARNING = (
 )
 MAX_IN_MEMORY = 50  # largest number of entries of a BoundedCache, in memory
 # numba's class that finds the cache folder in NUMBA_CACHE_DIR; it has a private name in numba 0.61
-_LOCATOR_CLASS: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
+_LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 
 def compile_cached(
@@ -277,7 +275,7 @@ def compile_cached(
     function = dispatcher.py_func
     if digests is not None:
         try:
-            dispatcher._cache = _CompiledFunctionCache(function, *digests, announcement)
+            dispatcher._cache = _CodeCache(function, *digests, announcement)
         except RuntimeError:  # numba finds no folder, for example for functions typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 warn_once(UNWRITABLE_CACHE_WARNING)
@@ -350,16 +348,14 @@ def with_unique_name(function: Callable[..., Any], digests: tuple[str, str] | No
     return copy
 
 
-class _CompiledFunctionCache(FunctionCache):
+class _CodeCache(FunctionCache):
     """Numba's cache of a function, with twoloop's digests and files. If a file cannot be read, numba compiles again."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         if cache_dir:  # numba would create the folder with access rights that depend on the umask
             with suppress(OSError):
-                make_trusted_folder(
-                    Path(cache_dir, _LOCATOR_CLASS.get_suitable_cache_subpath(inspect.getfile(function)))
-                )
+                make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
         source_stamp = self._cache_file._source_stamp
         folder = trusted_folder(Path(self._cache_path))
@@ -415,7 +411,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
             # a callback that uses this function as a closure variable need not compile the function again
             _COMPILED_DIGESTS[dispatcher] = digests
             with suppress(RuntimeError):  # no folder can be written
-                dispatcher._cache = _CompiledFunctionCache(dispatcher.py_func, *digests, "")
+                dispatcher._cache = _CodeCache(dispatcher.py_func, *digests, "")
         return dispatcher
 
     return decorate
@@ -479,11 +475,9 @@ def _use_twoloop_cache(helper: Any) -> None:
         if has_changed or compiled is None:
             discard_compiled_code(helper)
         return
-    if isinstance(helper._cache, FunctionCache) and (
-        has_changed or not isinstance(helper._cache, _CompiledFunctionCache)
-    ):
+    if isinstance(helper._cache, FunctionCache) and (has_changed or not isinstance(helper._cache, _CodeCache)):
         try:
-            helper._cache = NullCache() if digests is None else _CompiledFunctionCache(helper.py_func, *digests, "")
+            helper._cache = NullCache() if digests is None else _CodeCache(helper.py_func, *digests, "")
         except RuntimeError:
             helper._cache = NullCache()
     if helper.overloads and (has_changed or (compiled is None and (helper._can_compile or helper.stats.cache_hits))):

@@ -172,7 +172,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 
 @merged
-def _exchange_indices(order, position, k, chosen):
+def _exchange(order, position, k, chosen):
     """Exchange two indices so that `chosen` gets to position k of `order`; return the sign of the permutation."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
@@ -229,9 +229,7 @@ def choose_order(index, matrix, zero_source, zero_ratio):
         i, j = _choose_pivot(matrix, rows, columns, k)
         if i < 0:
             return SINGULAR_MATRIX
-        index[SIGN] *= _exchange_indices(rows, counts[ROW_POSITION], k, i) * _exchange_indices(
-            columns, counts[COLUMN_POSITION], k, j
-        )
+        index[SIGN] *= _exchange(rows, counts[ROW_POSITION], k, i) * _exchange(columns, counts[COLUMN_POSITION], k, j)
         pivot = 0.0
         for m in range(counts[COLUMN_SIZE, j]):
             counts[ACTIVE_ROW_SIZE, lists[ROWS, j, m]] -= 1

@@ -95,7 +95,7 @@ def load_matrix(program, mass, jacobian, K, D, z, stiffness, values):
     """Store Newton's matrix for z (real or complex) in the slots in `values`, from the entries of M, G, K and D."""
     for s in range(values.size):
         values[s] = 0.0
-    n_off_diagonal = program[N_OFF_DIAGONAL]
+    n_off = program[N_OFF_DIAGONAL]
     _, _, slots = mass_entries_of(program)
     for k in range(mass.size):
         values[slots[k]] += mass[k]
@@ -104,13 +104,13 @@ def load_matrix(program, mass, jacobian, K, D, z, stiffness, values):
     _, _, slots = jacobian_entries_of(program)
     for k in range(slots.size):
         values[slots[k]] += jacobian[k]
-        values[slots[k] + n_off_diagonal] += jacobian[k]
+        values[slots[k] + n_off] += jacobian[k]
     product_rows, first, second, slots = stiffening_products_of(program)
     for u in range(product_rows.size):
         product = stiffness[product_rows[u]] * jacobian[first[u]] * jacobian[second[u]]
         values[slots[u]] += product
         if slots[u] >= program[N_PIVOTS]:
-            values[slots[u] + n_off_diagonal] += product
+            values[slots[u] + n_off] += product
 
 
 @compiled
@@ -120,7 +120,7 @@ def factor(program, is_independent, values, sizes):
     For redundant rows (0 in `is_independent`), the factors become zeros, which removes the rows from solutions. `sizes`
     is scratch.
     """
-    n_q, n, n_off_diagonal = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF_DIAGONAL]
+    n_q, n, n_off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF_DIAGONAL]
     order, runs = pivot_order_of(program), update_runs_of(program)
     begin, row_of = factor_columns_of(program)
     for k in range(n):
@@ -132,7 +132,7 @@ def factor(program, is_independent, values, sizes):
             values[k] = 0.0
             for s in range(first, last):
                 values[s] = 0.0
-                values[s + n_off_diagonal] = 0.0
+                values[s + n_off] = 0.0
                 slot = s + 1
                 while slot < last:
                     slot += runs[u]
@@ -143,9 +143,9 @@ def factor(program, is_independent, values, sizes):
         inverse = 1.0 / values[k]
         values[k] = inverse
         for s in range(first, last):
-            lower, upper = values[s] * inverse, values[s + n_off_diagonal] * inverse
+            lower, upper = values[s] * inverse, values[s + n_off] * inverse
             target = row_of[s - n]
-            change = lower * values[s + n_off_diagonal]
+            change = lower * values[s + n_off]
             values[target] -= change
             sizes[target] += abs(change)
             slot = s + 1
@@ -157,8 +157,8 @@ def factor(program, is_independent, values, sizes):
                         target_run[i] -= source_run[i] * upper
                 if lower != 0.0:
                     target_run, source_run = (
-                        values[target + n_off_diagonal : target + n_off_diagonal + size],
-                        values[slot + n_off_diagonal : slot + n_off_diagonal + size],
+                        values[target + n_off : target + n_off + size],
+                        values[slot + n_off : slot + n_off + size],
                     )
                     for i in range(size):
                         target_run[i] -= lower * source_run[i]
@@ -171,7 +171,7 @@ def factor(program, is_independent, values, sizes):
 @compiled
 def solve(program, values, x, y):
     """Replace the right-hand side x = [r, c] by the solution, with the factors `values`; y is scratch."""
-    n, n_off_diagonal, order = program[N_PIVOTS], program[N_OFF_DIAGONAL], pivot_order_of(program)
+    n, n_off, order = program[N_PIVOTS], program[N_OFF_DIAGONAL], pivot_order_of(program)
     begin, row_of = factor_columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -182,7 +182,7 @@ def solve(program, values, x, y):
     for k in range(n - 1, -1, -1):
         total = y[k]
         for s in range(begin[k], begin[k + 1]):
-            total -= values[n + n_off_diagonal + s] * y[row_of[s]]
+            total -= values[n + n_off + s] * y[row_of[s]]
         y[k] = total * values[k]
     for k in range(n):
         x[order[k]] = y[k]

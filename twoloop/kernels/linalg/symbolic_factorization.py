@@ -50,16 +50,10 @@ class _DisjointSets:
 class _PartSupports:
     """Supports of each part: the ground, and hubs not eliminated yet. A part: bodies connected by eliminated joints."""
 
-    def __init__(
-        self,
-        joints: Sequence[frozenset[int]],
-        n_bodies: int,
-        hubs: set[int],
-        single_coordinate_bodies: AbstractSet[int],
-    ):
+    def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
         # bodies with a single coordinate: a joint with one of these may fix a part to the ground
-        self.single_coordinate_bodies = single_coordinate_bodies
+        self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
         self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support each part
@@ -70,7 +64,7 @@ class _PartSupports:
         """Return whether a joint may be eliminated next: its rows must be independent, see the module's docstring."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
-        if not bodies & self.single_coordinate_bodies and any(
+        if not bodies & self.lone_bodies and any(
             not self.is_grounded[part] and not self.hubs_by_part[part] for part in parts
         ):
             return True
@@ -79,7 +73,7 @@ class _PartSupports:
     def eliminate_joint(self, joint: int) -> None:
         """Merge the parts that an eliminated joint connects, and update their supports."""
         bodies = self.joints[joint]
-        is_grounded = len(bodies) == 1 or bool(bodies & self.single_coordinate_bodies)
+        is_grounded = len(bodies) == 1 or bool(bodies & self.lone_bodies)
         self._merge_parts((body for body in bodies if body not in self.hubs), is_grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
@@ -159,12 +153,12 @@ def elimination_order(
         rows_of_hubs = []
     nodes = [[n_q + i for i in rows_by_joint[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
     pairs: set[tuple[int, int]] = set()
-    single_coordinate_bodies: set[int] = set()
+    lone_bodies: set[int] = set()
     if couplings is not None:
         pairs = {(body_of[i], body_of[j]) for i, j in zip(*couplings, strict=True)}
-        single_coordinate_bodies = {hub for hub in hubs if len(coordinates[hub]) == 1}
+        lone_bodies = {hub for hub in hubs if len(coordinates[hub]) == 1}
     sizes = [len(node) for node in nodes]
-    for node in _minimum_degree_order(joints, joints_of, sorted(hubs), sizes, n_q, pairs, single_coordinate_bodies):
+    for node in _minimum_degree_order(joints, joints_of, sorted(hubs), sizes, n_q, pairs, lone_bodies):
         order += nodes[node]
     order += rows_of_hubs
     return np.array(order, dtype=np.int64)
@@ -193,12 +187,12 @@ def _minimum_degree_order(
     sizes: Sequence[int],
     n_bodies: int,
     pairs: Iterable[tuple[int, int]],
-    single_coordinate_bodies: AbstractSet[int],
+    lone_bodies: AbstractSet[int],
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
     Among the joints and hubs that may be eliminated, the next one has neighbours with the fewest rows and coordinates.
-    `pairs`: pairs of hubs that are coupled other than by joints. `single_coordinate_bodies`: see `_PartSupports`.
+    `pairs`: pairs of hubs that are coupled other than by joints. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -216,7 +210,7 @@ def _minimum_degree_order(
         neighbours[node_of[hub_b]].add(node_of[hub_a])
     for node, adjacent in enumerate(neighbours):
         adjacent.discard(node)
-    supports = _PartSupports(joints, n_bodies, set(hubs), single_coordinate_bodies)
+    supports = _PartSupports(joints, n_bodies, set(hubs), lone_bodies)
 
     def degree(node: int) -> int:
         return sum(sizes[neighbour] for neighbour in neighbours[node])
@@ -323,24 +317,9 @@ def program_in_order(
     )
     product_rows, first, second = _products_of_entries(jacobian[0], stiff_rows)
     pivot_a, pivot_b = (position[jacobian[1][indices]] for indices in (first, second))
-    stiffening_section = [
-        product_rows,
-        first,
-        second,
-        slots_of(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b)),
-    ]
+    products = [product_rows, first, second, slots_of(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b))]
     head = [n_q, n, n_off_diagonal, len(first_of), len(runs), n_mass, len(jacobian[0]), len(product_rows)]
-    parts = [
-        order,
-        begin,
-        row_of,
-        runs,
-        *mass,
-        entry_slots[:n_mass],
-        *jacobian,
-        entry_slots[n_mass:],
-        *stiffening_section,
-    ]
+    parts = [order, begin, row_of, runs, *mass, entry_slots[:n_mass], *jacobian, entry_slots[n_mass:], *products]
     return np.concatenate([np.array(head), *parts]).astype(np.int32)
 
 

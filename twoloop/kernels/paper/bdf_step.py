@@ -77,13 +77,8 @@ def _history_views(memory, n):
     differences = memory[begin : begin + size].reshape((N_DIFFERENCES, 2 * n))
     trial = memory[begin + size : begin + 2 * size].reshape((N_DIFFERENCES, 2 * n))
     begin += 2 * size
-    return (
-        differences,
-        trial,
-        memory[begin : begin + 2 * n],
-        memory[begin + 2 * n : begin + 4 * n],
-        memory[begin + 4 * n :],
-    )
+    prediction, rate = memory[begin : begin + 2 * n], memory[begin + 2 * n : begin + 4 * n]
+    return differences, trial, prediction, rate, memory[begin + 4 * n :]
 
 
 @kernel(SETTLE)

@@ -128,11 +128,8 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     Q_stage = memory_block(memory, s, n, at.Q_STAGE)
     V_stage = memory_block(memory, s, n, at.V_STAGE)
     q_full, v_full = memory_vector(memory, s, n, at.Q_FULL), memory_vector(memory, s, n, at.V_FULL)
-    q_mid, v_mid, a_mid = (
-        memory_vector(memory, s, n, at.Q_MID),
-        memory_vector(memory, s, n, at.V_MID),
-        memory_vector(memory, s, n, at.A_MID),
-    )
+    q_mid, v_mid = memory_vector(memory, s, n, at.Q_MID), memory_vector(memory, s, n, at.V_MID)
+    a_mid = memory_vector(memory, s, n, at.A_MID)
     q_old, v_old = memory_vector(memory, s, n, at.Q_OLD), memory_vector(memory, s, n, at.V_OLD)
     code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
     if code != DONE:
