@@ -116,7 +116,7 @@ def _legendre(z: Extended) -> Extended:
 
 
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
-    """Return values at z, single and double integrals to z, of the Lagrange polynomials, each with a row for each node.
+    """Return three arrays with a row for each Lagrange polynomial: values at z, single and double integrals up to z.
 
     `z` is on [-1, 1]; integrals are over the corresponding interval of [0, 1], from 0.
     """

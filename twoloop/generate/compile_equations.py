@@ -268,7 +268,7 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that computes a program with `stored` quantities; return whether its arrays are valid."""
+        """Write the part that computes a program, with quantities `stored` in memory; return whether they are valid."""
         places = {i: (arguments[4], place) for i, place in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)
