@@ -150,8 +150,8 @@ def split_steps(steps, counts, h, changes, used_newton):
 # UNUSUAL: Python must read the report, and may have to continue the run
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
-# arrays of runs that are repeated from different starts, for checks of a start, the choice of rows, and the run. Among
-# these arrays are
+# arrays of runs that are repeated from different starts, for checks of a start, the choice of rows, and the run; among
+# them are
 # - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
 # - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
 # - `last_start`: the last start, see START; `start_rows`: indices of the independent rows at the last start

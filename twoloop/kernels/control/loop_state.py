@@ -64,8 +64,8 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
 
-# columns of `out_steps`, which has one row for each accepted step. H: step size, s; other columns: numbers since the
-# start of the run of rejections by the error, failures, partitions, and Jacobians (0 after an explicit step)
+# columns of `out_steps`, which has one row for each accepted step. H: step size, s; other columns: total numbers, since
+# the run began, of rejections by the error, failures, partitions, and Jacobians (0 after an explicit step)
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
 # indices in `clock`, after those of the history
