@@ -280,7 +280,7 @@ def test_the_first_call_ends_where_that_of_a_user_ends(marks, spent, monkeypatch
 
     for module in (driver, first_calls):
         monkeypatch.setattr(module, "cpu_time", lambda: clock[0])
-    monkeypatch.setattr(first_calls, "_compiled_anew", lambda modules: modules[-1])  # other tests hold its functions
+    monkeypatch.setattr(first_calls, "_compiled_anew", lambda module: module)  # other tests hold its functions
     monkeypatch.setitem(CATALOGUE, "twice", replace(ours, name="twice", run=run))
     row = first_calls.times_of("heavy top", "twice")
     assert row["status"] == "REACHED_END" and row["first_call_s"] == spent

@@ -404,7 +404,7 @@ def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
         factors[k + 1 :, k + 1 :] -= np.outer(factors[k + 1 :, k], factors[k, k + 1 :])
 
     def solve(rhs: Array) -> Array:
-        intermediate = solve_triangular(factors, rhs, lower_program=True, unit_diagonal=True, check_finite=False)
+        intermediate = solve_triangular(factors, rhs, lower=True, unit_diagonal=True, check_finite=False)
         return np.asarray(solve_triangular(factors, intermediate, check_finite=False))
 
     a, b = np.random.default_rng(1).choice((-1.0, 1.0), (2, n))
