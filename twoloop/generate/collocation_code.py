@@ -143,7 +143,7 @@ MAX_CONTRACTION = 0.8  # contraction at or above which a step is rejected in its
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # lower and upper bound that replace a measured contraction outside of them
 # smallest and largest contraction with which the guessed size of the first step is accepted
 FAST_START, SLOW_START = 0.04, 0.3
-# contraction at or above which changes below MAX_ROUNDING, relative to the values, count as rounding errors
+# if the contraction is at least this, changes below MAX_ROUNDING, relative to the values, are rounding errors
 STAGNATION_RATIO = 0.5
 # values that replace KAPPA, MAX_ROUNDING and the limit of sweeps in steps of fixed size
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0

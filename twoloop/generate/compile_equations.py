@@ -468,7 +468,7 @@ class GeneratedCode(NamedTuple):
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads
     traced: CallbackTraces
-    evaluate: Evaluator  # evaluates arrays of expressions of the trace cache for this system
+    evaluate: Evaluator  # evaluates arrays of expressions, from the shared trace cache, for this system's parameters
 
     @property
     def kinds(self) -> frozenset[str]:

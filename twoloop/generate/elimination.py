@@ -45,7 +45,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # ratio of the smallest to the largest eigenvalue of M below which rows of G are added to M
+SINGULAR_MASS = 1e-10  # rows of G are added to M if the ratio of the smallest to the largest eigenvalue of M is smaller
 RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
 PIVOT_FRACTION = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
 # possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to its pivot without
@@ -61,8 +61,8 @@ N_FEW_COORDINATES = 24  # largest number of coordinates for which MIN_INDEX_FEW,
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
 MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number
-# number of rows of G per coordinate from which on dependent coordinates are eliminated; with fewer rows, the linear
-# system for the multipliers is smaller
+# dependent coordinates are eliminated if G has at least this number of rows per coordinate; with fewer rows, the linear
+# system for the multipliers is smaller than this
 MIN_ROW_RATIO = 2.0 / 3.0
 
 PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]

@@ -24,9 +24,9 @@ from twoloop.kernels.evaluation import operations as op
 
 # largest number of operations of a derived program or a series: tracing more would take longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
-# A product is recorded once for all its multiples: its constant factor is taken out, unless this might underflow or
-# overflow. So the factor must be between MIN_FACTOR and 1 / MIN_FACTOR in magnitude, and powers with exponents above
-# HIGH_EXPONENT keep the factors of their products.
+# A product is recorded once for all its multiples: the constant factors of both arguments are taken out, unless this
+# might underflow or overflow. They stay in if their product is not between MIN_FACTOR and 1 / MIN_FACTOR in magnitude,
+# and in the squares from which a power with an exponent above HIGH_EXPONENT is computed.
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 # reason, for messages, why a callback is refused that compares an expression, or converts one to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"

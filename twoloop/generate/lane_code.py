@@ -55,7 +55,7 @@ MAX_REJECTIONS = 10  # largest number of successive rejected steps; after more, 
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
 # a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
-CONTRACTION = 0.5  # largest ratio of a correction to the previous one: above this ratio, a projection fails
+CONTRACTION = 0.5  # a projection fails if the ratio of a correction to the previous one is larger than this
 N_PARALLEL = 3  # number of coordinates whose series one loop evaluates: each needs 3 of the 16 vector registers
 
 

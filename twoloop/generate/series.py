@@ -23,7 +23,7 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-# largest number of entries of M and [C_q; A] for which a series is traced, unless the user chooses the Taylor method
+# largest number of entries of M and [C_q; A] for which series are traced, unless the user chooses the Taylor method
 MAX_ENTRIES = 200_000
 
 # callbacks from which a series is derived

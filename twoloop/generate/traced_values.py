@@ -34,7 +34,7 @@ RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, 
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 # approximate largest number of compared states: in a chunk of steps, in a run, in a run with callbacks called in Python
 MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
-MAX_ENTRIES = 20_000  # approximate largest number of entries compared in a run: large systems, at fewer states
+MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run: large systems need fewer states
 # largest difference between call and trace that counts as a rounding error, relative to the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 CLEAR_DIFFERENCE = 1e-6  # relative difference above which a trace is wrong; if smaller, see `_is_systematic`

@@ -29,10 +29,9 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# v gets its own polynomial if the rounding error of q, divided by the duration of the interval, exceeds this number of
-# tolerances of v
+# v gets its own polynomial if the rounding error of q, divided by the interval, exceeds this many tolerances of v
 MAX_VELOCITY_ROUNDING = 10.0
-# pivot within an interval, relative to the larger one of the pivots at its ends, below which the position is singular
+# a position in an interval is singular if its pivot, relative to the larger one at the ends, is smaller than this
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5  # pivot below which any position is singular; for pivots see min_pivot_ratio in partition.py
 # a position with a pivot below WEAK_PIVOT is singular, too, if velocities of the polynomials violate the constraints by

@@ -81,7 +81,7 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # number of calls that do not use an integrator after a callback raised an exception in it
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # CPU time of the last run, s, below which elapsed time is recorded, as reading CPU time takes long
+SHORT_RUN = 1e-3  # if the last run took less CPU time, s, elapsed time is recorded, because reading CPU time takes long
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
 
@@ -385,8 +385,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-# ratio of the smallest pivot at a start to that at the first start, below which `set_up` checks the start
-RECHECK_PIVOT = 0.1
+RECHECK_PIVOT = 0.1  # `set_up` checks a start if its smallest pivot, relative to that at the first start, is smaller
 
 
 def first_chunk_size(run: Run) -> int:

@@ -231,7 +231,7 @@ class Interpolator:
             self.interior_states.update(self._divide(table, plan, self.kits[kind], groups[has_kind, indices.FIRST_OWN]))
         for i in groups[:, indices.FIRST_OWN].tolist():
             if (memory := self.crossing_memories.get(float(table.t[i]))) is not None:
-                self.interior_states[float(table.t[i])] = self._states_of_crossing(table, i, memory)
+                self.interior_states[float(table.t[i])] = self._states_in_crossing_step(table, i, memory)
         is_divided = np.array(
             [t in self.interior_states for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool
         )
@@ -293,16 +293,16 @@ class Interpolator:
         take_step = entry_point(kernels.crossing_step)
         take_step(self.kit, self.work, plan.options, plan.memory, begin, end - begin, tolerances, state, state.copy())
         succeeded = plan.memory[-kernels.N_STORED :][kernels.END] > begin
-        return self._states_of_crossing(table, i, plan.memory) if succeeded else None
+        return self._states_in_crossing_step(table, i, plan.memory) if succeeded else None
 
-    def _states_of_crossing(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states in interval i from the polynomial of a crossing step, which is stored in `memory`."""
+    def _states_in_crossing_step(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
+        """Return times and states in interval i, from the polynomial (in `memory`) of a step across a singularity."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
         times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
         states = np.array([state_at(memory, options, t) for t in times])
-        # a of the stored states is not copied, because it may consist of rounding errors
+        # the stored accelerations are not copied, because they may consist of rounding errors
         states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]
         return times, states
 

@@ -57,7 +57,8 @@ def warn_of_missed_changes(run: Run) -> str:
 Array = NDArray[np.float64]
 
 N_CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
-NEGLIGIBLE_RATIO = 1e-12  # largest singular value that counts as zero (as of redundant rows), relative to the largest
+# largest singular value, relative to the largest of all, that counts as zero, such as that of a redundant row
+NEGLIGIBLE_RATIO = 1e-12
 MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to their right-hand side
 
 
@@ -95,10 +96,10 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
 # step sizes to try across a singular position, relative to H_LONG, the longest of the last steps: several, because no
 # node of the step should be at the position
 STEP_RATIOS = tuple(0.85**k for k in range(28))
-# larger step sizes, relative to H_LONG, to try if too few nodes of a step are beyond the singular position
+# step sizes, relative to H_LONG, to try afterwards if too few nodes of a step are beyond the singular position
 LARGER_RATIOS = tuple(1.4**k for k in range(1, 7))
 # distances from a singular position: smallest pivot of C_q at a state, relative to the largest such pivot so far
-FAR_BEFORE = 0.2  # smallest distance from a singular position of a base, at which the polynomial across it begins
+FAR_BEFORE = 0.2  # smallest distance of a base, the state at which the polynomial across a singular position begins
 # limits of steps across a singular position. STRICT: those of the run. WIDER: the longest time without an evaluation
 # is GAP_FACTOR times as long, or unlimited if forces cannot be short. LOOSER: as WIDER, with larger tolerances
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
@@ -117,7 +118,7 @@ class Origin(NamedTuple):
 # largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times a step from the
 # current state to its mirror image beyond the singular position (see _find_base)
 MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
-# ratio of the distance of an earlier state to that of the base below which it is beyond another singular position
+# an earlier state is beyond another singular position if its distance, relative to that of the base, is smaller
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
 FAR_BEYOND = 0.3  # smallest distance beyond a singular position at which the run continues with its own method

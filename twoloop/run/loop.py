@@ -153,14 +153,14 @@ def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] |
 BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
 BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
 CHUNK_TO_EVENT = 16  # number of attempts in a chunk if an event may end the run: steps beyond the event are wasted
-CHUNK_TIME = 0.05  # CPU time of a chunk, s, from which on the next chunk is not larger, so that Ctrl-C is noticed soon
+# a chunk that takes more CPU time, s, is not followed by a larger one, so that Ctrl-C is noticed soon
+CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-MAX_BASE_CANDIDATES = 16  # largest number of last states that may be the base of a step across a singular position
-# attempts across a singular position need not end at t1, but at t1 + CROSSING_OVERSHOOT times the run's duration
-CROSSING_OVERSHOOT = 100.0
+MAX_BASE_CANDIDATES = 16  # number of last states among which the base of a crossing step is sought
+CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1, by at most this number of durations of the run
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
-# largest number of sets of buffers kept for later runs, and of floats in the buffer of states of such a set
+# MAX_SPARE: largest number of sets of buffers kept for later runs; MAX_SPARE_FLOATS: of floats in a buffer of states
 MAX_SPARE, MAX_SPARE_FLOATS = 16, 250_000
 _spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for later runs, by their sizes
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of ends of runs, besides those that `advance` returns
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # end codes of runs that `advance` does not return
 STAGNATION_STEPS = 20_000  # smallest number of accepted steps over which the mean step size is computed
 # A run stalls if its mean step size is below STAGNATION_PACE times the largest one, and the rest of the run would take
 # more than STAGNATION_LEFT steps; or if the rest would take more than MAX_STEPS_LEFT steps, that is, days.
@@ -80,14 +80,14 @@ class StallDetector:
 
 
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
-N_LAST_STEPS = 8  # number of steps before a sampled state, the median of which is the step size of the sample
+N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
 INITIAL_FACTOR = 0.1  # `initial_direction` times this is added to the last eigenvectors, so that no component stays 0
 # the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -MIN_ALIGNMENT
 MIN_ALIGNMENT = 0.9
-MIN_STEPS = 200  # number of accepted steps below which a message does not mention stiffness
-# stability limits the steps if the median of step size times rate, over the stability limit, is at least this value; in
-# smooth motion the ratio is 0.4
+MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
+# a problem counts as stiff if the median of h * rate / limit over the samples is at least this; `rate` is the fastest
+# rate of vibration or decay, `limit` the largest stable h * rate. In smooth motion the median is 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -198,18 +198,19 @@ def _dominant_eigenvalue(
     return eigenvalue, is_negative
 
 
-# ratio of singular values of C_q (or of inertias) up to which messages call C_q (or M) singular
+# messages call C_q (or M) singular if the ratio of its smallest to its largest singular value (or inertia) is at most
+# this
 MAX_SINGULAR_RATIO = 1e-3
-# ratio of the rounding error of velocities (or accelerations) to the tolerance above which a run is not trusted further
+# a result is not to be trusted if rounding errors of velocities (or accelerations) exceed this number of tolerances
 MAX_LASTING_ERROR = 100.0
-# ratio of singular values up to which the constraints do not determine the velocities at the end of a run
+# constraints do not determine the velocities at the end of a run if the ratio of singular values is at most this
 MAX_RATIO_AT_END = 1e-6
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
 CROSSINGS_MARK = "\0"  # stands in a message for the description of the singular positions that were crossed
-# time left, relative to the duration of the run, up to which a message mentions that the end is near
+# a message mentions that the end is near if the time left, relative to the duration of the run, is at most this
 NEAR_END = 1e-3
 
 _FAILURE_REASONS = {

@@ -29,10 +29,11 @@ from twoloop.run.workspace import kit_of, static_form, workspace
 
 Array = NDArray[np.float64]
 
-MIN_SINE = 1e-5  # sine of the angle of a row of C_q to the other rows, below which a dead centre may be near
-# largest number of Newton iterations by sparse factors; correction that ends them, relative to the largest coordinate
+MIN_SINE = 1e-5  # a dead centre may be near if the sine of the angle between a row of C_q and the other rows is smaller
+# MAX_CORRECTIONS: largest number of Newton iterations; ROUNDING: correction that ends them, relative to max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# largest distance between projection and prediction by C_q on the same assembly, relative to the guess's displacement
+# a projected position is on the same assembly if its distance from the prediction by C_q is at most this, relative to
+# the displacement of the guess
 MAX_NONLINEARITY = 0.5
 
 
@@ -181,8 +182,10 @@ CONVERGED_VIOLATION = 1e-2  # violation that ends the iteration, relative to the
 # singular values, relative to the largest, below which they count as zero: RANK_CUTOFF for ranks, LSTSQ_CUTOFF for
 # least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
-DEAD_CENTRE_RATIO = 0.01  # ratio of the smallest to the largest singular value up to which a dead centre is near
-MAX_SAME_DISTANCE = 0.1  # largest distance of equal positions, relative to the change by the projection
+# a dead centre is near if the ratio of the smallest to the largest singular value is at most this
+DEAD_CENTRE_RATIO = 0.01
+# distance up to which two positions count as equal, relative to the largest change by the projection
+MAX_EQUAL_DISTANCE = 0.1
 MAX_CHANGE = 1e8  # change of a coordinate, in units of `Scales.columns`, above which the iteration counts as diverged
 
 
@@ -417,7 +420,7 @@ def _describe_other_assembly(
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
         if mixed_projected is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
-        if distance(mixed_projected, position) > MAX_SAME_DISTANCE * largest_move or sign_at(mixed_projected) != sign:
+        if distance(mixed_projected, position) > MAX_EQUAL_DISTANCE * largest_move or sign_at(mixed_projected) != sign:
             return f"ends on another one, which differs by {_describe_change(position, mixed_projected, scales)}"
     return None
 

@@ -43,7 +43,7 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 # largest number of attempts in the first chunk of a small system; after each chunk, checks in Python take 0.2 ms
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of attempts in the first chunk if callbacks are slow Python functions
-SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
+SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
 TRIAL_STEPS = 10  # number of first steps; if one of them is short, a method that needs long steps is replaced
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
 CONTRADICTION = 1e-6  # smallest residual of a row of C_q a = gamma, relative to its terms, that contradicts other rows

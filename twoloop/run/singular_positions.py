@@ -19,14 +19,14 @@ Array = NDArray[np.float64]
 TimedState = tuple[float, Array]  # time and state [q, v, ...]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
-LOST_RANK_RATIO = 1e-2  # ratio of singular values below which messages say that constraints lose rank
+LOST_RANK_RATIO = 1e-2  # messages say that constraints lose rank if a ratio of singular values is smaller than this
 N_POSITIONS = 33  # number of positions between two states at which a ratio of singular values is evaluated
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DISPLACEMENT = 1e-6
-MIN_ROW_NORM = 0.1  # smallest divisor of a row, relative to the norm that its derivative lets expect
-# velocities turned if they changed by more than TURN_RATIO times the change that accelerations explain, and by more
-# than MIN_TURN times the tolerances
+MIN_ROW_NORM = 0.1  # smallest divisor of a row, relative to the norm expected from the derivative of the row
+# velocities count as turned if their change exceeds both TURN_RATIO times the change that accelerations explain and
+# MIN_TURN times the tolerances
 TURN_RATIO, MIN_TURN = 3.0, 10.0
 
 
@@ -198,8 +198,10 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-WEAK_RATIO = 1e-2  # singular value, relative to the largest, up to which rounding errors along its vector are estimated
-# ratio of pivots below which rounding errors are always estimated; ratio of pivots over ratio of singular values
+# rounding errors are estimated along singular vectors with at most this singular value, relative to the largest
+WEAK_RATIO = 1e-2
+# SMALL_PIVOT: with smaller ratios of pivots, rounding errors are always estimated; PIVOT_FACTOR: typical ratio of
+# pivots, divided by the ratio of singular values
 SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 

@@ -24,13 +24,15 @@ Array = NDArray[np.float64]
 CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for derivatives along the motion
 # weights of five samples in f' and f''
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-MAX_DIFFERENCE_ERROR = 1e-8  # largest relative error of a derivative by finite differences; smaller ones count as 0
-MIN_RANK_DERIVATIVE = 1e-6  # smallest relative derivative of the rows with which the rank rises
+# largest relative error of derivatives by finite differences; smaller derivatives count as 0
+MAX_DIFFERENCE_ERROR = 1e-8
+# the rank rises if zero singular values of C_q have larger derivatives than this, relative to those of C_q
+MIN_RANK_DERIVATIVE = 1e-6
 # smallest derivative of the rows along v that counts, relative to that along a velocity of the size of its tolerance
 MIN_CLARITY = 10.0
-# relative change of the rows: up to the state beside the start; within the first step that is tried
+# relative change of the rows. BESIDE_CHANGE: from the start to a state beside it; STEP_CHANGE: in the first trial step
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
-# number of states beside the start that are tried; largest correction of such a state, relative to its displacement
+# N_BESIDE: number of states beside the start to try; MAX_CORRECTION: their largest correction per displacement
 N_BESIDE, MAX_CORRECTION = 6, 0.2
 MAX_RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, relative to the right-hand side
 

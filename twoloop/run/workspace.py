@@ -40,7 +40,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# displacement of a coordinate or velocity x, relative to max(1, |x|), by which forces that depend on x are found
+# displacement of a coordinate or velocity x, relative to max(1, |x|), that shows which forces depend on x
 DISPLACEMENT = 1e-3
 # largest number of entries, and of operations, of sparse factors of Newton's matrix, relative to those of dense factors
 MAX_NEWTON_SHARE = 0.2
@@ -109,9 +109,10 @@ def _derivative_entries(
     return entries
 
 
-MASSLESS_RATIO = 1e-10  # eigenvalue of a body's M, relative to the largest, up to which its eigenvector has no mass
-# norm of a row's component along the massless directions of a body, relative to the row's norm, above which the row is
-# used to give one of these directions a mass
+# a direction of a body has no mass if its eigenvalue of M, relative to the largest one, is at most this
+MASSLESS_RATIO = 1e-10
+# a row gives a massless direction of a body a mass if the norm of the row's component along these directions, relative
+# to the norm of the row, is larger than this
 MIN_MASSLESS_FRACTION = 1e-3
 MIN_SIZE_NEWTON = 1.6  # number of coordinates, relative to LARGE, from which on Newton's matrix has sparse factors
 # largest number of entries, and of operations, of the static form, relative to those of dense factors

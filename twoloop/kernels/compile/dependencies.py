@@ -184,7 +184,7 @@ def is_twoloop(module: str) -> bool:
 LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
 FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback with the result of `frozen_values`
-NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that leave the value loaded last unused
+NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that do not use the value that was loaded last
 
 
 class FrozenValue(NamedTuple):

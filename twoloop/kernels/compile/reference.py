@@ -97,8 +97,8 @@ class Reference(types.Type):
     def table(self, values: Any) -> Any:
         """Return the table (int64) for the object `values`, whose attributes are the arrays and functions of this type.
 
-        The object must exist as long as the table is used. Its attributes for generated functions are addresses; 0 if a
-        function is missing.
+        The object must exist as long as the table is used. It holds a function compiled by numba as an object (None if
+        missing), but a generated function as its address (0 if missing).
         """
         words: list[int] = []
         for field, kind in self.arrays.items():

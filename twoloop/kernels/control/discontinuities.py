@@ -36,7 +36,7 @@ BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
 TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, relative to the slope times np.spacing(t)
-STEEPNESS = 4.0  # slope of C_t or b, relative to its mean over the step, above which a part of the step is a ramp
+STEEPNESS = 4.0  # a part of a step is a ramp if the slope of C_t or b, relative to its mean over the step, is larger
 MAX_RAMP_SHARE = 0.125  # longest ramp, relative to the step size, at which a step has to end
 MIN_SPACINGS = 8.0  # duration of an interval, in spacings of floating-point numbers, at which its bisection ends
 SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in an interval
@@ -160,7 +160,8 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-# ratio of second differences of samples to their range above which a change is sudden, as in pulses four spacings wide
+# a change is sudden if second differences of samples, relative to the range of the samples, are larger, as in pulses
+# four spacings wide
 SUDDEN_RATIO = 0.1
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
 # smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too
@@ -168,19 +169,19 @@ LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol ti
 LEAST_VALUE = 1e-150
 # least number of samples in a step: a force that acts for a quarter of the step may miss all stages
 MIN_SAMPLES_IN_STEP = 8.0
-RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one below which samples ahead are taken again
+RESAMPLE_BELOW = 0.25  # samples ahead are taken again if the required spacing, relative to the last one, is smaller
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
 EQUAL_CHANGES = 1e-5  # largest time between two changes that count as one, relative to the widest spacing of samples
-# time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
-# at zero, such as 1 - cos(t), look sudden
+# changes sooner after the start, relative to GAP, are not recorded: rounding errors make forces that begin at zero,
+# such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
-# smallest ratio of a sudden change to its neighbouring changes; on a smooth slope, the ratio is smaller
+# smallest ratio of a sudden change to the changes next to it; a smooth slope has a smaller ratio
 MIN_STEEPNESS_RATIO = 2.0
-SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
+SHORT_STEP = 0.5  # a discontinuity is suspected if the step size, relative to the longest of the last steps, is smaller
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
-# largest change of an acceleration, relative to the largest acceleration, while a velocity changes by its tolerance: if
-# the change is larger, the acceleration decays, see _acceleration_lasts
+# an acceleration decays, see _acceleration_lasts, if it changes by more than this, relative to the largest
+# acceleration, while a velocity changes by its tolerance
 MAX_LASTING_CHANGE = 0.5
 CHANGE_MARGIN = 0.01  # a change up to this time after a step's beginning, in spacings of samples, counts as passed
 LARGEST_ROW = N_SAMPLES + 1  # index of the row of w.changes with the largest absolute values so far, after the samples

@@ -106,7 +106,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 # constants of the power iterations in stiffness.py and run/messages.py, which estimate rho (1/s), the largest rate of
 # the motion; it follows from eigenvalues of dF/dq and dF/dv, where F are the accelerations
 DISPLACEMENT = 1e-6  # displacement in finite differences, relative to the largest coordinate or velocity
-INNER_TOL = 1e-8  # tolerance of Newton's method for positions that are projected onto the constraints
+INNER_TOL = 1e-8  # tolerance of Newton's method for the projection of positions onto the constraints
 
 
 def initial_direction(n_q: int) -> NDArray[np.float64]:

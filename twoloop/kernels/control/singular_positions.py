@@ -21,26 +21,26 @@ from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_ratio, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
-SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a singular position is suspected
-# step size, relative to the longest of the last steps, below which pivots of C_q are computed anew
+# a singular position is suspected if the step size, relative to the longest of the last steps, is smaller than this
+SHORT_STEP = 0.5
+# pivots of C_q are computed anew if the step size, relative to the longest of the last steps, is smaller than this
 COLLAPSED_STEP = 0.2
-# ratio of the smallest pivot of C_q to its largest value so far below which a singular position is near
+# a singular position is near if the smallest pivot of C_q, relative to its largest value so far, is smaller than this
 SINGULAR_PIVOT = 0.2
 STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
-# ratio of the smallest pivot to its largest value so far below which a rejected step of the static form is repeated
-# with projected stages
+# a rejected step of the static form is repeated with projected stages if the smallest pivot, relative to its largest
+# value so far, is smaller than this
 REPEAT_PIVOT = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
 MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, relative to the longest recent step
-# ratio of the smallest pivot to its largest value so far below which rounding determines accelerations, and a run ends
+# if the smallest pivot, relative to its largest value so far, is smaller, rounding spoils accelerations: the run ends
 UNDETERMINED_PIVOT = 1e-6
-# number of accepted steps between two checks of a partition, if steps (generated code) do not use it
-CHECK_INTERVAL = 16
+CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that generated code does not use
 # the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
 # freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
-# pivot at an end of a step, relative to its largest value so far, below which the step is checked
+# a step is checked if the pivot at one of its ends, relative to the largest pivot so far, is smaller than this
 MAX_UNCHECKED_PIVOT = 0.5
 # the smallest pivot counts as zero within a step if its smallest sample is below this fraction of its largest change
 # between two samples
@@ -48,8 +48,7 @@ PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: smallest and largest result of near_pivot_ratio; MAX_ROUNDING_ERROR: allowed rounding
 # error, in tolerances; EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-# static form: pivot at a step's end, relative to that at its start, below which the step is halved
-MIN_END_RATIO = 0.25
+MIN_END_RATIO = 0.25  # static form: a step is halved if the pivot at its end, relative to that at its start, is smaller
 
 
 @merged

@@ -73,28 +73,28 @@ FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
 NEGLIGIBLE_DAMPING = 1e-3  # product of step size and eigenvalue of dF/dv below which the power iterations for dF/dv end
 ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
-STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limit the step of the explicit method
+STABILITY_LIMIT = 3.0  # stability must limit the step of the explicit method if the ratio of h rho to LIMIT is larger
 # least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
 # needs finite differences, which take about eight evaluations per coordinate
 MIN_COST_PER_COORDINATE = 64.0
-TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in its evaluations
-# least cost of the run, relative to the cost of a trial, at which a trial that may be in vain can begin
+TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of this method
+# a trial that may be in vain begins only if the run has cost at least as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
-# cost of the run, in units of MIN_COST_IN_TRIALS trials, at which a trial begins whatever the rates are; this number is
-# multiplied by k + 1 after k trials
+# after k trials, a trial begins whatever the rates are if the run has cost k + 1 times this number, in units of
+# MIN_COST_IN_TRIALS trials
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
 QUIET_FACTOR = 10.0  # largest velocity, in tolerances, of oscillations that steps at the stability limit excite
-MIN_HIDDEN_RATIO = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
+MIN_HIDDEN_RATIO = 0.05  # to damp a hidden rate may allow longer steps if the ratio of h rho to LIMIT is larger
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
-RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
+RETURN_BELOW = 0.4  # the explicit method is tried again if the ratio of h rho to LIMIT is smaller than this
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method
 TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
-N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial whose cost is not measured
+N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # ratio of the cost per second before a trial to that on trial above which the trial has succeeded
+MIN_GAIN = 1.2  # a trial has succeeded if the cost per second before it is more than this factor times that on trial
 N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial
@@ -392,7 +392,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
         memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + FIRST_ESTIMATE * options[COST_RATIO]
     if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        phase = -1
+        phase = -1  # phase that begins now; -1: the present phase continues
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
             phase = _judge_trial(w, options, memory, t)
         elif w.counters[N_EVALUATIONS] >= memory[NEXT_ESTIMATE]:

@@ -106,14 +106,13 @@ def gather_independent_columns(G, rate, rows, independent, D):
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
 ROUNDING_DISAGREEMENT = 1e-9  # largest relative difference of Gamma with the steps e and 2 e that rounding may cause
-# the step e is doubled if the relative difference of Gamma with the steps e and 2 e is smaller than this, because
-# rounding errors are smaller with a larger step
+# the step e is doubled if values of Gamma with the steps e and 2 e differ by less, relatively: a larger step causes
+# smaller rounding errors
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-# step of one-sided differences, relative to that of central differences, whose order is higher, 4 instead of 2
-ONE_SIDED_STEP_RATIO = 1.0 / 16.0
-# rounding error of Gamma if terms of the sum G v cancel, relative to the ratio of the largest term to the largest step
+ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # step of one-sided differences (order 2), relative to that of central ones (order 4)
+# rounding error of Gamma, relative to the largest term of G v divided by the largest step, if such terms cancel
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this times the required accuracy
 

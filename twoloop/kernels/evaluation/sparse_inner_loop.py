@@ -82,8 +82,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-# rows whose pivots are smaller than this, relative to the size of the row, are checked: such a pivot may be only a
-# rounding error
+# rows with smaller pivots, relative to the size of the row, are checked: such pivots may be rounding errors
 SUSPECT_PIVOT = 1e-6
 MIN_PIVOT = 1e-10  # smallest pivot, relative to the size of its row, with which factors by 1-by-1 pivots are accurate
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows is at most this

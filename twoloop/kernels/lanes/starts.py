@@ -36,10 +36,10 @@ from twoloop.kernels.lanes.layout import (
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # eigenvalue of G G^T below which a combination of rows counts as redundant
-# number of inverse iterations for each row of Z; few are enough, because the eigenvalues of redundant combinations of
-# rows are much smaller than the others
+# number of inverse iterations for each row of Z: few, because eigenvalues of redundant combinations are much smaller
+# than the others
 N_REDUNDANT_ITERATIONS = 5
-# fractional parts of its multiples are irregular start values of inverse iterations
+# multiples of this number, modulo 1, are irregular start values of inverse iterations
 GOLDEN_SECTION = 0.6180339887498949
 
 
@@ -151,9 +151,8 @@ def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factor
             _remove_redundant_components(work, n_rows, w, Z, z, scratch)
         normalise_vector(work, z, n_rows, scratch)
         for k in range(LANES):
-            if (
-                not work[scratch * LANES + k] < MAX_REDUNDANT_EIGENVALUE
-            ):  # `scratch` is now the eigenvalue plus ITERATION_SHIFT
+            # `scratch` is now the eigenvalue plus ITERATION_SHIFT
+            if not work[scratch * LANES + k] < MAX_REDUNDANT_EIGENVALUE:
                 work[z * LANES + k] = np.nan
 
 
@@ -219,8 +218,8 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# largest difference between the projection of displaced positions and its linear prediction by C_q, relative to the
-# displacement, for which no other assembly of the mechanism can be as near
+# no other assembly can be as near if the projection of displaced positions differs from its linear prediction by C_q by
+# at most this, relative to the displacement
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`

@@ -9,8 +9,7 @@ from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl
 
 # rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# orthogonalisation is repeated if the squared norm of the orthogonal part of a row, relative to that of the row, is
-# below this
+# a row is orthogonalised again if the squared norm of its orthogonal part, relative to its own, is smaller than this
 REORTHOGONALISE_BELOW = 0.5
 
 

@@ -62,8 +62,8 @@ def store_rounding_errors(rounding):
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
 MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_order` has failed; the paper has no limit
-# largest ratio of a change to the first change in a convergent iteration; changes may grow at first, because the
-# iteration matrix is not normal
+# an iteration diverges if a change exceeds the first change by more than this factor; changes may grow at first,
+# because the iteration matrix is not normal
 MAX_GROWTH = 1e3
 MIN_ITERATIONS = 8  # number of iterations after which a change that exceeds the previous change means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)

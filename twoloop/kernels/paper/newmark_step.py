@@ -9,8 +9,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# factor of increase of the largest |coordinate| so far, above which _motion_rate treats a step as a start from rest at
-# the origin
+# _motion_rate assumes a start from rest at the origin if the largest |coordinate| grows by more than this factor
 GROWTH_AFTER_REST = 2.0
 TINY = 1e-300  # added to the tolerance, which is zero for a mechanism at rest at the origin
 

@@ -47,14 +47,15 @@ CONVERGED_CHANGE = 0.01
 # the iteration has also converged if a sweep changes accelerations by at most STALL_CHANGE tolerances, and by at least
 # STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
-MAX_SWEEPS, FEW_SWEEPS = 40, 12  # largest number of sweeps, and number of sweeps after which more nodes are left out
-# factor on the limit of the pivot below which nodes are left out, after FEW_SWEEPS sweeps that have not converged
+# MAX_SWEEPS: largest number of sweeps; FEW_SWEEPS: number of sweeps after which more nodes are left out
+MAX_SWEEPS, FEW_SWEEPS = 40, 12
+# nodes with pivots below a limit are left out; after FEW_SWEEPS sweeps without convergence, this multiplies the limit
 DISTANCE_FACTOR = 2.0
-MAX_LEFT_OUT_NODES = 9  # number of left-out nodes above which the step fails
+MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of
 # `begin_polynomial`. BEGIN, DURATION, END (s): those of the polynomial of the last converged attempt; END = -inf: none
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
-# duration of the shortest and longest part of the polynomial that is taken as one step, relative to the polynomial
+# shortest and longest part of the polynomial that one step takes, relative to its duration
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 # longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
 NODE_GAP = 0.0767

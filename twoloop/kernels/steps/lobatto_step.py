@@ -72,12 +72,12 @@ SAFETY = 0.75  # factor on the step size for which the estimated error would equ
 MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as stiff, and another method takes over
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations count as hardly varying within a step
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
-MIN_PIVOT_RATIO = 0.4  # ratio of a pivot within a step to that at its beginning below which a singular position is near
-# smallest tolerance with which this method continues after a singular position; with smaller tolerances, another method
-# takes over, because five more runs of the benchmark A02 were wrong
+MIN_PIVOT_RATIO = 0.4  # a singular position is near if a pivot in a step, relative to that at its beginning, is smaller
+# after a singular position, another method takes over if a tolerance is smaller: five more runs of the benchmark A02
+# would be wrong
 TIGHT_TOLERANCE = 1e-8
-# value of the field FAILURES at which another method takes over; a step whose iteration does not converge adds 2 to the
-# field, an accepted step subtracts 1
+# another method takes over if the field FAILURES reaches this value; a step whose iteration does not converge adds 2 to
+# the field, an accepted step subtracts 1
 MAX_FAILURES = 12.0
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps

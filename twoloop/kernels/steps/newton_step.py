@@ -43,7 +43,7 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
-# ratio of the last two Newton corrections of a step above which the next step computes new derivatives
+# the next step computes new derivatives if the ratio of the last two Newton corrections is larger than this
 SLOW_CONTRACTION = 0.05
 # largest Newton correction, relative to max(1, |value|), that counts as a rounding error in steps of fixed size
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9

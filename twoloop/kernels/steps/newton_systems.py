@@ -99,7 +99,7 @@ from twoloop.kernels.steps.stages import (
 )
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
-# relative difference of step sizes that count as equal: as differences of times, they have rounding errors
+# relative difference up to which step sizes count as equal, because rounding errors of times change them
 EQUAL_STEP_TOLERANCE = 1e-9
 # largest Newton correction, relative to the smallest tolerance, that counts as a rounding error if it does not decrease
 MAX_ROUNDING_CORRECTION = 0.1

@@ -81,7 +81,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     TRIED,  # 1: the last attempt has computed the series about its end, the current series if the attempt is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
     TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
-    # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_DISTANCE; 0: not known yet
+    # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_DEPARTURE; 0: not known yet
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts, which determines the times within a step at which the defect is evaluated
     SUSPECTED,  # 1: the run has not passed the time SUSPECT yet, at which the defect of a rejected step was too large
@@ -371,9 +371,9 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-# distance from the constraints, relative to the largest distance that `departure` allows, at which a step should end
-# before its projection: step sizes are chosen for this distance
-TARGET_DISTANCE = 0.3
+# step sizes are chosen for this result of `departure`: distance from the constraints before the projection, relative to
+# the allowed distance
+TARGET_DEPARTURE = 0.3
 # a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
 # times the defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
@@ -542,7 +542,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
-        error = x / memory[ALLOWED_SIZE]  # if at most 1, this bounds the error, which is a higher power of the ratio
+        error = x / memory[ALLOWED_SIZE]  # an upper bound if at most 1: the error is about a power of this ratio
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
@@ -570,10 +570,9 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(DONE, 0.0, 0.0)
     distance = departure(w, tolerances, h, q, v, q1)
     memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
-    if (
-        distance > 0.0
-    ):  # if MAX_GROWTH or a force ahead shortened the step, x / ALLOWED_SIZE counts as at least 1 / MAX_GROWTH
-        allowed_factor = (TARGET_DISTANCE / distance) ** (1.0 / order)
+    if distance > 0.0:
+        # if MAX_GROWTH or a force ahead shortened the step, x / ALLOWED_SIZE counts as at least 1 / MAX_GROWTH
+        allowed_factor = (TARGET_DEPARTURE / distance) ** (1.0 / order)
         memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / MAX_GROWTH) * allowed_factor)
     if distance > 1.0:
         return Attempt(DONE, distance, allowed_factor)

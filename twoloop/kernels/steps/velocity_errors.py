@@ -20,12 +20,12 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# largest factor on the duration of a velocity error that changes as slowly as the motion, because it is not due to a
-# vibration, and has the same sign in later steps, so that the errors add up
+# a velocity error that changes as slowly as the motion is not due to a vibration: it has the same sign in later steps,
+# so that errors add up. Therefore its duration is multiplied by a factor, at most this one
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, in units of tolerances[GAP]
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
-FAST_DURATION = 20.0  # duration of a velocity error, in units of z = h gamma, below which the error may change fast
+FAST_DURATION = 20.0  # a velocity error may change fast if its duration, in units of z = h gamma, is smaller than this
 OUTDATED_CHANGE = 0.3  # relative change of J above which J counts as outdated
 
 
