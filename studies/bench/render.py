@@ -46,7 +46,13 @@ def power(value: float) -> str:
 
 def brief(stamp: str) -> str:
     """Command, date, commit and machine of a stamp; the first line of the CSV has the versions, too."""
-    return "; ".join(stamp.split("; ")[:4])
+    parts = [""]
+    for part in stamp.split("; "):  # those in parentheses belong together
+        if parts[-1].count("(") > parts[-1].count(")"):
+            parts[-1] += f"; {part}"
+        else:
+            parts.append(part)
+    return "; ".join(parts[1:5])
 
 
 def percent(share: float) -> str:

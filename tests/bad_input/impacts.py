@@ -90,7 +90,7 @@ IMPACTS = [
     of_step("`inputs=[1.0]` of four", step(inputs=[1.0]), "inputs must be all 4 parameters", "give all, or a mapping"),
     of_step("an input that is not finite", step(inputs={0: np.nan}), "inputs must be finite", "look at the controller"),
     of_step("a length that changes on the way", step(inputs={0: 1.5})).says("inputs must enter forces alone; that at place 0 enters", "`start` anew with other parameters"),
-    of_step("`method='Taylor'`", lambda: Integrator(LINKAGE.system, "Taylor").start(0.0, LINKAGE.q0, LINKAGE.v0)).says("must not be 'Taylor'", "take the default"),
+    *(of_step(f"`method={name!r}`", lambda name=name: Integrator(LINKAGE.system, name).start(0.0, LINKAGE.q0, LINKAGE.v0)).says(f"must not be {name!r}", "take the default") for name in ("Taylor", "Lobatto16")),
     of_step("`compiled=True`").when(lambda: Integrator(LINKAGE.system, compiled=True).start(0.0, LINKAGE.q0, LINKAGE.v0)).says("start takes no compiled", "leave it out"),
     of_spatial("friction of a stop in space", rubs_in_space).says("must be zero, as stops rub in the plane only", "leave it out, or make the model in a plane"),
     of_stops("friction without a slide", lambda: Stop(lambda t, q: q[0], friction=0.3)).says("slide of 'stop' must be a function of t and q, as it rubs", "give slide(t, q), the position of the point along the surface", TypeError),

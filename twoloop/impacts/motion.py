@@ -40,6 +40,7 @@ from twoloop.impacts.friction import (
 )
 from twoloop.impacts.joined import Impact, join_arcs
 from twoloop.impacts.sequence import Impacts, ImpactWarning, Sequence
+from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.taylor import Taylor
@@ -565,7 +566,7 @@ class Motion:
 
 def options_without_traces(options: dict[str, Any]) -> dict[str, Any]:
     """Return changed options, `method` and `compiled`, for arcs with closed stops: their callbacks cannot be traced."""
-    method = PRESETS["auto"] if isinstance(check_method(options["method"]), Taylor) else options["method"]
+    method = PRESETS["auto"] if isinstance(check_method(options["method"]), Taylor | Lobatto16) else options["method"]
     return {"method": method, "compiled": False}
 
 
@@ -610,7 +611,7 @@ def solve_with_stops(
     ----------
     system, t_span, q0, v0, method, rtol, atol
         As for `solve_dae`. The gaps must not be negative at the start. While stops are closed, "auto" takes the place
-        of "Taylor", which cannot trace their forces, `compiled=True` has no effect, and "Lobatto16" is refused.
+        of "Taylor" and "Lobatto16", which need traces of their forces, and `compiled=True` has no effect.
     stops : Stop or sequence of Stop
         E.g. `Stop(lambda t, q: q[1], restitution=0.5)`, or `problem.stops` of a model.
     t_eval : array_like, optional

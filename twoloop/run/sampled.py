@@ -19,6 +19,7 @@ from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.methods.auto import Auto
+from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
@@ -91,10 +92,9 @@ class SampledRun:
         q0: Array,
         v0: Array,
     ):
-        if isinstance(method, Taylor):
-            raise ValueError(
-                "method of start and step must not be 'Taylor', whose series are made for given parameters"
-            )
+        if isinstance(method, Taylor | Lobatto16):
+            name = type(method).__name__
+            raise ValueError(f"method of start and step must not be {name!r}, whose code is made for given parameters")
         if isinstance(method, Auto):
             method = replace(method, series=None, n_rows=system.n_c + system.n_a)
         check_start(
