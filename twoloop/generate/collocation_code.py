@@ -273,10 +273,7 @@ class CollocationCode:
             inner_emit, (work, state, tolerances, numbers) = emit.for_builder(builder), builder.arguments
             inner_emit.numbers = inner_emit.constants = numbers
             self._call(inner_emit, "begin_nodes", self._predict_nodes, [work, state, tolerances])
-            mass_first, not_computed = (
-                self._evaluator(inner_emit, work, -1),
-                constant(DOUBLE, float(mem.NOT_COMPUTED)),
-            )
+            mass_first, not_computed = self._evaluator(inner_emit, work, -1), constant(DOUBLE, float(mem.NOT_COMPUTED))
             builder.ret(self._iterate(inner_emit, work, state, tolerances, mass_first, lambda: not_computed))
         return name
 
@@ -489,9 +486,7 @@ class CollocationCode:
         because the estimate is of order 12.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
-        n_sweeps, change, target, rho = (
-            num.load(work, place) for place in (mem.SWEEPS, mem.CHANGE, mem.TARGETED, mem.RHO)
-        )
+        n_sweeps, change, target, rho = (num.load(work, i) for i in (mem.SWEEPS, mem.CHANGE, mem.TARGETED, mem.RHO))
         vec2 = LaneEmitter(builder, 2)
         error_to_kappa = num.divide(num.multiply(rho, change), constant(DOUBLE, KAPPA))
         error_to_kappa = num.add(error_to_kappa, constant(DOUBLE, SMALLEST_RATIO))
@@ -736,11 +731,9 @@ class CollocationCode:
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
         """Return the sum of the rows of a table, multiplied by `terms`; two independent partial sums are faster."""
-        sums = [
-            emit.multiply(emit.broadcast(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)
-        ]
-        for k, (term, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
-            sums[(k + 1) % 2] = emit.fma(emit.broadcast(term), constants(row), sums[(k + 1) % 2])
+        sums = [emit.multiply(emit.broadcast(x), constants(row)) for x, row in zip(terms[:2], table[:2], strict=True)]
+        for k, (x, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
+            sums[(k + 1) % 2] = emit.fma(emit.broadcast(x), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)
 
     def _polynomial_pointer(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
@@ -749,10 +742,8 @@ class CollocationCode:
         is_second = builder.compare(
             "fcmp one" if not other else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO
         )
-        polynomial_size = LANES * len(self.iterated_coordinates)
-        offset = builder.select(
-            is_second, integer(self.polynomial_offset + polynomial_size), integer(self.polynomial_offset)
-        )
+        size = LANES * len(self.iterated_coordinates)
+        offset = builder.select(is_second, integer(self.polynomial_offset + size), integer(self.polynomial_offset))
         return num.pointer(work, offset)
 
 

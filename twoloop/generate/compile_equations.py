@@ -169,9 +169,8 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# numbers of operations above which equations are split into functions, which halves the time to compile. SPLIT_ALL
-# replaces SPLIT_PROJECTIONS if there is no reduced program for the accelerations: they are then split, too, and take
-# 50 % longer to run
+# equations with more operations than this are split into functions, which halves the time to compile. SPLIT_ALL applies
+# if there is no reduced program for the accelerations: they are then split, too, and take 50 % longer to run
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 

@@ -213,17 +213,15 @@ class PivotChooser:
         lose up to 2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times
         as large as M, k digits are lost, which refinement restores. `index`: index in MIN_PIVOTS of the choice for M.
         """
-        last_choice = self._last_choice
-        rows = G[list(last_choice.rows)]
+        last = self._last_choice
+        rows = G[list(last.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
         scratch, chosen = np.zeros_like(self._scratch), np.zeros_like(self._row_indices)
         new_index = self._kernel(mass + scale * rows.T @ rows, G, RANK_TOL, 0.0, START_LIMITS, scratch, chosen)
-        if not 0 <= new_index <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last_choice.rows):
-            return last_choice
+        if not 0 <= new_index <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
+            return last
         min_pivot = float(MIN_PIVOTS[new_index])
-        return replace(
-            last_choice, added_rows=last_choice.rows, scale=float(scale), min_pivot=min_pivot, is_refined=True
-        )
+        return replace(last, added_rows=last.rows, scale=float(scale), min_pivot=min_pivot, is_refined=True)
 
     def _decode(self, index: int) -> PivotChoice:
         """Return the choice that `self._row_indices` describes; raise Untraceable if `index` is an error code."""
@@ -409,9 +407,7 @@ class Elimination:
         """Return the program for "r", Q, and "c", the right-hand sides of the rows of G."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
-        return Program(
-            self.graph, {"r": force, "c": [value if k in used else self.zero for k, value in enumerate(gamma)]}
-        )
+        return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> list[Affine]:
         """Return a list of the accelerations and the multipliers of the independent rows, at velocities v."""

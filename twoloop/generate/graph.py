@@ -489,8 +489,8 @@ class Derivative:
     def _differentiate_quantity(self, i: int) -> Affine:
         stack = [i]  # an explicit stack, as products may be nested more deeply than Python allows recursion
         while i not in self._derivatives:
-            operation = self.graph.operations[stack[-1]]
-            exprs = () if operation is None else [expr for expr in operation[1:] if isinstance(expr, Affine)]
+            op = self.graph.operations[stack[-1]]
+            exprs = () if op is None else [expr for expr in op[1:] if isinstance(expr, Affine)]
             missing = [
                 k
                 for expr in exprs
@@ -502,9 +502,7 @@ class Derivative:
                 continue
             k = stack.pop()
             if k not in self._derivatives:
-                change = (
-                    Affine(self.graph, 0.0, {}) if operation is None else self._differentiate_operation(k, *operation)
-                )
+                change = Affine(self.graph, 0.0, {}) if op is None else self._differentiate_operation(k, *op)
                 self._derivatives[k] = change.as_term()
         return self._derivatives[i]
 

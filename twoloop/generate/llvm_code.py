@@ -286,8 +286,7 @@ def write(
 
 LARGEST_ANGLE = 1e6  # largest accepted angle, rad: for larger angles, HALF_PI as a sum of two numbers is not accurate
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # pi/2 as a sum: angles are reduced by multiples of pi/2
-# coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from S. Moshier's Cephes
-# library, sin.c
+# coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from Moshier's Cephes, sin.c
 SINES = (
     -1.66666666666666307295e-1,
     8.33333333332211858878e-3,

@@ -92,11 +92,8 @@ class Factors:
             self.mass_pivots.append(determinant)
         else:
             self.conditions.append((determinant, (a * diagonal[1]).as_term()))
-        inverse = determinant.reciprocal()
-        return [
-            [(c * inverse).as_term(), (-b * inverse).as_term()],
-            [(-b * inverse).as_term(), (a * inverse).as_term()],
-        ]
+        factor = determinant.reciprocal()
+        return [[(c * factor).as_term(), (-b * factor).as_term()], [(-b * factor).as_term(), (a * factor).as_term()]]
 
     def solve(self, rhs: Sequence[Affine]) -> list[Affine]:
         """Return the solution of the linear system for a right-hand side."""
@@ -322,9 +319,7 @@ class DependentCoordinates:
             squares = _add_products(self._zero, [(entry, entry) for entry in column])
             self.conditions.append((pivot * pivot, squares.times(MIN_PIVOT_SQUARE)))
         else:
-            a, b = (
-                _add_products(self._zero, [(x, x) for x in column]).as_term() for column in zip(*block, strict=True)
-            )
+            a, b = (_add_products(self._zero, [(x, x) for x in pair]).as_term() for pair in zip(*block, strict=True))
             self.conditions.append((pivot * pivot, (a * b).times(MIN_PIVOT_SQUARE)))
 
     def _substitute(self, j: int, row: Terms) -> None:
@@ -350,9 +345,7 @@ def solve_reduced_system(
     matrix: dict[tuple[int, int], Affine] = {}
     coordinates.check_length(sum(len(row) ** 2 // 2 for row in T))  # operations of T^T M T, if M is diagonal
     for a, x in enumerate(independent):
-        mass_T = [
-            _add_products(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).as_term() for row in rows
-        ]  # M T
+        mass_T = [_add_products(zero, ((m, T[j][x]) for m, j in row if x in T[j])).as_term() for row in rows]  # M T
         for b, y in enumerate(independent[: a + 1]):
             inertia = _add_products(zero, ((T[i][y], mass_T[i]) for i in range(n) if y in T[i])).as_term()
             if a == b or not is_zero(inertia):
@@ -360,7 +353,7 @@ def solve_reduced_system(
     rhs = [_add_products(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).as_term() for x in independent]
     factors = Factors(matrix, len(independent), len(independent))
     solution = dict(zip(independent, factors.solve(rhs), strict=True))
-    accelerations = [g[i] + _add_products(zero, ((entry, solution[x]) for x, entry in T[i].items())) for i in range(n)]
+    accelerations = [g[i] + _add_products(zero, ((m, solution[x]) for x, m in T[i].items())) for i in range(n)]
     return accelerations, list(_pivot_conditions(matrix, factors))
 
 

@@ -99,9 +99,7 @@ class ParameterTape(SymbolicObject):
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
         self.atoms: list[Any] = [None] * len(values)
-        self._merged_products: dict[
-            tuple[Powers, Powers], Powers
-        ] = {}  # cache: product of two Powers, by the pair of factors
+        self._merged_products: dict[tuple[Powers, Powers], Powers] = {}  # cache: product of two Powers, by its factors
         self._atom_indices: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]

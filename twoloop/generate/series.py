@@ -301,15 +301,12 @@ def _assemble_program(
 def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any]]:
     """Return the operations that `exprs` need, as (quantity, operation), each sine with the cosine of its angle."""
     needed = set(graph.quantities_for(exprs))
-    trigonometric_kinds = (SINE, COSINE)
-    angles = {
-        each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trigonometric_kinds
-    }
+    trig_kinds = (SINE, COSINE)
+    angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trig_kinds}
     return [
         (i, operation)
         for i, operation in enumerate(graph.operations)
-        if operation is not None
-        and (i in needed or (operation[0] in trigonometric_kinds and operation[1].key in angles))
+        if operation is not None and (i in needed or (operation[0] in trig_kinds and operation[1].key in angles))
     ]
 
 

@@ -296,9 +296,7 @@ class Equations:
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._expressions: dict[str, Any] = {}
-        self._results_before_copy: dict[
-            str, Any
-        ] = {}  # results of callbacks that were traced before this graph was copied
+        self._results_before_copy: dict[str, Any] = {}  # results of callbacks traced before this graph was copied
 
     def trace_all(self) -> "Equations":
         """Trace the callbacks of the system that can be traced, so that copies share the results; return self."""

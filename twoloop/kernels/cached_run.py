@@ -135,8 +135,7 @@ def _is_within_bounds(t, rows, bounds):
 def split_steps(steps, counts, h, changes, used_newton):
     """Fill `h` with step sizes (s), `changes` with changes of counters, and `used_newton` with flags of Newton steps.
 
-    `steps`: rows of out_steps; `counts`: numbers of rejections and partitions, before the steps on entry, after them on
-    return.
+    `steps`: rows of out_steps; `counts`: numbers of rejections and partitions, on entry before the steps, then after.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -287,11 +286,9 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
         return REFUSED
     w.notes[indices.KINK_AFTER] = t1
     if b.control[at.FIXED_STEP] == 0.0:
-        span, first, within = t1 - t, b.constants[FIRST], b.constants[EVALUATES_WITHIN] > 0.0
+        span, h, within = t1 - t, b.constants[FIRST], b.constants[EVALUATES_WITHIN] > 0.0
         _set_step_limits(b.control, b.tolerances, span, b.constants[LONGEST], within)
-        b.clock[at.H_NEXT] = min(
-            first if first > 0.0 else _first_step_size(b.state, n, t, span, b.constants[LEAST]), span
-        )
+        b.clock[at.H_NEXT] = min(h if h > 0.0 else _first_step_size(b.state, n, t, span, b.constants[LEAST]), span)
         b.control[at.SHORTEST] = SHORTEST_STEP * b.clock[at.H_NEXT]
     _copy_vector(w.rows_v, b.start_rows)
     return 0

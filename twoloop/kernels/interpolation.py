@@ -332,14 +332,12 @@ def fill_accelerations(f, w, times, states, out):
 
 
 @kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
-def fill_intervals(
-    f, w, options, memory, initial_memory, tolerances, state, new_state, t, states, intervals, out_t, out
-):
+def fill_intervals(f, w, options, memory, memory_0, tolerances, state, new_state, t, states, intervals, out_t, out):
     """Store states within intervals, computed by equal steps of the method; return the number of failed intervals.
 
     `intervals` are the indices of the intervals. For each interval, `out_t` (times) and `out` (states) get equally many
     rows: the first state, the interior states, and the last state. If an interval fails, its first time becomes NaN.
-    `initial_memory` is the method's memory at the start of a run.
+    `memory_0` is the method's memory at the start of a run.
     """
     n = w.Q.size
     n_rows = out_t.size // intervals.size
@@ -347,7 +345,7 @@ def fill_intervals(
     for g in range(intervals.size):
         i, first = intervals[g], g * n_rows
         last = first + n_rows - 1
-        copy(initial_memory, memory)
+        copy(memory_0, memory)
         state[:] = 0.0
         copy(states[i], state[: 3 * n])
         out_t[first], out_t[last] = t[i], t[i + 1]
@@ -361,7 +359,7 @@ def fill_intervals(
                 h = out_t[r] - t_before
                 code, _, _ = f.attempt(f, w, options, memory, t_before, h, tolerances, state, new_state)
                 if code != DONE and renew_partition(f, w, t_before, state[:n]) == DONE:
-                    copy(initial_memory, memory)
+                    copy(memory_0, memory)
                     code, _, _ = f.attempt(f, w, options, memory, t_before, h, tolerances, state, new_state)
                 f.settle(f, w, options, memory, tolerances, True)
             copy(new_state, state)

@@ -29,9 +29,8 @@ class Static(NamedTuple):
     dense_jacobian: bool  # whether a callback fills a full matrix with C_q, from which the entries are copied
 
 
-# arguments of _create_layout: n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T is used, whether the
-# augmented matrix is used, number of nodes of the traced programs, sizes of the static form (None: another form),
-# length of `matrices`
+# arguments of _create_layout: n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T and the augmented matrix are
+# used, number of nodes of the traced programs, sizes of the static form (None: another form), length of `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
@@ -255,9 +254,7 @@ def _create_layout(
             word = WORK.offsets[name]
             table[word], mask[word] = WORD * begin, 1
             table[word + 1 : word + 1 + len(shape)] = shape
-    named_ranges = [
-        [(name, *begin_end_shape) for name, begin_end_shape in ranges.items()] for ranges in (of_numbers, of_integers)
-    ]
+    named_ranges = [[(name, *entry) for name, entry in ranges.items()] for ranges in (of_numbers, of_integers)]
     return Layout(named_ranges[0], named_ranges[1], n_numbers, n_integers, *n_lasting, table, masks[0], masks[1])
 
 

@@ -674,11 +674,9 @@ def _run_from(
     check: Callable[[CallbackTraces], None],
 ) -> tuple[Run, GeneratedCode | None]:
     """Return a new run that begins at a state, and the generated code that it calls."""
-    has_fixed_step = options.step_size is not None
-    code = code_for(system, options.method, has_fixed_step, options.compiled, t, q, check)
-    plan, interiors = plans_for(
-        system, options.method, options.rtol, float(options.atol.min()), has_fixed_step, code, check
-    )
+    fixed = options.step_size is not None
+    code = code_for(system, options.method, fixed, options.compiled, t, q, check)
+    plan, interiors = plans_for(system, options.method, options.rtol, float(options.atol.min()), fixed, code, check)
     if derived:
         plan = plan.changed(traced=(*plan.traced, *derived))
     return Run(system, plan, t, q, v, options.rtol, options.atol, options.step_size, interiors), code

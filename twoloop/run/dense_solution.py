@@ -255,8 +255,7 @@ class Interpolator:
     def _repair_interval(self, table: StateTable, group: Groups, smallest: float) -> None:
         """Cache other states for the polynomial of an interval if they reduce its residual, `smallest` on entry.
 
-        Three sets are tried: states of a step across a singular position, states of N_REPAIR_STEPS steps, and only the
-        two ends of the interval.
+        Sets to try: states of a step across a singular position, states of N_REPAIR_STEPS steps, and only the two ends.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
@@ -389,14 +388,11 @@ class Interpolator:
 
     def fill_accelerations(self, times: Array, states: Array, out: Array) -> None:
         """Store [a, lam] in `out` for states on the constraints, given `times` and rows [q, v]; NaN on failure."""
-        compute, times, states = (
-            entry_point(self.kernels.fill_accelerations),
-            *map(np.ascontiguousarray, (times, states)),
-        )
-        failures = compute(self.kit, self.work, times, states, out)
+        fill, times, states = entry_point(self.kernels.fill_accelerations), *map(np.ascontiguousarray, (times, states))
+        failures = fill(self.kit, self.work, times, states, out)
         if failures > 0 and self.static_form is not None:
             self._switch_to_dense_form()
-            failures = compute(self.kit, self.work, times, states, out)
+            failures = fill(self.kit, self.work, times, states, out)
         self.failures = failures
         if failures > 0 and self.warns:
             _warn_of_lost_rank(

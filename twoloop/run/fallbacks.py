@@ -65,8 +65,7 @@ MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
     """Return the state [q, v] right after a jump of C_t or b at t; None if no velocities satisfy the constraints.
 
-    Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0. Of all velocities that the constraints allow, v+ is nearest to
-    v in the metric of M.
+    Solve M (v+ - v) + G^T p = 0, G v+ + (C_t, b) = 0: of all allowed velocities, v+ is nearest to v in the metric of M.
     """
     q = corrected_positions(system, t, q)
     equations, norms, largest = scaled_equations(system, t, q)
@@ -222,9 +221,7 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
         max_size = min(max_size, time_left)
     first_size = max(h_long, min(run.mirrored_size, LARGER_RATIOS[-1] * h_long))
     run.sizes_to_try = [size for size in sizes_across(first_size, max_size) if size > min_size]
-    run.larger_sizes = [
-        h_long * part for part in LARGER_RATIOS if max(first_size, min_size) < h_long * part <= max_size
-    ]
+    run.larger_sizes = [h_long * r for r in LARGER_RATIOS if max(first_size, min_size) < h_long * r <= max_size]
     if not run.sizes_to_try:
         run.sizes_to_try, run.larger_sizes = run.larger_sizes or [min(first_size, max_size)], []
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
@@ -243,21 +240,17 @@ def _find_base(run: Run, past: list[TimedState]) -> tuple[TimedState | None, flo
     farthest = distance_now = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
     scale = distance_now / singular_value if singular_value > 0.0 else np.inf
     base: TimedState | None = None
-    step_size, max_age = 0.0, MAX_AGE_IN_H_LONG * float(run.clock[a.H_LONG])
+    size, max_age = 0.0, MAX_AGE_IN_H_LONG * float(run.clock[a.H_LONG])
     for time, state in reversed(past):
         distance = scale * least_singular_value(run.system, time, state[:n], run.rank)
-        if (
-            (farthest >= FAR_BEFORE and step_size > 0.0)
-            or distance < MIN_DISTANCE_RATIO * farthest
-            or t - time > max_age
-        ):
+        if (farthest >= FAR_BEFORE and size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > max_age:
             break
         if distance > farthest:
-            step_size = 2.0 * distance_now * (t - time) / (distance - distance_now)
-            max_age = max(max_age, MAX_AGE_IN_MIRRORED * step_size)
+            size = 2.0 * distance_now * (t - time) / (distance - distance_now)
+            max_age = max(max_age, MAX_AGE_IN_MIRRORED * size)
             if farthest < FAR_BEFORE:
-                farthest, base, step_size = distance, (time, state.copy()), step_size + t - time
-    return base, step_size
+                farthest, base, size = distance, (time, state.copy()), size + t - time
+    return base, size
 
 
 def sizes_across(longest: float, allowed: float) -> list[float]:

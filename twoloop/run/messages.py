@@ -198,8 +198,7 @@ def _dominant_eigenvalue(
     return eigenvalue, is_negative
 
 
-# messages call C_q (or M) singular if the ratio of its smallest to its largest singular value (or inertia) is at most
-# this
+# messages call C_q (or M) singular up to this ratio of the smallest to the largest singular value (or inertia)
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not to be trusted if rounding errors of velocities (or accelerations) exceed this number of tolerances
 MAX_LASTING_ERROR = 100.0
@@ -307,10 +306,7 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
             "rtol and atol, or shorten t_span.",
         )
     if code == OUT_OF_TIME:
-        return (
-            Status.TIME_LIMIT,
-            f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span.",
-        )
+        return Status.TIME_LIMIT, f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span."
     if code == STAGNATED:
         return Status.STAGNATED, f"{stopped}: {_describe_stall(run, t1, stall)}"
     if code == a.AT_DISCONTINUITY:

@@ -150,15 +150,9 @@ class ParametricRun:
 
     def _with_parameter_arrays(self, plan: Plan) -> Plan:
         """Return a copy of a plan in which arrays that `_fill_arrays` fills replace arrays of expressions."""
-        array, plan_fields = self._expression_arrays.array, vars(plan)
-        changes: dict[str, Any] = {
-            name: array(plan_fields[name]) for name in NUMBER_FIELDS if plan_fields[name] is not None
-        }
-        changes |= {
-            name: self._with_parameter_arrays(plan_fields[name])
-            for name in PLAN_FIELDS
-            if plan_fields[name] is not None
-        }
+        array, values = self._expression_arrays.array, vars(plan)
+        changes: dict[str, Any] = {name: array(values[name]) for name in NUMBER_FIELDS if values[name] is not None}
+        changes |= {name: self._with_parameter_arrays(values[name]) for name in PLAN_FIELDS if values[name] is not None}
         return plan.changed(traced=tuple(each.with_coefficients(array) for each in plan.traced), **changes)
 
 

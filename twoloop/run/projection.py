@@ -32,8 +32,7 @@ Array = NDArray[np.float64]
 MIN_SINE = 1e-5  # a dead centre may be near if the sine of the angle between a row of C_q and the other rows is smaller
 # MAX_CORRECTIONS: largest number of Newton iterations; ROUNDING: correction that ends them, relative to max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# a projected position is on the same assembly if its distance from the prediction by C_q is at most this, relative to
-# the displacement of the guess
+# largest distance of a projection on the same assembly from its prediction by C_q, relative to the guess's displacement
 MAX_NONLINEARITY = 0.5
 
 

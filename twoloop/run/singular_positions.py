@@ -88,9 +88,7 @@ def describe_turn(
     """
     n = system.n_q
     for (t0, first), (t1, last), across in _crossing_ends(crossings, now):
-        largest_q, largest_v = (
-            max(np.abs(first[part]).max(), np.abs(last[part]).max()) for part in (_q_slice(n), _v_slice(n))
-        )
+        largest_q, largest_v = (max(np.abs(first[p]).max(), np.abs(last[p]).max()) for p in (_q_slice(n), _v_slice(n)))
         change = np.abs(last[_v_slice(n)] - first[_v_slice(n)])
         least_a = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
         if not (change > np.maximum(MIN_TURN * (atol + rtol * largest_v), TURN_RATIO * (t1 - t0) * least_a)).any():

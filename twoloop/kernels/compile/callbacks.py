@@ -416,8 +416,7 @@ def _compile_with_writable_inputs(
 ) -> Dispatcher:
     """Compile a callback with writable inputs, because its helpers may not accept read-only arrays.
 
-    Raises TypeError if the callback itself writes to its inputs. `error`: error of the compilation with read-only
-    inputs.
+    Raises TypeError if the callback itself writes to its inputs. `error`: that of compilation with read-only inputs.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)
@@ -487,7 +486,5 @@ def _informative_line(error: Exception) -> str:
     message = _without_colours(error)
     message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # >>> marks a signature without a match
     lines = [line.strip() for line in message.splitlines() if line and not line.startswith("    ")]
-    informative = [
-        line for line in lines if line and not _UNINFORMATIVE_LINE.match(line) and not line.startswith("def ")
-    ]
-    return f"{type(error).__name__}: {informative[-1] if informative else message.strip()[:200]}"
+    useful = [line for line in lines if line and not _UNINFORMATIVE_LINE.match(line) and not line.startswith("def ")]
+    return f"{type(error).__name__}: {useful[-1] if useful else message.strip()[:200]}"

@@ -335,9 +335,7 @@ def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
                 loaded_names[current_name] = None
             free = each.opname == "LOAD_DEREF" and each.argval in code.co_freevars
             current_name = _LoadedName(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
-    inner_names = [
-        entry for constant in code.co_consts if isinstance(constant, CodeType) for entry in _loaded_names(constant)
-    ]
+    inner_names = [entry for c in code.co_consts if isinstance(c, CodeType) for entry in _loaded_names(c)]
     loaded_names.update((entry, None) for entry in inner_names if not entry.free or entry.name in code.co_freevars)
     return tuple(loaded_names)
 

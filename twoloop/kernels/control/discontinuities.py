@@ -160,8 +160,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-# a change is sudden if second differences of samples, relative to the range of the samples, are larger, as in pulses
-# four spacings wide
+# a change is sudden if second differences, relative to the range of the samples, are larger (pulses 4 spacings wide)
 SUDDEN_RATIO = 0.1
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
 # smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too
@@ -249,12 +248,10 @@ def _first_sudden_bend(values, n, along, least):
     """
     index, limit = _find_sudden_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
     while index > 1:  # few samples of a smooth curve may bend as much: the argument `within` = True excludes such bends
-        earlier, earlier_limit = _find_sudden_bend(
-            values, index, along * (values[index] - values[0]) / index, least, True
-        )
+        earlier, bound = _find_sudden_bend(values, index, along * (values[index] - values[0]) / index, least, True)
         if earlier == 0:
             break
-        index, limit = earlier, earlier_limit
+        index, limit = earlier, bound
     return index, limit
 
 
@@ -437,14 +434,11 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     begin = max(t, clock[at.SAMPLED_TO])
     is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # the next samples must find the same change again
     while begin < min(t + size, last, next_change):
-        present_spacing, is_at_change = (
-            min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing,
-            False,
-        )
-        clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], present_spacing)
-        t_first, begin = first_discontinuity(f, w, tolerances, clock, t, begin, present_spacing, last, 0.0, q, v, a)
+        spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
+        clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)
+        t_first, begin = first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, 0.0, q, v, a)
         next_change = min(next_change, t_first)
-        clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = begin, present_spacing
+        clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = begin, spacing
     return next_change
 
 

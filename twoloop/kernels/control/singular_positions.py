@@ -28,8 +28,7 @@ COLLAPSED_STEP = 0.2
 # a singular position is near if the smallest pivot of C_q, relative to its largest value so far, is smaller than this
 SINGULAR_PIVOT = 0.2
 STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
-# a rejected step of the static form is repeated with projected stages if the smallest pivot, relative to its largest
-# value so far, is smaller than this
+# the static form repeats rejected steps with projected stages if the pivot, relative to the largest so far, is smaller
 REPEAT_PIVOT = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
 MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, relative to the longest recent step
@@ -42,8 +41,7 @@ FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
 # a step is checked if the pivot at one of its ends, relative to the largest pivot so far, is smaller than this
 MAX_UNCHECKED_PIVOT = 0.5
-# the smallest pivot counts as zero within a step if its smallest sample is below this fraction of its largest change
-# between two samples
+# the smallest pivot counts as zero in a step if a sample is below this fraction of its largest change between samples
 PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: smallest and largest result of near_pivot_ratio; MAX_ROUNDING_ERROR: allowed rounding
 # error, in tolerances; EPS: unit roundoff
@@ -131,8 +129,7 @@ def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
     """Return whether an accepted step comes so near a singular position that a crossing step must replace it.
 
-    Rounding errors of its stages may then change the result by more than the tolerances, though its error estimate is
-    small.
+    Rounding errors of its stages may then exceed the tolerances of the result, though its error estimate is small.
     """
     bridge = control[at.BRIDGE]
     if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
@@ -175,7 +172,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
     `size` is the size of the last step, s; `at_output` is true if this step ended at an output time. `state` contains
     all coordinates, so that it need not be converted for a new partition.
     """
-    is_short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
+    short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
     if f.flags[FORM] == STATIC:
         clock[at.PIVOT_HERE] = w.notes[PIVOT]
         clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
@@ -208,12 +205,10 @@ def check_partition(f, w, control, clock, size, at_output, state):
         w.notes[SENSITIVITY] = 1.0  # as far from singular positions: then the partition is renewed again soon
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
-    if is_short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
+    if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
         # the partition may have been chosen at a distant state: with a new one an implicit method may still continue
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step can cross the singular position, where rounding would determine velocities
-    return (
-        at.NEAR_SINGULAR if is_short and is_near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE
-    )
+    return at.NEAR_SINGULAR if short and is_near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

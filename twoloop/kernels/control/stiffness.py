@@ -81,7 +81,7 @@ TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in eva
 # a trial that may be in vain begins only if the run has cost at least as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
-# after k trials, a trial begins whatever the rates are if the run has cost k + 1 times this number, in units of
+# after k trials, another one begins, whatever the rates are, if the run has cost k + 1 times this number, in units of
 # MIN_COST_IN_TRIALS trials
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
@@ -323,11 +323,11 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
     # a trial that may be in vain, or that needs finite differences, must cost little compared with the run so far
-    counted_cost, least_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
+    counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
-        counted_cost = max(counted_cost, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
-    is_cheap = counted_cost > least_cost and (
-        f.flags[FORCE_BY_Q_GIVEN] == 1 or counted_cost > MIN_COST_PER_COORDINATE * w.independent.size
+        counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
+    is_cheap = counted > min_cost and (
+        f.flags[FORCE_BY_Q_GIVEN] == 1 or counted > MIN_COST_PER_COORDINATE * w.independent.size
     )
     is_hidden = False
     if memory[PHASE] == EXPLICIT and is_cheap and h_rho > MIN_HIDDEN_RATIO:
@@ -337,13 +337,11 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
     # a run of high cost starts a trial whatever the rates are: if friction is about to reverse, few states show the
     # largest rate. The condition on `cost` excludes the short steps at the start, when the expected cost is unknown
-    costs_enough = (
-        is_cheap and cost > least_cost and counted_cost > COST_OF_ANY_TRIAL * least_cost * (1.0 + memory[N_TRIALS])
-    )
+    is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > STABILITY_LIMIT
         or is_hidden
-        or costs_enough
+        or is_costly
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
     if is_cheap and h_rho <= 1.0:  # N_ABOVE_LIMIT is not reset while a trial is too expensive

@@ -30,14 +30,7 @@ INTEGERS_32 = types.int32[::1]  # for long programs, which fit in the processor'
 
 # names of the programs in `Functions`: programs that replace missing callbacks (evaluation/operations.py), and programs
 # for sparse factors of large systems (linalg/symbolic_factorization.py, sparse_lu.py). A missing program has size 0
-PROGRAMS = (
-    "jacobian_program",
-    "jacobian_numbers",
-    "gamma_program",
-    "gamma_numbers",
-    "static_program",
-    "newton_program",
-)
+PROGRAMS = "jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "static_program", "newton_program"
 # the callbacks of a mechanism, its parameters, its flags and its programs
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # type: ignore[misc]
 

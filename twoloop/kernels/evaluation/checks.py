@@ -378,30 +378,28 @@ def _is_close(fused, separate, tolerance, rounding_errors):
 
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
-def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, tolerance, rounding):
+def kinematics_agree(f, t, q, v, fused, separate, roundings, tolerance, rounding):
     """Return whether `kinematics` agrees with the separate callbacks, up to `tolerance` times the largest result.
 
     Values of C may also differ by `rounding` times the sum of their |terms|. `fused` and `separate`, (3 + n_q, n_c),
-    are zero on entry, and contain C, C_t, gamma and C_q on return; `rounding_errors` (n_c), zero on entry, is scratch.
+    are zero on entry, and contain C, C_t, gamma and C_q on return; `roundings` (n_c), zero on entry, is scratch.
     """
-    n, n_c = q.size, rounding_errors.size
+    n, n_c = q.size, roundings.size
     fused_rows, separate_rows = fused[3:].reshape((n_c, n)), separate[3:].reshape((n_c, n))
     f.kinematics(t, q, v, f.p, fused[0], fused_rows, fused[1], fused[2])
     f.constraint(t, q, f.p, separate[0])
     f.jacobian(t, q, f.p, separate_rows)
     f.constraint_rate(t, q, f.p, separate[1])
     f.gamma(t, q, v, f.p, separate[2])
-    is_close = _is_close(fused_rows, separate_rows, tolerance, rounding_errors)
+    is_close = _is_close(fused_rows, separate_rows, tolerance, roundings)
     for k in range(1, 3):
         is_close = is_close and _is_close(
-            fused[k : k + 1].reshape((n_c, 1)), separate[k : k + 1].reshape((n_c, 1)), tolerance, rounding_errors
+            fused[k : k + 1].reshape((n_c, 1)), separate[k : k + 1].reshape((n_c, 1)), tolerance, roundings
         )
     for i in range(n_c):
         for j in range(n):
-            rounding_errors[i] += rounding * abs(separate_rows[i, j]) * abs(q[j])
-    return is_close and _is_close(
-        fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, rounding_errors
-    )
+            roundings[i] += rounding * abs(separate_rows[i, j]) * abs(q[j])
+    return is_close and _is_close(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, roundings)
 
 
 VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors

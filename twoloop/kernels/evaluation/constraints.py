@@ -106,8 +106,7 @@ def gather_independent_columns(G, rate, rows, independent, D):
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
 ROUNDING_DISAGREEMENT = 1e-9  # largest relative difference of Gamma with the steps e and 2 e that rounding may cause
-# the step e is doubled if values of Gamma with the steps e and 2 e differ by less, relatively: a larger step causes
-# smaller rounding errors
+# the step e is doubled if relative differences of Gamma with e and 2 e are smaller: longer steps reduce rounding errors
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)

@@ -84,7 +84,7 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
 
 
 @compiled
-def _write_states_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
+def _write_states_in_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
     """Store the states at output times within accepted steps in out_q and out_v, or NaN where the projection fails."""
     while True:
         n_requested = 0
@@ -178,11 +178,9 @@ def advance_lanes(
             n_running += work[RUNNING * LANES + k]
         if n_running < LANES or has_new_runs:
             first_new_run = next_run
-            next_run, n_occupied = _refill_lanes(
-                code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status
-            )
+            next_run, n_used = _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status)
             has_new_runs = next_run > first_new_run
-            if n_occupied == 0:
+            if n_used == 0:
                 if next_run == numbers.shape[0]:
                     return
                 continue
@@ -192,7 +190,5 @@ def advance_lanes(
         code.commit(order, control, work)
         _write_final_states(work, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
         if times.size > 1:
-            _write_states_within_steps(
-                code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps
-            )
+            _write_states_in_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps)
         _advance_time(work, control, n_steps)

@@ -150,8 +150,7 @@ def set_end(work, control):
 def end_steps(code, settings, control, work, predicted_v):
     """Project NEW onto the constraints; raise ERROR to the change by the projection, in tolerances, if that is larger.
 
-    If velocities change by more than the tolerances, a drive has a jump or kink between the stages. `predicted_v` (n)
-    is scratch.
+    If velocities change by more than the tolerances, a drive jumps or bends between the stages. Scratch: `predicted_v`.
     """
     n, order = settings[N], settings[ORDER]
     state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])

@@ -236,8 +236,7 @@ def _multiply_number(work, target, apart, x, imaginary):
 def _subtract_product(work, target, x, y, imaginary, imaginary_y):
     """Subtract the product x * y from the number `target` in each lane; if `imaginary` > 0, all three are complex.
 
-    Their imaginary parts are `imaginary` vectors after the real part of x, and `imaginary_y` vectors after the real
-    parts of y and `target`.
+    Imaginary parts are `imaginary` vectors after the real part of x, and `imaginary_y` after those of y and `target`.
     """
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:

@@ -288,18 +288,15 @@ def _correct_stages(settings, method_options, s, work):
     residual_rows, width = matrix_view(work, residual, s, n), n * LANES
     for i in range(s * width):
         work[changes * LANES + i] = 0.0
-    for system in range(n_systems):
+    for index in range(n_systems):
         row, column = offset + 2, offset + 2 + 2 * s
         offset += 2 + 4 * s
         sum_rows(method_options[row : row + s], residual_rows, vector_range(work, scratch, n))
         sum_rows(method_options[row + s : row + 2 * s], residual_rows, vector_range(work, scratch + n, n))
-        matrix, pivots = (
-            matrix_offset(memory, n, s, SYSTEMS + 2 * system),
-            pivots_offset(memory, n, s, n_systems, system),
-        )
-        imaginary = 0 if system < n_real else n * n
+        matrix, pivots = matrix_offset(memory, n, s, SYSTEMS + 2 * index), pivots_offset(memory, n, s, n_systems, index)
+        imaginary = 0 if index < n_real else n * n
         solve_systems(work, matrix, pivots, n, imaginary, scratch)
-        multiplicity = 1.0 if system < n_real else 2.0
+        multiplicity = 1.0 if index < n_real else 2.0
         for j in range(s):
             re, im = multiplicity * method_options[column + j], multiplicity * method_options[column + s + j]
             for i in range(width):
@@ -472,10 +469,8 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         largest_v = max(largest_v, abs(work[(begin + j) * LANES + k]))
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
         largest_error = max(largest_error, abs(work[(twice + j) * LANES + k]))
-        second_difference = (
-            work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
-        )
-        largest_difference = max(largest_difference, abs(second_difference))  # |(z J)^2 e| for the velocity error e
+        difference = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
+        largest_difference = max(largest_difference, abs(difference))  # |(z J)^2 e| for the velocity error e
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]

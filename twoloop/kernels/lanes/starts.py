@@ -36,8 +36,7 @@ from twoloop.kernels.lanes.layout import (
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # eigenvalue of G G^T below which a combination of rows counts as redundant
-# number of inverse iterations for each row of Z: few, because eigenvalues of redundant combinations are much smaller
-# than the others
+# number of inverse iterations for each row of Z: few, because redundant combinations have much smaller eigenvalues
 N_REDUNDANT_ITERATIONS = 5
 # multiples of this number, modulo 1, are irregular start values of inverse iterations
 GOLDEN_SECTION = 0.6180339887498949
@@ -295,10 +294,8 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
     """Project the positions of NEW onto the constraints by Gauss-Newton steps; clear RUNNING where this fails."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, row, _, factors_at_new, _ = _memory_offsets(
-        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
-    )
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors_at_new
+    G, x, change, _, _, _, _, row, _, factors, _ = _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors
     for k in range(LANES):
         work[LEFT_TO_MOVE * LANES + k] = work[RUNNING * LANES + k]
     for _ in range(MAX_ITERATIONS):
@@ -333,10 +330,8 @@ def _project_velocities(code, settings, control, pattern, moves, work):
     """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at its positions."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, row, factors_at_nearest, _, _ = _memory_offsets(
-        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
-    )
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors_at_nearest
+    G, x, change, _, _, _, _, row, factors, _, _ = _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors
     fill_field(work, FINE, 1.0)
     code.rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
@@ -355,8 +350,8 @@ def _project_velocities(code, settings, control, pattern, moves, work):
 
 
 @compiled
-def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, change_from_guess, weakest_direction):
-    """Store the weakest direction in `weakest_direction` (n), scaled to the largest entry of `change_from_guess`.
+def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
+    """Store the weakest direction in `weakest` (n), scaled to the largest entry of `correction`.
 
     Clear RUNNING in lanes with dependent rows.
     """
@@ -365,17 +360,15 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
         fill_field(work, x + i, 0.5 + (GOLDEN_SECTION * (i + 1)) % 1.0)
     for _ in range(N_WEAKEST_ITERATIONS):
         normalise_vector(work, x, n_rows, scratch)
-        solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest_direction)
+        solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest)
     normalise_vector(work, x, n_rows, scratch)
     min_eigenvalue = MIN_EIGENVALUE if n_redundant == 0 else MAX_REDUNDANT_EIGENVALUE * n_rows
     for k in range(LANES):
         if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` is now the smallest eigenvalue
             work[RUNNING * LANES + k] = 0.0
-        factor = _largest_value(work, change_from_guess, n, k) / max(
-            _largest_value(work, weakest_direction, n, k), DIAGONAL_SHIFT
-        )
+        factor = _largest_value(work, correction, n, k) / max(_largest_value(work, weakest, n, k), DIAGONAL_SHIFT)
         for j in range(n):
-            work[(weakest_direction + j) * LANES + k] *= factor
+            work[(weakest + j) * LANES + k] *= factor
 
 
 @compiled
@@ -383,27 +376,16 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
     """Clear RUNNING in lanes in which another guess has a projection far from its linear prediction by C_q."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
-    _, x, change, nearest_positions, change_from_guess, weakest_direction, displacement, _, factors_at_nearest, _, _ = (
-        _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    _, x, change, nearest, correction, weakest, displacement, _, factors, _, _ = _memory_offsets(
+        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
-    x, change, nearest_positions, change_from_guess = (
-        memory + x,
-        memory + change,
-        memory + nearest_positions,
-        memory + change_from_guess,
-    )
-    weakest_direction, displacement, factors = (
-        memory + weakest_direction,
-        memory + displacement,
-        memory + factors_at_nearest,
-    )
-    _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, change_from_guess, weakest_direction)
+    x, change, nearest, correction = memory + x, memory + change, memory + nearest, memory + correction
+    weakest, displacement, factors = memory + weakest, memory + displacement, memory + factors
+    _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest)
     for by_correction, by_weakest in OTHER_GUESSES:
         for j in range(n * LANES):
-            shift = (
-                by_correction * work[change_from_guess * LANES + j] + by_weakest * work[weakest_direction * LANES + j]
-            )
-            work[displacement * LANES + j], work[new * LANES + j] = shift, work[nearest_positions * LANES + j] + shift
+            shift = by_correction * work[correction * LANES + j] + by_weakest * work[weakest * LANES + j]
+            work[displacement * LANES + j], work[new * LANES + j] = shift, work[nearest * LANES + j] + shift
         _gauss_newton(code, settings, control, pattern, moves, work)
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
@@ -411,15 +393,10 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
         # `change` becomes the component of the displacement that is normal to the constraints
         solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
-            distance, rounding = (
-                0.0,
-                ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, nearest_positions, n, k),
-            )
+            distance, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, nearest, n, k)
             for j in range(n):
                 m = j * LANES + k
-                expected = (
-                    work[nearest_positions * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
-                )
+                expected = work[nearest * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
                 distance = max(distance, abs(work[new * LANES + m] - expected))
             if not distance <= MAX_CURVATURE * _largest_value(work, displacement, n, k) + rounding:
                 work[RUNNING * LANES + k] = 0.0

@@ -142,7 +142,7 @@ def _subtract_multiple(R, K, column_active, row_sizes, column_sizes, r, j, i):
 
 
 @compiled
-def _eliminate_pivot_block(R, K, row_active, column_active, row_sizes, column_sizes, i, k, j, l):
+def _eliminate(R, K, row_active, column_active, row_sizes, column_sizes, i, k, j, l):
     """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate these columns.
 
     `row_sizes` and `column_sizes`, the numbers of entries left in each row and column, are updated correctly only if
@@ -210,16 +210,12 @@ def choose_dependent_columns(G, kinds, rows, n_kept, numbers, integers, out):
             break
         block[0] = block[1] = index // n
         block[2] = block[3] = index % n
-        _eliminate_pivot_block(
-            R, K, row_active, column_active, row_sizes, column_sizes, block[0], block[1], block[2], block[3]
-        )
+        _eliminate(R, K, row_active, column_active, row_sizes, column_sizes, block[0], block[1], block[2], block[3])
         n_active, n_blocks = n_active - 1, n_blocks + 1
     while n_active > 0:
         block = out[4 * n_blocks : 4 * n_blocks + 4]
         if not _find_varying_pivots(R, K, row_active, column_active, squared_norms, row_scratch, column_sizes, block):
             return 0
-        _eliminate_pivot_block(
-            R, K, row_active, column_active, row_sizes, column_sizes, block[0], block[1], block[2], block[3]
-        )
+        _eliminate(R, K, row_active, column_active, row_sizes, column_sizes, block[0], block[1], block[2], block[3])
         n_active, n_blocks = n_active - (1 if block[0] == block[1] else 2), n_blocks + 1
     return n_blocks

@@ -163,8 +163,7 @@ def least_norm_solution(rows, values, min_sine, basis, factors, kept, coefficien
 def singular_values_exceed(rows, ratio, gram):
     """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one, s.
 
-    They do if rows rows^T - (ratio s)^2 I is positive definite; s is replaced by its upper bound, the Frobenius norm.
-    `gram` is scratch.
+    They do if rows rows^T - (ratio s)^2 I is definite, with the Frobenius norm as a bound of s. `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):

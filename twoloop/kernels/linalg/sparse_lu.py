@@ -117,8 +117,7 @@ def load_matrix(program, mass, jacobian, K, D, z, stiffness, values):
 def factor(program, is_independent, values, sizes):
     """Replace the matrix in `values` by its factors, 1/pivot on the diagonal; return False if a pivot is too small.
 
-    For redundant rows (0 in `is_independent`), the factors become zeros, which removes the rows from solutions. `sizes`
-    is scratch.
+    Factors of redundant rows (0 in `is_independent`) become 0, so that solutions do not use them. `sizes` is scratch.
     """
     n_q, n, n_off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF_DIAGONAL]
     order, runs = pivot_order_of(program), update_runs_of(program)

@@ -64,11 +64,9 @@ class _PartSupports:
         """Return whether a joint may be eliminated next: its rows must be independent, see the module's docstring."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
-        if not bodies & self.lone_bodies and any(
-            not self.is_grounded[part] and not self.hubs_by_part[part] for part in parts
-        ):
+        if not bodies & self.lone_bodies and any(not self.is_grounded[p] and not self.hubs_by_part[p] for p in parts):
             return True
-        return not bodies & self.hubs and not any(self.hubs_by_part[part] for part in parts)
+        return not bodies & self.hubs and not any(self.hubs_by_part[p] for p in parts)
 
     def eliminate_joint(self, joint: int) -> None:
         """Merge the parts that an eliminated joint connects, and update their supports."""
@@ -164,11 +162,9 @@ def elimination_order(
     return np.array(order, dtype=np.int64)
 
 
-def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], body_groups: Iterable[Sequence[int]]) -> list[int]:
+def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], groups: Iterable[Sequence[int]]) -> list[int]:
     """Return, for each coordinate, the index of the first coordinate of the same body."""
-    pairs = np.array([(first, other) for first, *others in body_groups for other in others], dtype=np.int64).reshape(
-        -1, 2
-    )
+    pairs = np.array([(first, other) for first, *others in groups for other in others], dtype=np.int64).reshape(-1, 2)
     rows, columns = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
     representatives, previous = np.arange(n_q), np.full(n_q, -1)
     while (representatives != previous).any():
@@ -278,8 +274,7 @@ def program_in_order(
 ) -> NDArray[np.int32] | None:
     """Return the program for an order of elimination; None if the program would have too many updates.
 
-    With `unsymmetric`, the factors also contain U: the slot of entry (i, j) of U is that of (j, i) of L, plus
-    program[N_OFF_DIAGONAL].
+    `unsymmetric`: factors also contain U; its entry (i, j) has the slot of (j, i) of L plus program[N_OFF_DIAGONAL].
     """
     n = len(order)
     position = np.empty(n, dtype=np.int64)

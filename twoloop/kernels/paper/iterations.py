@@ -73,8 +73,7 @@ UNDECIDED, CONVERGED, DIVERGED = range(3)
 def _test_convergence(change, last_change, first_change, iteration, tolerance, q):
     """Return UNDECIDED, CONVERGED or DIVERGED, from the current, the previous and the first change of the stages.
 
-    An iteration has converged if the change is at most `tolerance`, or if changes no longer decrease because of
-    rounding errors of q.
+    An iteration has converged if changes are at most `tolerance`, or do not decrease because of rounding errors of q.
     """
     if change <= tolerance:
         return CONVERGED

@@ -78,7 +78,7 @@ def _padded_size(n_q: int) -> int:
 
 
 @inlined
-def _coefficient_row(memory, which):
+def _row(memory, which):
     """Return a view (N_TERMS + 2) of row `which`, such as PSI, of the coefficients in `memory`."""
     start = N_SCALARS + which * (N_TERMS + 2)
     return memory[start : start + N_TERMS + 2]
@@ -117,7 +117,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
         return
     memory[FAILED] = 0.0
     memory[CURRENT] = 1.0 - memory[CURRENT]
-    psi, new_psi = _coefficient_row(memory, PSI), _coefficient_row(memory, NEW_PSI)
+    psi, new_psi = _row(memory, PSI), _row(memory, NEW_PSI)
     for i in range(N_TERMS):
         psi[i] = new_psi[i]
     memory[DEPTH] = min(memory[DEPTH] + 1.0, float(N_TERMS))
@@ -132,7 +132,7 @@ def _begin_history(memory, n, state):
     table[:, :] = 0.0
     for m in range(n):
         table[N_TERMS, m] = state[2 * n + m]
-    _coefficient_row(memory, PSI)[:] = 0.0
+    _row(memory, PSI)[:] = 0.0
     memory[ORDER] = memory[DEPTH] = memory[NEXT_ORDER] = 1.0
     memory[STARTING] = 1.0
     memory[FAILED] = memory[AGE] = 0.0
@@ -141,16 +141,8 @@ def _begin_history(memory, n, state):
 @merged
 def _compute_coefficients(memory, h, k):
     """Store psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of size h in `memory`."""
-    psi, new_psi, beta = (
-        _coefficient_row(memory, PSI),
-        _coefficient_row(memory, NEW_PSI),
-        _coefficient_row(memory, BETA),
-    )
-    g, G, c = (
-        _coefficient_row(memory, G_VELOCITY),
-        _coefficient_row(memory, G_POSITION),
-        _coefficient_row(memory, C_AT_NODES),
-    )
+    psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
+    g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
     new_psi[0] = h
     for i in range(N_TERMS):
         new_psi[i + 1] = psi[i] + h
@@ -178,11 +170,7 @@ def _compute_coefficients(memory, h, k):
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
     """Store the predicted state in q1 and v1, and the differences predicted by table `old` in the table `new`."""
-    beta, g, G = (
-        _coefficient_row(memory, BETA),
-        _coefficient_row(memory, G_VELOCITY),
-        _coefficient_row(memory, G_POSITION),
-    )
+    beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
@@ -251,7 +239,7 @@ def _choose_order(memory, h, k, table, d, n):
     The rules are those of Shampine and Gordon's STEP. The order decreases if the error at lower orders is not larger.
     It increases after k + 1 steps at order k if the error at order k + 1 is smaller; while STARTING is 1, at each step.
     """
-    g, G = _coefficient_row(memory, G_VELOCITY), _coefficient_row(memory, G_POSITION)
+    g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     weight_v, weight_q = _scratch_rows(memory, n)
     v0 = v1 = v2 = v3 = q0 = q1 = q2 = q3 = 0.0
     lower, lowest = max(k - 1, 0), max(k - 2, 0)
@@ -321,7 +309,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error, factor = _choose_order(memory, h, k, new, d, n)
     if not error <= 1.0:
         return Attempt(DONE, error, factor)
-    g, G = _coefficient_row(memory, G_VELOCITY)[k], _coefficient_row(memory, G_POSITION)[k]
+    g, G = _row(memory, G_VELOCITY)[k], _row(memory, G_POSITION)[k]
     for m in range(n):
         q1[m] += h * h * G * d[m]
         v1[m] += h * g * d[m]

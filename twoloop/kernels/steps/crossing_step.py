@@ -169,8 +169,7 @@ def _estimate_error(tolerances, h, state, legendre, a, n_kept):
 def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
     """Set q_end and v_end to the state at the time c h after the beginning of the polynomial.
 
-    (q, v) is the state at the beginning. A and AA (S) are the weights of the accelerations a (S, n) in their integral
-    and double integral.
+    (q, v): state at the beginning; A, AA (S): weights of the accelerations a (S, n) in their first and second integral.
     """
     _weighted_sum(A, a, v_end)
     _weighted_sum(AA, a, q_end)
@@ -256,7 +255,7 @@ def _extrapolate_node(j, c, last, a):
 
 
 @compiled
-def _evaluate_polynomial(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acceleration):
+def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acceleration):
     """Set q, v and `acceleration` (n each) to the values of the polynomial `time` seconds after its beginning."""
     fraction = time / duration
     _fill_integral_weights(b, c, fraction, weights_v, weights_q)
@@ -348,9 +347,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         min_node_pivot = near_pivot_ratio(tolerances)
     if t + h <= stored[END] + ROUNDING * stored[DURATION] + 4.0 * np.spacing(abs(t)):
         begin, duration = stored[BEGIN], stored[DURATION]
-        _evaluate_polynomial(
-            t + h - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage
-        )
+        _polynomial_at(t + h - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage)
         return _finish_piece(f, w, t + h, min_node_pivot * largest_pivot, options, tolerances, stage, state, new_state)
     stored[END] = -np.inf
     if time_of_base <= t:

@@ -73,11 +73,9 @@ MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as s
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations count as hardly varying within a step
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
 MIN_PIVOT_RATIO = 0.4  # a singular position is near if a pivot in a step, relative to that at its beginning, is smaller
-# after a singular position, another method takes over if a tolerance is smaller: five more runs of the benchmark A02
-# would be wrong
+# after a singular position, another method takes over with smaller tolerances: five more runs of A02 would be wrong
 TIGHT_TOLERANCE = 1e-8
-# another method takes over if the field FAILURES reaches this value; a step whose iteration does not converge adds 2 to
-# the field, an accepted step subtracts 1
+# another method takes over if FAILURES reaches this; a step without convergence adds 2, an accepted step subtracts 1
 MAX_FAILURES = 12.0
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
@@ -249,8 +247,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
     """Project the states in the first n_ends rows of `out_state` onto the constraints, each in one lane of `data`.
 
-    Each lane receives its projected state, the accelerations and multipliers, and in the field FINE 1 if the projection
-    converges, else 0.
+    Each lane receives the projected state, accelerations, multipliers, and in FINE whether the projection converged.
     """
     begin_ends = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):

@@ -53,8 +53,7 @@ MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     """Solve for the stage accelerations A_stage (s, n) by Newton's method; return a code.
 
-    On entry, A_stage contains predicted accelerations. The ratio of the last two corrections is stored in
-    memory[CONTRACTION].
+    On entry, A_stage contains predictions. Store the ratio of the last two corrections in memory[CONTRACTION].
     """
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size

@@ -384,7 +384,7 @@ def _update_banded_residual(f, w, t, q, v):
 
 
 @compiled
-def _fill_band_by_differences(f, w, t, q, v, by_v, base, moved, b, band):
+def _fill_band(f, w, t, q, v, by_v, base, moved, b, band):
     """Store K, or D if `by_v`, computed by differences, in `band` (n_q, 2 b + 1); return DONE or NOT_FINITE.
 
     Columns j, j + 2 b + 1, ... are computed at once. `base` (n_q) is the residual at (q, v); `moved` (n_q) is scratch.
@@ -452,9 +452,7 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
     _update_banded_residual(f, w, t, q, v)
     copy(w.Q, base)
-    code = _fill_band_by_differences(
-        f, w, t, q, v, False, base, moved, b, _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b)
-    )
+    code = _fill_band(f, w, t, q, v, False, base, moved, b, _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b))
     if code != DONE:
         return code
     # displace all velocities at once: if this does not change the residual, D is zero
@@ -467,13 +465,11 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
             memory[HAS_DAMPING] = 1.0
     if memory[HAS_DAMPING] == 0.0:
         return DONE
-    return _fill_band_by_differences(
-        f, w, t, q, v, True, base, moved, b, _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b)
-    )
+    return _fill_band(f, w, t, q, v, True, base, moved, b, _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b))
 
 
 @compiled
-def _factor_banded_matrix(w, memory, s, b, which, z, numbers, factorize, substitute):
+def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
     """Store the factors of M - z^2 K - z D with the border C_q in `numbers`, and pivots in `memory`; return a code.
 
     `which`: index of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
@@ -643,8 +639,7 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
     """Store the entries of K, or of D if `by_v`, computed by differences, in `entries`; return DONE or NOT_FINITE.
 
-    All columns of a group are computed at once. `base` (n_q) is the residual at (q, v); `residual` and `moved` (n_q)
-    are scratch.
+    All columns of a group are computed at once. `base`: residual at (q, v); `residual` and `moved` (n_q): scratch.
     """
     rows, columns, begins = tangent_entries_of(f.newton_program)
     base_point = v if by_v else q
@@ -790,9 +785,7 @@ def factor_filter(f, w, options, memory, s, h):
     if f.flags[FORM] == STATIC:
         return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 0))
     if f.flags[BANDWIDTH] >= 0:
-        return _factor_banded_matrix(
-            w, memory, s, f.flags[BANDWIDTH], 0, z, matrix_storage(w, n, FILTER), DGBTRF, DGBTRS
-        )
+        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 0, z, matrix_storage(w, n, FILTER), DGBTRF, DGBTRS)
     return _factor_dense_matrix(w, memory, s, 0, z, as_matrix(matrix_storage(w, n, FILTER), w.independent.size))
 
 
@@ -804,9 +797,7 @@ def _factor_complex_system(f, w, memory, s, k, z):
     if f.flags[FORM] == STATIC:
         return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 1 + k).view(np.complex128))
     if f.flags[BANDWIDTH] >= 0:
-        return _factor_banded_matrix(
-            w, memory, s, f.flags[BANDWIDTH], 1 + k, z, system_storage(w, n, k), ZGBTRF, ZGBTRS
-        )
+        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 1 + k, z, system_storage(w, n, k), ZGBTRF, ZGBTRS)
     return _factor_dense_matrix(w, memory, s, 1 + k, z, as_matrix(system_storage(w, n, k), w.independent.size))
 
 

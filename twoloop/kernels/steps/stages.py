@@ -233,10 +233,8 @@ def diagonal_options(
     A, c, weights, jump_weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, jump_weights))
     gamma = A[-1, -1]
     one_stage = options_array([[gamma]], [1.0], [1.0], inner_tol, outer_tol, 0.0)
-    newton_entries = np.array([1.0, 0.0, gamma, float(tests_velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
-    return np.concatenate(
-        [one_stage, newton_entries, [float(c.size)], A.ravel(), c, weights, jump_weights, [float(embedded)]]
-    )
+    newton = np.array([1.0, 0.0, gamma, float(tests_velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
+    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, jump_weights, [float(embedded)]])
 
 
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:

@@ -110,7 +110,7 @@ def _integer_array(options, which):
 
 
 @inlined
-def _float_array(options, which):
+def _floats(options, which):
     return options[int(options[N_SCALARS + which]) : int(options[N_SCALARS + which + 1])]
 
 
@@ -149,11 +149,11 @@ def sum_of_products(X, Y, K, total):
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
     """Store the arguments of the operations of group g, sums of `values` without their constants, in `out`."""
-    column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
+    column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
     row, column = _integer_array(options, sums + ROW), _integer_array(options, sums + MORE_COLUMN)
-    coefficient = _float_array(options, sums + MORE_COEFFICIENT)
+    coefficient = _floats(options, sums + MORE_COEFFICIENT)
     for e in range(groups[g + more], groups[g + more + 1]):
         out[row[e]] += coefficient[e] * values[column[e]]
 
@@ -161,12 +161,12 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 @merged
 def _store_sums(options, sums, scale, values, out):
     """For each item of `sums`, store `scale` times its sum of `values`, without its constant, in `out`."""
-    column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
+    column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
         out[indices[o]] = scale * coefficient[o] * values[column[o]]
     row, column = _integer_array(options, sums + ROW), _integer_array(options, sums + MORE_COLUMN)
-    coefficient = _float_array(options, sums + MORE_COEFFICIENT)
+    coefficient = _floats(options, sums + MORE_COEFFICIENT)
     for e in range(row.size):
         out[row[e]] += scale * coefficient[e] * values[column[e]]
 
@@ -178,10 +178,7 @@ def start_operations(options, table, values, z, x, y):
     Pending products, whose second factor depends on the accelerations, are set to zero.
     """
     groups = _integer_array(options, table + GROUPS)
-    constant, constant_2 = (
-        _float_array(options, table + FIRST + CONSTANT),
-        _float_array(options, table + SECOND + CONSTANT),
-    )
+    constant, constant_2 = _floats(options, table + FIRST + CONSTANT), _floats(options, table + SECOND + CONSTANT)
     for g in range(0, groups.size, N_GROUP):
         kind = groups[g]
         _fill_arguments(options, table + FIRST, groups, g, MORE_FIRST, values, x)
@@ -339,7 +336,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     A, LAM = 1 + 2 * n, 1 + 3 * n
     begin_early = LAM + n_rows
     begin_late = begin_early + _integer_array(options, EARLY + FIRST + COLUMN).size
-    indices, constant = _integer_array(options, BALANCE + SUM_INDICES), _float_array(options, BALANCE + CONSTANT)
+    indices, constant = _integer_array(options, BALANCE + SUM_INDICES), _floats(options, BALANCE + CONSTANT)
 
     start_series(options, t, unit, state, N, series, begin_early, X1[0], Y1[0], r, c)
     for k in range(order - 1):
@@ -371,8 +368,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-# step sizes are chosen for this result of `departure`: distance from the constraints before the projection, relative to
-# the allowed distance
+# step sizes are chosen for this distance from the constraints before projection, relative to the allowed distance
 TARGET_DEPARTURE = 0.3
 # a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
 # times the defect near the beginning of the step, where the series is exact
@@ -404,7 +400,7 @@ def _compute_series(f, w, options, memory, t, state, unit, which):
 
 
 @merged
-def _allowed_step(tolerances, series, unit, order, n):
+def _max_step(tolerances, series, unit, order, n):
     """Return the step size, in units of `unit` (s), up to which the last two terms are within the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
@@ -533,9 +529,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         memory[HAS_SERIES], memory[UNIT] = 1.0, h
         if is_estimated:
-            memory[ALLOWED_SIZE] = _allowed_step(
-                tolerances, series_view(memory, order, n, memory[CURRENT]), h, order, n
-            )
+            memory[ALLOWED_SIZE] = _max_step(tolerances, series_view(memory, order, n, memory[CURRENT]), h, order, n)
             if memory[ALLOWED_SIZE] > MAX_GROWTH:
                 return Attempt(DONE, TOO_SHORT, min(memory[ALLOWED_SIZE], MAX_FIRST_FACTOR))
     series, unit = series_view(memory, order, n, memory[CURRENT]), memory[UNIT]
@@ -595,7 +589,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
     factor = 0.0
     if is_estimated:
-        memory[NEXT_ALLOWED_SIZE] = _allowed_step(tolerances, series, unit, order, n)
+        memory[NEXT_ALLOWED_SIZE] = _max_step(tolerances, series, unit, order, n)
         distance_factor = memory[DISTANCE_FACTOR] if memory[DISTANCE_FACTOR] > 0.0 else 1.0
         factor = min(distance_factor * memory[NEXT_ALLOWED_SIZE] * unit / h, MAX_GROWTH)
     return Attempt(DONE, max(error, distance), factor)

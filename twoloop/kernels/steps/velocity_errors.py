@@ -30,13 +30,11 @@ OUTDATED_CHANGE = 0.3  # relative change of J above which J counts as outdated
 
 
 @compiled
-def filtered_velocity_error(
-    w, memory, tolerances, z, unfiltered, filtered_once, filtered_twice, state, new_state, a_end
-):
+def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once, filtered_twice, state, new_state, a1):
     """Return the largest effect of a velocity error, in units of the tolerances, see `velocity_error`.
 
     `unfiltered` (n_dof) is the velocity error; `filtered_once` and `filtered_twice` (n_dof) are this error after one
-    and two filters (I - z J)^-1. `a_end` (n_q) are the accelerations at the end of the step, which show how fast the
+    and two filters (I - z J)^-1. `a1` (n_q) are the accelerations at the end of the step, which show how fast the
     motion changes after a contact has begun within the step. Stores the duration of the error in ERROR_DURATION.
     """
     n = w.Q.size
@@ -45,7 +43,7 @@ def filtered_velocity_error(
     largest, curvature, largest_v, largest_a = 0.0, 0.0, 0.0, 0.0
     for i in range(n_dof):
         largest_v = max(largest_v, abs(v[w.independent[i]]))
-        largest_a = max(largest_a, abs(a[w.independent[i]]), abs(a_end[w.independent[i]]))
+        largest_a = max(largest_a, abs(a[w.independent[i]]), abs(a1[w.independent[i]]))
         largest = max(largest, abs(filtered_twice[i]))
         curvature = max(curvature, abs(filtered_twice[i] - 2.0 * filtered_once[i] + unfiltered[i]))  # (z J)^2 e
     if largest > 0.0:
