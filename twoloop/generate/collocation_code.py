@@ -139,7 +139,7 @@ FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 KAPPA = 0.02  # iteration error, in tolerances, at which the sweeps end: then total errors are at most those of DOP853
 TARGET_SWEEPS = 6.0  # number of sweeps for which the step size is chosen; larger with predictions of degree 6 and more
 EXTRA_SWEEPS = 7  # number of sweeps beyond the target at which a step that has not converged is rejected
-MAX_CONTRACTION = 0.8  # contraction at or above which a step is rejected in its fourth sweep or later
+MAX_CONTRACTION = 0.8  # a step is rejected in its fourth sweep or later if the contraction is at least this
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # lower and upper bound that replace a measured contraction outside of them
 # smallest and largest contraction with which the guessed size of the first step is accepted
 FAST_START, SLOW_START = 0.04, 0.3

@@ -39,7 +39,7 @@ from twoloop.kernels.evaluation.operations import (
 )
 
 FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # fast-math flags of floating-point instructions, as in kernels
-MIN_TERMS_SPLIT = 4  # number of terms from which on a sum is computed as the sum of two halves
+MIN_TERMS_SPLIT = 4  # a sum of at least this number of terms is computed as the sum of two halves
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
 # names of LLVM intrinsics by names of functions; a function without an intrinsic is called in libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}

@@ -70,7 +70,7 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import PARTITION_CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-# error of a rejected step, in tolerances, above which a force is assumed to change suddenly within the step
+# a force is assumed to change suddenly in a step that is rejected with a larger error, in tolerances
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
 # number of accepted steps before a short next step can end the trial of a method, because the first size is a guess

@@ -464,7 +464,7 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # kernels do not measure the loss of digits: a choice that depends on this loss must equal none of the kernels
+    # kernels do not measure the loss of digits: a choice that depends on it gets an index that no kernel returns
     index = int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot)) if choice.is_refined is None else len(MIN_PIVOTS)
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), choice.scale

@@ -406,7 +406,7 @@ def _blocks_of_groups(groups: Groups) -> list[Groups]:
 
 
 def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
-    """Return a group (row of indices for kernels) of each of `intervals`; its indices of output times are 0."""
+    """Return a group (row of indices for kernels) for each of `intervals`, without output times."""
     groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
     groups[:, indices.KIND] = table.kinds[intervals]

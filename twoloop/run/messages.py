@@ -290,7 +290,7 @@ def describe_arrival(t: float, fixed: bool) -> str:
 
 
 def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Status, str]:
-    """Return the status and the message of a run, given the code of its end (of `advance`, or of this module)."""
+    """Return the status and the message of a run that ended with a code of `advance`, or with one of this module."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
         arrival = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)

@@ -185,7 +185,7 @@ RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 DEAD_CENTRE_RATIO = 0.01
 # distance up to which two positions count as equal, relative to the largest change by the projection
 MAX_EQUAL_DISTANCE = 0.1
-MAX_CHANGE = 1e8  # change of a coordinate, in units of `Scales.columns`, above which the iteration counts as diverged
+MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in units of `Scales.columns`
 
 
 class Move(NamedTuple):

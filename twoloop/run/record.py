@@ -635,7 +635,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kind of interval, for the dense solution, of each step of the run's plan; `steps`: rows of steps."""
+    """Return, for each row of `steps` by the run's plan, the kind of interval that the dense solution uses."""
     if run.plan.apart:
         return np.full(len(steps), indices.APART)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS

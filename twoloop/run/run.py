@@ -117,10 +117,12 @@ class Run:
         self.may_be_steep = steep or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # size of a step that ends as far beyond the position as its base is before it, s
+        self.mirrored_size = 0.0  # size, s, of a step that leads from its base to the mirror image beyond the position
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # sizes of steps that are still to be tried, s
-        self.larger_sizes: list[float] = []  # larger sizes, s, tried if a step has too few nodes beyond it
+        self.larger_sizes: list[
+            float
+        ] = []  # larger sizes, s, to try if too few nodes of a step are beyond the position
         self.crossing_size = 0.0  # size of the last attempted step across a singular position, s
         self.piece_ends: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
         self.origins: list[Any] = []  # `Origin`s of polynomials across the position that are still to be tried

@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 # displacement of a coordinate or velocity x, relative to max(1, |x|), that shows which forces depend on x
 DISPLACEMENT = 1e-3
-# largest number of entries, and of operations, of sparse factors of Newton's matrix, relative to those of dense factors
+# sparse factors of Newton's matrix have at most this share of the entries, and operations, of dense factors
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -114,9 +114,9 @@ MASSLESS_RATIO = 1e-10
 # a row gives a massless direction of a body a mass if the norm of the row's component along these directions, relative
 # to the norm of the row, is larger than this
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # number of coordinates, relative to LARGE, from which on Newton's matrix has sparse factors
-# largest number of entries, and of operations, of the static form, relative to those of dense factors
-MAX_STATIC_SHARE = 0.05
+# Newton's matrix has sparse factors if the number of coordinates, relative to LARGE, is at least this
+MIN_SIZE_NEWTON = 1.6
+MAX_STATIC_SHARE = 0.05  # the static form has at most this share of the entries, and operations, of dense factors
 
 
 class StaticForm(NamedTuple):
@@ -129,7 +129,7 @@ class StaticForm(NamedTuple):
     mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else (0, 0)
     newton_arguments: tuple[Any, ...]  # arguments of `newton_form` that follow t0 and q0
     newton_program: NDArray[np.int32] | None = None  # factorizes Newton's matrix; None until a plan needs it
-    n_groups: int = 0  # number of groups of columns of Newton's matrix, each computed from one difference of forces
+    n_groups: int = 0  # number of column groups of Newton's matrix; one difference of forces yields a group
 
     def matrix_cost(self) -> float:
         """Return the estimated cost of Newton's matrix and its factors, in evaluations of accelerations."""

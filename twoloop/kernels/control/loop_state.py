@@ -48,7 +48,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     BRIDGE,
     SHORTEST,  # smallest allowed step size, s; steps of at most EQUAL_SPACINGS spacings of t are too short as well
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
-    TRIAL_STEPS,  # number of first steps after which the loop stops with SWITCH_METHOD if the next size is at most GAP
+    TRIAL_STEPS,  # stop with SWITCH_METHOD if the size after one of the first TRIAL_STEPS steps is at most GAP
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # largest ratio of an error to its estimate near a jump of a force, see SUDDEN_ERROR in advance.py
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
@@ -81,10 +81,10 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     H_FAILED,  # size of the last failed step, for messages, s
     H_LONG,  # longest of the last steps, s, which count less the older they are, see H_LONG_DECAY in step_size.py
     LARGEST_PIVOT,  # largest value so far of PIVOT in Work.notes, the smallest pivot of C_q
-    JUMP_FROM,  # time at which the next interval in which C_t or b jumps begins, s; infinite if none has been located
+    JUMP_FROM,  # time at the beginning of the next interval with a jump of C_t or b, s; infinite: none is known
     JUMP_TO,  # time at which this interval ends, s
     APPLIES_JUMP,  # 1: the next step goes from JUMP_FROM to JUMP_TO; new_state is the state after the jump
-    ROUGH_TO,  # time at which the last step rejected with an error above SUDDEN_ERROR would have ended, s
+    ROUGH_TO,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
     PIVOT_HERE,  # static form: value of PIVOT in Work.notes at the end of the last step
     # samples in time alone (at a fixed state) and samples along the motion: see discontinuities.py
     SAMPLED_TO,  # time of the last sample in time alone, s

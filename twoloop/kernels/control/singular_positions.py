@@ -202,7 +202,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         # the pivots of an old partition may not show that the motion approaches a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.notes[SENSITIVITY] = 1.0  # as far from singular positions: then the partition is renewed again soon
+        w.notes[SENSITIVITY] = 1.0  # its value far from singular positions: the partition is renewed again soon
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:

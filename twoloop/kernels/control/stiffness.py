@@ -71,7 +71,7 @@ from twoloop.kernels.linalg.dense import copy
 # estimates, which take about eight evaluations each. For the explicit method, both are multiplied by COST_RATIO
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
-NEGLIGIBLE_DAMPING = 1e-3  # product of step size and eigenvalue of dF/dv below which the power iterations for dF/dv end
+NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if step size times eigenvalue is smaller than this
 ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
 STABILITY_LIMIT = 3.0  # stability must limit the step of the explicit method if the ratio of h rho to LIMIT is larger
 # least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
@@ -86,7 +86,8 @@ COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run 
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
 QUIET_FACTOR = 10.0  # largest velocity, in tolerances, of oscillations that steps at the stability limit excite
-MIN_HIDDEN_RATIO = 0.05  # to damp a hidden rate may allow longer steps if the ratio of h rho to LIMIT is larger
+# damping of a hidden rate may allow longer steps if the ratio of h rho to LIMIT is larger than this
+MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # the explicit method is tried again if the ratio of h rho to LIMIT is smaller than this
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method

@@ -101,7 +101,7 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     ATOL,  # first index of the absolute tolerances: one for each coordinate and its velocity
 ) = range(6)
 LONGEST_UNSEEN = 0.01  # value of GAP, relative to the duration of the run
-REPORTED_ERROR = 30.0  # error of velocities near a singular position, in tolerances, above which the error is reported
+REPORTED_ERROR = 30.0  # errors of velocities near a singular position are reported if they are larger, in tolerances
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
 # kinds of intervals between accepted states, for dense output; they tell which data the polynomials interpolate

@@ -9,8 +9,8 @@ import math
 
 from twoloop.kernels.data.common import compiled, exact
 
-# kinds of operations. PENDING: product of Taylor series, in which the coefficient of the current order of the second
-# factor is computed only by solving the linear equations of this order. RESULT: output of a program
+# kinds of operations. PENDING: product of two Taylor series, of which the second gets its coefficient of an order only
+# when the linear equations of this order are solved. RESULT: output of a program
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
 # columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of its result among
 # the nodes, or among the results for RESULT. FIRST to SECOND - 1 and SECOND to END - 1: terms of its two arguments

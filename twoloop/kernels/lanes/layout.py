@@ -30,7 +30,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     UNIT,  # unit of time of a series, s
     H,  # size of the step, s
     X,  # time from the beginning of the step to the state to be computed, s
-    FINE,  # on entry to a task 1 in lanes in which it has to run; on return 1 in those in which it has succeeded
+    FINE,  # 1 in lanes in which a task has to run; after the task, 1 in lanes in which it has succeeded
     DEFECT,  # defect at the end of the step, relative to the allowed defect
     OFF,  # difference of predicted and projected positions, relative to its limit, see `departure` of step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
@@ -50,7 +50,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     H_NEXT,  # size of the next step, s
     H_LIMIT,  # upper limit of step sizes after a failed step, s; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
-    ROUGH_TO,  # time at which the last step rejected with an error above SUDDEN_ERROR would have ended, s
+    ROUGH_TO,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
     SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
     EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
     PAST,  # history of step-size control, stored lane by lane, see control/step_size.py

@@ -35,7 +35,7 @@ from twoloop.kernels.lanes.layout import (
 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
-MAX_REDUNDANT_EIGENVALUE = 1e-4  # eigenvalue of G G^T below which a combination of rows counts as redundant
+MAX_REDUNDANT_EIGENVALUE = 1e-4  # combinations of rows count as redundant if their eigenvalue of G G^T is smaller
 # number of inverse iterations for each row of Z: few, because redundant combinations have much smaller eigenvalues
 N_REDUNDANT_ITERATIONS = 5
 # multiples of this number, modulo 1, are irregular start values of inverse iterations

@@ -70,7 +70,7 @@ MAX_STARTS = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
 MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as stiff, and another method takes over
-MIN_CURVED = 0.1  # value of the field CURVED below which accelerations count as hardly varying within a step
+MIN_CURVED = 0.1  # accelerations count as hardly varying within a step if the field CURVED is smaller than this
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
 MIN_PIVOT_RATIO = 0.4  # a singular position is near if a pivot in a step, relative to that at its beginning, is smaller
 # after a singular position, another method takes over with smaller tolerances: five more runs of A02 would be wrong

@@ -63,8 +63,8 @@ ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # indices of the arrays of OperationGroups, and of Sums, see twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # index, after the arrays of a list of sums, of the array of indices at which sums are stored
-# indices, among the program's arrays, of the first arrays of the two tables and of the two lists of sums
+SUM_INDICES = N_SUMS  # position, after the arrays of a list of sums, of the array that tells where sums are stored
+# positions, among the program's arrays, at which the two tables and the two lists of sums begin
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS

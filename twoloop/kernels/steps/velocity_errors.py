@@ -26,7 +26,7 @@ SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, in units of tolerances[GAP]
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
 FAST_DURATION = 20.0  # a velocity error may change fast if its duration, in units of z = h gamma, is smaller than this
-OUTDATED_CHANGE = 0.3  # relative change of J above which J counts as outdated
+OUTDATED_CHANGE = 0.3  # J counts as outdated if its relative change is larger than this
 
 
 @compiled
