@@ -739,11 +739,9 @@ class CollocationCode:
     def _polynomial_pointer(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
         """Return a pointer to the polynomial of the last accepted step or, if `other`, of the attempted step."""
         builder, num = emit.builder, Emitter(emit.builder)
-        is_second = builder.compare(
-            "fcmp one" if not other else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO
-        )
+        second = builder.compare("fcmp one" if not other else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO)
         size = LANES * len(self.iterated_coordinates)
-        offset = builder.select(is_second, integer(self.polynomial_offset + size), integer(self.polynomial_offset))
+        offset = builder.select(second, integer(self.polynomial_offset + size), integer(self.polynomial_offset))
         return num.pointer(work, offset)
 
 

@@ -244,11 +244,9 @@ class SplitFunctions:
         assert all_valid is not None
         return all_valid
 
-    def _lowering(
-        self, emit: Emitter, graph: Graph, arguments: Sequence[Value], places: Mapping[int, Location]
-    ) -> Lowering:
-        """Return the Lowering that writes a part; `arguments` begin with the inputs of `graph` and the coefficients."""
-        *inputs, emit.numbers = arguments[:4]
+    def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], places: Mapping[int, Location]) -> Lowering:
+        """Return the Lowering that writes a part; `args` begin with the inputs of `graph` and the coefficients."""
+        *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]
         lowering = Lowering(emit, self.numbers, places)

@@ -305,9 +305,7 @@ class Elimination:
         self.all_rows, independent = np.vstack(rows), list(choice.rows)
         self.rows, self.rates = self.all_rows[independent], np.concatenate(rates)[independent]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
-        self.conditions = [
-            (pivot, pivot_alone.times(choice.min_pivot)) for pivot, pivot_alone in self.factors.conditions
-        ]
+        self.conditions = [(pivot, alone.times(choice.min_pivot)) for pivot, alone in self.factors.conditions]
         self.conditions += [(pivot, self.zero) for pivot in self.factors.mass_pivots if pivot.terms]
         self.redundant_rows = self._redundant_rows(np.concatenate(rates))
         self._check_length()

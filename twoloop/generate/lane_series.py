@@ -428,14 +428,11 @@ class LaneSeries:
         keys += [(pair, False) for pair in pairs - set(self.carried_pairs)]
         keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours often share a factor
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
-        next_order = builder.add(k, integer(1))
+        order = builder.add(k, integer(1))
         for begin in range(0, len(keys), MAX_SUMS_IN_LOOP):
             group = keys[begin : begin + MAX_SUMS_IN_LOOP]
             with emit.loop(integer(2), k, [emit.constant(0.0)] * len(group)) as (j, totals, new):
-                up, down = (
-                    self._row_pointer(emit, scratch, j),
-                    self._row_pointer(emit, scratch, builder.sub(next_order, j)),
-                )
+                up, down = self._row_pointer(emit, scratch, j), self._row_pointer(emit, scratch, builder.sub(order, j))
                 row_before = self._row_pointer(emit, scratch, builder.sub(j, integer(1)))
                 loaded: dict[tuple[Value, int], Value] = {}
                 for ((x, y), for_next_order), total in zip(group, totals, strict=True):

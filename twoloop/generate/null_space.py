@@ -230,14 +230,12 @@ class DependentCoordinates:
     Raises
     ------
     ReductionFailed
-        If a pivot is always zero, or if the elimination takes more than `max_added_operations` operations.
+        If a pivot is always zero, or if the elimination takes more than `max_added` operations.
     """
 
-    def __init__(
-        self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: PivotBlocks, max_added_operations: int
-    ):
+    def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: PivotBlocks, max_added: int):
         self._n, graph = len(rows[0]), rows[0][0].graph
-        self._graph, self._max_operations = graph, len(graph.operations) + max_added_operations
+        self._graph, self._max_operations = graph, len(graph.operations) + max_added
         self._zero, self._one = Affine(graph, 0.0, {}), Affine(graph, 1.0, {})
         self._rows: list[Terms] = [
             {j: entry for j, entry in enumerate([*row, rhs]) if not is_zero(entry)}
@@ -281,7 +279,7 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check_length(self, n_following: int = 0) -> None:
-        """Raise ReductionFailed if more than `max_added_operations` are added, including `n_following` later ones."""
+        """Raise ReductionFailed if more than `max_added` operations are added, with `n_following` later ones."""
         if len(self._graph.operations) + n_following > self._max_operations:
             raise ReductionFailed
 

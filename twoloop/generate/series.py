@@ -275,10 +275,7 @@ def _assemble_program(
     tables = [
         [
             *_grouped_operations(operations),
-            (
-                PENDING,
-                sorted([(only_quantity(expr), *factors) for expr, *factors in products.values()], key=_term_counts),
-            ),
+            (PENDING, sorted([(only_quantity(expr), *pair) for expr, *pair in products.values()], key=_term_counts)),
         ]
         for operations, products in ((early, row_products), (late, reaction_products))
     ]

@@ -147,11 +147,7 @@ class GrowthExponents(DegreeAlgebra):
     """Algebra of growth: a value is the exponent p with which a quantity grows, like x^p, for large inputs x."""
 
     functions = MappingProxyType(
-        {
-            **DegreeAlgebra.functions,
-            RECIPROCAL: lambda power: -power,
-            **dict.fromkeys((SINE, COSINE), lambda power: 0.0),
-        }
+        {**DegreeAlgebra.functions, RECIPROCAL: lambda p: -p, **dict.fromkeys((SINE, COSINE), lambda p: 0.0)}
     )
 
 

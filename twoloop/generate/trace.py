@@ -463,12 +463,10 @@ class TraceCache:
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
         self._classes = classes
-        n_numbers = int(np.abs(self._classes).max(initial=0))
+        size = int(np.abs(self._classes).max(initial=0))
         _, first = np.unique(np.abs(self._classes), return_index=True)
         self._first_of_class = first[self._classes[first] != 0]  # index of the first parameter of each class
-        self._tape = ParameterTape(
-            np.random.default_rng(7).uniform(*GENERIC_RANGE, n_numbers).tolist(), range(n_numbers)
-        )
+        self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC_RANGE, size).tolist(), range(size))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for i in np.flatnonzero(self._classes).tolist():
             signed_class = int(self._classes[i])
@@ -550,7 +548,7 @@ def derive_cached(
     """
     for find_cache in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("family", find_cache), partial(find_cache, system))
-        derived = system.remembered((key, find_cache), partial(_derive_from_cache, system, cache, key, make))
+        derived = system.remembered((key, find_cache), partial(_derive_shared, system, cache, key, make))
         try:
             if isinstance(derived, Untraceable):
                 raise derived
@@ -562,9 +560,7 @@ def derive_cached(
     raise reason
 
 
-def _derive_from_cache(
-    system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]
-) -> Any:
+def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
     """Return the result of `derive_cached` from one trace cache, or the exception that says why there is none."""
     try:
         result = cache.remembered(key, partial(make, cache))

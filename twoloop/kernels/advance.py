@@ -273,23 +273,23 @@ def advance(
                 continue
         n_attempts += 1.0
         t = clock[at.T]
-        at_jump = clock[at.APPLIES_JUMP] == 1.0
-        if t == clock[at.JUMP_FROM] and not at_jump:
+        jumps = clock[at.APPLIES_JUMP] == 1.0
+        if t == clock[at.JUMP_FROM] and not jumps:
             return at.AT_DISCONTINUITY
         target = outputs[int(clock[at.NEXT_OUTPUT])]
-        goal = min(target, clock[at.JUMP_TO] if at_jump else clock[at.JUMP_FROM])
+        goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
         n_grid_steps = 1.0  # number of steps of the grid that this step completes
         if fixed_size:
             size, n_grid_steps, reaches_goal = size_on_grid(clock, t, h, target, goal)
         else:
-            size, reaches_goal = size_off_grid(control, t, h, goal - t, at_jump)
+            size, reaches_goal = size_off_grid(control, t, h, goal - t, jumps)
         shortened = reaches_goal or (h > 0.5 * (goal - t) and not fixed_size)
         at_output = reaches_goal and goal == target
         if reaches_goal:
             size = goal - t
         samples_ahead = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
-        if (samples_ahead or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not at_jump:
+        if (samples_ahead or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not jumps:
             full_size, last = size, outputs[outputs.size - 1]
             size = limit_to_discontinuity(f, w, tolerances, control, clock, t, full_size, last, state, new_state)
             if size < full_size:
@@ -297,7 +297,7 @@ def advance(
         if not reaches_goal and size <= max(EQUAL_SPACINGS * np.spacing(abs(t)), control[at.SHORTEST]):
             return at.STEP_TOO_SMALL
         code, error, factor = _attempt_step(
-            f, w, options, memory, tolerances, control, clock, t, size, at_jump, state, new_state
+            f, w, options, memory, tolerances, control, clock, t, size, jumps, state, new_state
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
@@ -313,22 +313,18 @@ def advance(
             if not prepare_projected_repetition(f, w, control, clock, size):
                 clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
-        if (
-            accepted
-            and not at_jump
-            and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state)
-        ):
+        if accepted and not jumps and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             clock[at.FAILURE_CODE] = SINGULAR
             return at.NEAR_SINGULAR
-        checks_rates = control[at.DRIVEN] == 1.0 and not at_jump
+        checks_rates = control[at.DRIVEN] == 1.0 and not jumps
         if checks_rates and _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             clock[at.FAILURE_CODE] = DONE
             continue
-        if not at_jump:
+        if not jumps:
             f.settle(f, w, options, memory, tolerances, accepted)
         if code != DONE:
             end_code = _handle_failure(f, w, control, clock, t, size, code, t_repeated, state)
@@ -367,7 +363,7 @@ def advance(
             clock[at.T] = goal
         else:
             clock[at.T] = clock[at.T_START] + clock[at.N_FIXED] * h if fixed_size else t + size
-        if at_jump:
+        if jumps:
             clock[at.JUMP_FROM], clock[at.APPLIES_JUMP] = np.inf, 0.0
         copy(new_state, state)
         if at_output or control[at.STORE_ALL] == 1.0:
@@ -390,7 +386,7 @@ def advance(
         ):
             clock[at.H_FAILED] = clock[at.H_NEXT]
             return at.SWITCH_METHOD
-        if at_jump:
+        if jumps:
             return at.PAUSED
         if control[at.SYMMETRIC] == 0.0:
             end_code = check_partition(f, w, control, clock, size, at_output, state)

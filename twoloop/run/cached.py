@@ -154,9 +154,7 @@ class CachedIntegrator:
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
-        self.attributes_at_start = {
-            name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")
-        }
+        self.attributes_at_start = {key: getattr(run, key) for key in ("plan", "memory", "chunk", "kit", "functions")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.interpolation = OutputInterpolation(run)
         self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether generated code is called

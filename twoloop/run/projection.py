@@ -375,22 +375,16 @@ def _projected_position(
 
 
 def _describe_other_assembly(
-    system: ConstrainedSystem,
-    t: float,
-    position: Array,
-    guess: Array,
-    free: NDArray[np.intp],
-    scales: Scales,
-    cutoff: float,
+    system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Describe where other guesses, about as far from `position` as `guess`, are projected; None: same assembly.
+    """Describe where other guesses as far from `q1` as `guess` are projected; None: all on the same assembly.
 
     On the same assembly, guesses are projected to points near those that C_q predicts to first order, with the same
     sign of the determinant. Two assemblies may differ in the dependent coordinates alone.
     """
-    scaled_move = (position - guess) / scales.columns
+    scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
-    jacobian = system.jacobian(t, position)
+    jacobian = system.jacobian(t, q1)
     dependent, sign, _ = _assembly(scales.scaled(jacobian), free)
     dependent_columns = list(dependent)
 
@@ -402,25 +396,22 @@ def _describe_other_assembly(
         return int(np.linalg.slogdet(block)[0]) if sign != 0 else 0
 
     weakest_move = largest_move * _weakest_direction(scales.scaled(jacobian), free)
-    for direction in (-2.0 * scaled_move, weakest_move, -weakest_move):
-        displacement = direction * scales.columns
-        projected, excess, _ = _gauss_newton(system, t, position + displacement, free, cutoff)
+    for move in (-2.0 * scaled_move, weakest_move, -weakest_move):
+        displacement = move * scales.columns
+        projected, excess, _ = _gauss_newton(system, t, q1 + displacement, free, cutoff)
         if projected is None or not excess <= 1.0:
             return "does not converge"
-        expected = position + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
-        if (
-            distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(direction).max())
-            and sign_at(projected) == sign
-        ):
+        expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
+        if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
         # curvature may explain the distance: project a guess with the new dependent and the old other coordinates
-        mixed = position.copy()
+        mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
         if mixed_projected is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
-        if distance(mixed_projected, position) > MAX_EQUAL_DISTANCE * largest_move or sign_at(mixed_projected) != sign:
-            return f"ends on another one, which differs by {_describe_change(position, mixed_projected, scales)}"
+        if distance(mixed_projected, q1) > MAX_EQUAL_DISTANCE * largest_move or sign_at(mixed_projected) != sign:
+            return f"ends on another one, which differs by {_describe_change(q1, mixed_projected, scales)}"
     return None
 
 

@@ -120,9 +120,7 @@ class Run:
         self.mirrored_size = 0.0  # size, s, of a step that leads from its base to the mirror image beyond the position
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # sizes of steps that are still to be tried, s
-        self.larger_sizes: list[
-            float
-        ] = []  # larger sizes, s, to try if too few nodes of a step are beyond the position
+        self.larger_sizes: list[float] = []  # larger sizes, s, to try if too few nodes are beyond the position
         self.crossing_size = 0.0  # size of the last attempted step across a singular position, s
         self.piece_ends: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
         self.origins: list[Any] = []  # `Origin`s of polynomials across the position that are still to be tried
@@ -194,11 +192,7 @@ class Run:
         clock[a.H_LIMIT] = self.plan.limit_start
 
     def advance(
-        self,
-        outputs: Array,
-        buffers: Buffers,
-        filled: NDArray[np.int64],
-        active: tuple[Plan, Array, Kit] | None = None,
+        self, outputs: Array, buffers: Buffers, filled: NDArray[np.int64], active: tuple[Plan, Array, Kit] | None = None
     ) -> int:
         """Take compiled steps to the last output time, or until Python must act; return the code of the reason.
 

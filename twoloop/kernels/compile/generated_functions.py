@@ -64,11 +64,7 @@ _FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # gen
 
 
 def generated_functions(
-    kind: str,
-    stamp: str,
-    key: str,
-    write: Callable[[], tuple[list[str], str]],
-    optimise: bool = True,
+    kind: str, stamp: str, key: str, write: Callable[[], tuple[list[str], str]], optimise: bool = True
 ) -> GeneratedFunctions:
     """Return the functions of a module from memory or from the disk, or compile the text that `write` returns.
 
