@@ -267,7 +267,7 @@ def reject_turned_velocities(
 
 
 def describe_rounding(run: "Run", places: list[TimedState], end: float) -> str:
-    """Return words on the first of the states `places`, before `end`, whose velocities rounding changed, else ""."""
+    """Return a sentence about the first of the states `places` before `end` in which rounding changed v, else ""."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]

@@ -111,8 +111,8 @@ def _derivative_entries(
 
 # a direction of a body has no mass if its eigenvalue of M, relative to the largest one, is at most this
 MASSLESS_RATIO = 1e-10
-# a row gives a massless direction of a body a mass if the norm of the row's component along these directions, relative
-# to the norm of the row, is larger than this
+# a row can give a massless direction of a body a mass if the row's component along these directions, relative to the
+# row, has a larger norm
 MIN_MASSLESS_FRACTION = 1e-3
 # Newton's matrix has sparse factors if the number of coordinates, relative to LARGE, is at least this
 MIN_SIZE_NEWTON = 1.6

@@ -307,7 +307,7 @@ def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
 
 
 def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
-    """Yield the attributes that a function uses of a user's module, and of modules within this module.
+    """Yield the attributes of a user's module, and of modules within this module, that a function uses.
 
     `attributes` are the names loaded one after another, as in `module.inner.K`. If there are none, the module itself is
     assigned to a variable or passed to a helper, and all attributes listed in `names` are yielded.

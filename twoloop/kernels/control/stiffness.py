@@ -77,7 +77,7 @@ STABILITY_LIMIT = 3.0  # stability must limit the step of the explicit method if
 # least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
 # needs finite differences, which take about eight evaluations per coordinate
 MIN_COST_PER_COORDINATE = 64.0
-TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of this method
+TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
 # a trial that may be in vain begins only if the run has cost at least as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning

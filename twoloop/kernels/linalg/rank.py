@@ -9,7 +9,7 @@ from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl
 
 # rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# a row is orthogonalised again if the squared norm of its orthogonal part, relative to its own, is smaller than this
+# a row is orthogonalised again if the squared norm of its orthogonal part, relative to that of the row, is smaller
 REORTHOGONALISE_BELOW = 0.5
 
 

@@ -55,7 +55,7 @@ MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of
 # `begin_polynomial`. BEGIN, DURATION, END (s): those of the polynomial of the last converged attempt; END = -inf: none
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
-# shortest and longest part of the polynomial that one step takes, relative to its duration
+# duration of the shortest and of the longest step along the polynomial, relative to the duration of the polynomial
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 # longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
 NODE_GAP = 0.0767
