@@ -117,7 +117,7 @@ class Run:
         self.may_be_steep = steep or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # size, s, of a step that leads from its base to the mirror image beyond the position
+        self.mirrored_size = 0.0  # size, s, of a step that ends at the mirror image of its base
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # sizes of steps that are still to be tried, s
         self.larger_sizes: list[float] = []  # larger sizes, s, to try if too few nodes are beyond the position

@@ -64,10 +64,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean absolute slope (per s) and the largest absolute value of w.rates[:, row].
-
-    The samples in w.rates span `length` seconds.
-    """
+    """Return the mean absolute slope (per s) and the largest |value| of w.rates[:, row], sampled over `length` seconds."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -266,10 +263,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time just after the change of component j that lies between samples k and k + 1.
-
-    `low` and `high` are the times of these samples.
-    """
+    """Return the time just after component j changes, between samples k and k + 1 at the times `low` and `high`."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):

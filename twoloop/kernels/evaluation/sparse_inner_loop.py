@@ -439,10 +439,7 @@ def _is_on_constraints(f, w, q):
 
 @compiled
 def _project_state(f, w, t, q, v, theta):
-    """Project (q, v) onto the constraints in place; return a code.
-
-    On return, the factors in w are those at q before the last correction.
-    """
+    """Project (q, v) in place; return a code. On return, the factors in w are those at q before the last correction."""
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):

@@ -351,10 +351,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
-    """Store the weakest direction in `weakest` (n), scaled to the largest entry of `correction`.
-
-    Clear RUNNING in lanes with dependent rows.
-    """
+    """Store the weakest direction in `weakest`, scaled to max|correction|; clear RUNNING where rows are dependent."""
     scratch = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN_SECTION * (i + 1)) % 1.0)

@@ -583,10 +583,7 @@ def _sparse_derivative_views(f, w):
 
 @inlined
 def _sparse_scratch(f, w):
-    """Return scratch views of w.matrices, with N = n_q + n_c.
-
-    The views are three vectors (n_q), pivot sizes (N), and two complex vectors (N).
-    """
+    """Return scratch views of w.matrices: three vectors (n_q), pivot sizes (N = n_q + n_c), two complex vectors (N)."""
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
     begin += 2 * (mass_entries_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices

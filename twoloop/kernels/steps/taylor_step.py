@@ -385,10 +385,7 @@ TOO_SHORT = 2.0  # error returned to reject a first step because the series allo
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, which):
-    """Store the series with index `which` about `state` at t in `memory`; return a code.
-
-    `state` must be the result of the last projection.
-    """
+    """Store series `which` about `state`, the result of the last projection, at t in `memory`; return a code."""
     n = w.Q.size
     memory[TARGET] = which
     if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # generated code leaves no factors in w
