@@ -64,7 +64,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean absolute slope (per s) and the largest |value| of w.rates[:, row], sampled over `length` seconds."""
+    """Return the mean absolute slope (per s) and the largest |value| of w.rates[:, row], sampled over `length` s."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
