@@ -110,7 +110,7 @@ ROUNDING_DISAGREEMENT = 1e-9  # largest relative difference of Gamma with the st
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # step of one-sided differences (order 2), relative to that of central ones (order 4)
+ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # step of one-sided differences (order 2), relative to central differences (order 4)
 # rounding error of Gamma, relative to the largest term of G v divided by the largest step, if such terms cancel
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this times the required accuracy
