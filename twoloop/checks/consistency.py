@@ -172,9 +172,19 @@ class Violation:
 
     @classmethod
     def of_velocity(
-        cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
+        cls,
+        system: ConstrainedSystem,
+        t: float,
+        q: Array,
+        v: Array,
+        jacobian: Array,
+        scales: Scales,
+        harmless: Array | float = 0.0,
     ) -> Violation:
-        """Measure the violation of C_q v + C_t = 0 and A v + b = 0, relative to the fastest motion there."""
+        """Measure the violation of C_q v + C_t = 0 and A v + b = 0, relative to the fastest motion there.
+
+        Corrections up to `harmless`, (n_q,), are accepted in any case: relative to no motion, rounding is large.
+        """
         rate = system.rates(t, q)
         # an entry that is zero at this position only counts, too: bars may lie in line with an axis
         pattern = pattern_of(system, t, q)[: len(jacobian)]
@@ -189,7 +199,11 @@ class Violation:
 
         noise = _noise(q, change, jacobian, float(np.abs(v).max(initial=0.0)))
         terms = np.maximum(np.abs(jacobian) @ np.abs(v) + np.abs(rate), noise / EPS)
-        return cls(system, t, equation, values, terms, jacobian, scales, speeds, np.abs(v))
+        violation = cls(system, t, equation, values, terms, jacobian, scales, speeds, np.abs(v))
+        violation.allowed = np.maximum(violation.allowed, harmless)
+        in_rows = np.where(pattern != 0.0, harmless / scales.columns, np.inf).min(axis=1)
+        violation.allowed_left = np.maximum(violation.allowed_left, np.where(np.isfinite(in_rows), in_rows, 0.0))
+        return violation
 
     @property
     def excess(self) -> float:
@@ -254,10 +268,12 @@ def check_start(
     *,
     derivatives: bool = True,
     exact: Callable[[], bool] | None = None,
+    harmless: Array | float = 0.0,
 ) -> None:
     """Call every callback once at the start; check shapes, finiteness, rank, consistency and, if asked, derivatives.
 
     `exact` returns whether derivatives were derived from traces: then they are not compared with differences.
+    Velocities may be corrected by `harmless`, (n_q,), in any case.
 
     Raises
     ------
@@ -295,7 +311,7 @@ def check_start(
     if not is_at_rounding(rows @ v0 + rate, rows, v0, rate):
         full = system.rows(t0, q0)
         scales = scales_of(system, t0, q0, full)
-        Violation.of_velocity(system, t0, q0, v0, full, scales).refuse("v0")
+        Violation.of_velocity(system, t0, q0, v0, full, scales, harmless).refuse("v0")
 
 
 class StartEvaluation:

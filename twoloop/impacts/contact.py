@@ -20,6 +20,7 @@ from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.fallbacks import NEGLIGIBLE_RATIO
 from twoloop.run.run import Run
+from twoloop.run.singular_start import Branch, branch_at
 
 
 class Gap(NamedTuple):
@@ -217,6 +218,11 @@ class Accelerations:
         # any explicit method will do: only the accelerations at the start of its steps are used
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
+        if isinstance(branch_at(derived, t, self._run.state, self._run.rank, atol), Branch):  # the rank rises beside
+            raise ValueError(
+                f"contact or friction of {system.name!r} must not begin in a singular position, as at t = {t:g}: the "
+                "constraints have lost rank there, but not beside it. Start a little before that position, or beyond"
+            )
         self._run.work.notes[indices.GENERATION] = 1.0  # the run has determined the ranks
         self._n = system.n_q
         self._last: tuple[tuple[float, bytes, bytes], Array] | None = None

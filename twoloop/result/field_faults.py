@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import Interpolator, ranks_at
 from twoloop.run.record import Record, Status
+from twoloop.run.singular_start import Branch, branch_at
 
 Array = NDArray[np.float64]
 
 NEAR = 1e-9  # difference of times, relative to the duration of the run, up to which they count as equal
 ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
+SINGULAR_START = 1e-5  # relative error of a by differences at a start in a singular position
 PATTERNS = 3  # number of sign patterns of the perturbations by which the effect of a tolerance is measured
 
 
@@ -113,7 +115,17 @@ def _acceleration_faults(
     if not is_stored.any():
         return
     t, states, stored = t[is_stored], states[is_stored], stored[is_stored]
-    row = np.concatenate([states[0], np.zeros(n)])
+    at_start = t == t[0]
+    if np.isnan(stored[at_start, n:]).all() and not at_start.all():
+        rank, _ = ranks_at(system, float(t[0]), states[0, :n], states[0, n:], rtol)
+        first = np.append(states[0], stored[0, :n])
+        branch = branch_at(system, float(t[0]), first, rank, atol + rtol * np.abs(states[0, n:]).max())
+        if isinstance(branch, Branch):  # a start in a singular position, where lam is not determined
+            off = np.abs(stored[at_start, :n] - branch.a).max()
+            if not off <= SINGULAR_START * np.abs(branch.a).max():
+                yield f"a differs at the start, a singular position, by {off:.2g} from that of the branch with v0"
+            t, states, stored = t[~at_start], states[~at_start], stored[~at_start]
+    row = np.append(states[0], np.full(n, np.nan))  # of a nothing is known
     ranks = ranks_at(system, float(t[0]), states[0, :n], states[0, n:], rtol)
     interpolator = Interpolator(system, float(t[0]), row, rtol, atol, ranks)
     interpolator.warns = False

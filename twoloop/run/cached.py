@@ -82,6 +82,7 @@ N_SKIPPED_CALLS = 16  # number of calls that do not use an integrator after a ca
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
 SHORT_RUN = 1e-3  # if the last run took less CPU time, s, elapsed time is recorded, because reading CPU time takes long
+HARMLESS = 0.01  # correction of v0 that is accepted in any case, relative to the tolerances
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
 
@@ -616,7 +617,7 @@ def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
     """Return a copy of a cached run at another start; None if other code or another form of algebra is needed."""
-    _check_start(system, t0, q0, v0, options.check_derivatives)
+    _check_start(system, t0, q0, v0, options)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None
     run = entry.run.from_start(t0, q0, v0) if has_definite_mass(system, t0, q0) == entry.definite else None
@@ -633,7 +634,7 @@ def _new_run(
     if new:
         load_checked_bounds(system)
     first_value = first_force(system, t0, q0, v0)
-    _check_start(system, t0, q0, v0, options.check_derivatives)
+    _check_start(system, t0, q0, v0, options)
 
     def check(traced: CallbackTraces) -> None:
         traced.refuse_if_wrong(system, t0, t1, q0, v0)
@@ -680,12 +681,12 @@ def _run_from(
     return Run(system, plan, t, q, v, options.rtol, options.atol, options.step_size, interiors), code
 
 
-def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, derivatives: bool) -> None:
+def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, options: Options) -> None:
     """Check a start, unless it is the start that was checked last; raise if it is refused."""
+    derivatives, harmless = options.check_derivatives, HARMLESS * (options.atol + options.rtol * np.abs(v0))
 
     def check() -> None:
-        check_start(
-            system, t0, q0, v0, derivatives=derivatives, exact=lambda: has_exact_derivatives(system, t0, q0, v0)
-        )
+        exact = partial(has_exact_derivatives, system, t0, q0, v0)
+        check_start(system, t0, q0, v0, derivatives=derivatives, exact=exact, harmless=harmless)
 
-    system.remembered_at(("start", derivatives), (t0, q0.tobytes(), v0.tobytes()), check)
+    system.remembered_at(("start", derivatives), (t0, q0.tobytes(), v0.tobytes(), harmless.tobytes()), check)

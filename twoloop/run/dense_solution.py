@@ -393,11 +393,15 @@ class Interpolator:
         if failures > 0 and self.static_form is not None:
             self._switch_to_dense_form()
             failures = fill(self.kit, self.work, times, states, out)
-        self.failures = failures
-        if failures > 0 and self.warns:
-            _warn_of_lost_rank(
-                f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN"
-            )
+        self.failures, n = failures, self.system.n_q
+        if failures > 0:
+            # at a start in a singular position a is known, and the run has warned that lam is not
+            is_missing = np.isnan(out[:, :n]).any(axis=1)
+            out[is_missing & (times == self.arguments[1]), :n] = self.arguments[2][2 * n :]
+            n_missing = int(np.isnan(out[:, :n]).any(axis=1).sum())
+            if n_missing > 0 and self.warns:
+                text = f"at {n_missing} of {len(times)} times there are no accelerations and multipliers; they are NaN"
+                _warn_of_lost_rank(text)
 
 
 def _blocks_of_groups(groups: Groups) -> list[Groups]:
