@@ -2,8 +2,8 @@
 
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -51,35 +51,24 @@ def load_problem(where: str) -> Problem:
 def known_of(problem: Problem, t_end: float, limit: float) -> ReferenceMotion:
     """Make the reference, and print how long it takes, as it is the longest part of many comparisons."""
     print(f"making the reference of {problem.name!r} to {t_end:g} s, at most {limit:g} s a run ...", flush=True)
-    began = time.perf_counter()
-    try:
-        with _ticking():
-            made = make_reference(problem, t_end, limit, partial(print, flush=True))
-    except StudyError as error:
-        raise StudyError(f"{error}. Choose a shorter --t-end, or more than --reference-limit {limit:g}") from None
-    except Exception as error:  # of the mechanism's functions
-        said = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
-        raise StudyError(f"no reference for {problem.name!r}: {said}") from error
-    print(f"... made in {time.perf_counter() - began:.1f} s; it holds to {made.floor:.0e}", flush=True)
-    return made
-
-
-@contextmanager
-def _ticking() -> Iterator[None]:
-    """Print the time that has passed every few seconds."""
-    ended, began = threading.Event(), time.perf_counter()
+    began, ended = time.perf_counter(), threading.Event()
 
     def tick() -> None:
         while not ended.wait(TICK):
             print(f"  ... {time.perf_counter() - began:.0f} s", flush=True)
 
-    thread = threading.Thread(target=tick, daemon=True)
-    thread.start()
+    threading.Thread(target=tick, daemon=True).start()
     try:
-        yield
+        made = make_reference(problem, t_end, limit, partial(print, flush=True))
+    except StudyError as error:
+        raise StudyError(f"{error}. Choose a shorter --t-end, or more than --reference-limit {limit:g}") from None
+    except Exception as error:  # of the mechanism's functions
+        said = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+        raise StudyError(f"no reference for {problem.name!r}: {said}") from error
     finally:
         ended.set()
-        thread.join()
+    print(f"... made in {time.perf_counter() - began:.1f} s; it holds to {made.floor:.0e}", flush=True)
+    return made
 
 
 def runs_of(case: Case, solvers: Iterable[str | Solver], quick: bool) -> list[Run]:

@@ -6,13 +6,14 @@ import sys
 import threading
 import time
 import warnings
+from functools import cache
 
 import numpy as np
 import pytest
 
 from tests.problems import event, pendulum, quick, run, violations, worst
 from tests.processes import run_python
-from twoloop import DOP853, Integrator, Status, mechanisms, solve_dae
+from twoloop import DOP853, Integrator, Status, mechanisms, solve_dae, sweep
 from twoloop.mechanisms import four_bar
 
 HORIZONTAL = ([-1.0, 0.0], [0.0, 0.0])
@@ -269,13 +270,18 @@ def test_a_handler_of_the_users_own_stays():
     assert result.success and heard == [signal.SIGINT]
 
 
-class Alarm(Exception):
+class Alarm(ValueError):  # the errors of callbacks and of runs in sweeps are handled
     pass
+
+
+linkage = cache(four_bar)
 
 
 WORK = {
     "runs": lambda system: solve_dae(system, (0.0, 10.0), *START, "RadauIIA5", 1e-6, 1e-6),
     "samples": lambda system: [(sampled := Integrator(system)).start(0.0, *START), sampled.step(0.1)],
+    "compiled": lambda system: run(linkage(), 20.0),
+    "sweeps": lambda system: sweep(mechanisms.pendulum, [{"start": -1.0}] * 2, t_span=(0.0, 50.0), parallel="threads"),
     "dense": lambda system: solve_dae(system, (0.0, 1.0), *START, dense_output=True).sol(np.linspace(0.0, 1.0, 300)),
 }
 

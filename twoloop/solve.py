@@ -248,7 +248,7 @@ def solve_dae(
             end_folder(kept, result)
         return result
     except (KeyboardInterrupt, SystemError) as error:
-        if not (is_keyboard_interrupt(error) and interrupts.returns_result()):
+        if not (is_keyboard_interrupt(error) and interrupts.returns_result(error)):
             raise
     finally:
         interrupts.restore_handlers()

@@ -44,15 +44,8 @@ def test_the_page_of_the_docs_runs_outside_the_repository(file, code, monkeypatc
     monkeypatch.setattr(compare.figures, "work_precision", lambda *arguments, **more: None)
     (out / "compare.md").unlink()
     monkeypatch.chdir(file.parent.parent)
-    again = [
-        f"{file}:swing",
-        *words[1:-4],
-        str(out),
-        *words[-3:],
-        "--redraw",
-        "--solver",
-        f"{file.parent}/my_solver.py:solve",
-    ]
+    again = [f"{file}:swing", *words[1:-4], str(out), *words[-3:], "--redraw"]
+    again += ["--solver", f"{file.parent}/my_solver.py:solve"]
     compare.main(again)
     assert (out / "compare.md").read_text() == text
     own = row_format.read_rows(out / "compare.jsonl")

@@ -1,5 +1,6 @@
 """`studies.compare` where something is missing or fails: no reference, no end, no measure, a mass of less rank."""
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -7,6 +8,8 @@ from studies import compare
 from studies.bench import reference_motion
 from studies.bench.collector import Case, Run, called_from
 from studies.bench.solvers import CATALOGUE
+from twoloop import solve_dae
+from twoloop.mechanisms import n_four_bar
 
 MECHANISMS = """
 import dataclasses
@@ -74,6 +77,19 @@ def test_without_a_reference_the_report_says_why(mechanisms, monkeypatch):
     with pytest.raises(SystemExit, match=says):
         compared(mechanisms, "top", "--reference-limit", "7")
     assert "no reference for 'heavy top'" in (mechanisms.parent / "top" / "compare.md").read_text()
+
+
+def test_the_reference_where_rows_are_singular_is_the_ode_in_minimal_coordinates(monkeypatch):
+    def singular(*run, **options):
+        raise RuntimeError("singular")
+
+    monkeypatch.setattr(reference_motion, "_explicit", singular)
+    problem = n_four_bar(2)
+    known = reference_motion.make_reference(problem, 0.5)
+    assert "minimal coordinates" in known.source and known.floor < 1e-10
+    result = solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
+    q, v = known.states(result.t)
+    assert np.abs(q - result.q).max() < 1e-8 > 0.1 * np.abs(v - result.v).max()
 
 
 def test_functions_that_raise_are_named(mechanisms):

@@ -7,30 +7,12 @@ import pytest
 from studies.bench import render
 from studies.bench.render import listed, number, percent, power, table
 
+NUMBERS = [(0.0123, "0.012"), (0.5, "0.50"), (3.44, "3.4"), (123.4, "120"), (1234, "1234"), (123456, "1.2e5")]
+NUMBERS += [(2.44e-5, "2.4e-5"), (2e-5, "2e-5"), (-2.44e-5, "−2.4e-5"), (-3.0, "−3.0"), (9.99e-4, "1e-3"), (0, "0")]
+NUMBERS += [(0.0, "0"), (None, "–"), (float("nan"), "–"), (np.float64("nan"), "–"), (np.int64(12), "12")]
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.0123, "0.012"),
-        (0.5, "0.50"),
-        (3.44, "3.4"),
-        (123.4, "120"),
-        (1234, "1234"),
-        (123456, "1.2e5"),
-        (2.44e-5, "2.4e-5"),
-        (2e-5, "2e-5"),
-        (-2.44e-5, "−2.4e-5"),
-        (-3.0, "−3.0"),
-        (9.99e-4, "1e-3"),
-        (0, "0"),
-        (0.0, "0"),
-        (None, "–"),
-        (float("nan"), "–"),
-        (np.float64("nan"), "–"),
-        (np.int64(12), "12"),
-        (float("inf"), "∞"),
-    ],
-)
+
+@pytest.mark.parametrize(("value", "text"), [*NUMBERS, (float("inf"), "∞")])
 def test_numbers_have_two_digits_and_one_exponent_style(value, text):
     assert number(value) == text
 

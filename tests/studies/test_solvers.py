@@ -16,16 +16,9 @@ from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
 T_END = 0.2
-COMPILING = (
-    "IDA",
-    "LSODA",
-    "DOP853",
-    "RK45",
-    "Radau,",
-    "Radau9,",
-    "BDF,",
-    *("heyoka", "CyRK", "CVODE", "Dopri8", "Pr9", "collocation"),
-)  # seconds each, and tested by the studies that show them
+# seconds each, and tested by the studies that show them
+COMPILING = "IDA", "LSODA", "DOP853", "RK45", "Radau,", "Radau9,", "BDF,", "heyoka", "CyRK", "CVODE", "Dopri8", "Pr9"
+COMPILING += ("collocation",)
 
 
 def setting(name):

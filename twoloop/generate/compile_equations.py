@@ -13,6 +13,7 @@ faster than the length of a block. The values of long equations are stored in me
 projections share the functions for the factors of the matrix at a position, and for the solution with these factors.
 """
 
+import ctypes
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
@@ -21,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.structure import mass_and_rows
 from twoloop.generate import llvm_code
 from twoloop.generate.elimination import Elimination, PivotChoice, Solution
 from twoloop.generate.graph import Graph, Untraceable
@@ -34,6 +36,7 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
+LARGEST_LOSS = 1e-7  # relative error of accelerations at a start: code that loses more to little inertia is not used
 
 
 def write_accelerations(
@@ -495,9 +498,34 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
             return SharedCode(Elimination(system, choice, cache.equations(system)), cache)
 
         code: GeneratedCode = derive_cached(system, ("code", choice), make, lambda code: check(code.traced))
+        if (choice.added_rows or choice.is_refined) and _loss(code, system, t0, q0) > LARGEST_LOSS:
+            raise Untraceable(f"elimination without pivots loses the digits of little inertia in {system.name!r}")
     except Untraceable as error:
         raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
     return code
+
+
+def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
+    """Return the largest relative error of the accelerations of generated code, at rest at a start."""
+    rows, n = list(code.shared.equations.choice.rows), system.n_q
+    q, v, a = np.array(q0), np.zeros(n), np.empty(n)
+    signature = ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_double, *[ctypes.c_void_p] * 4)
+    accelerate = signature(code.shared.functions.addresses["own_accelerate"])
+    if not accelerate(t0, *(x.ctypes.data for x in (q, v, code.numbers, a))):  # kernels compute them
+        return 0.0
+    mass, G = mass_and_rows(system, t0, q)
+    kinds = [kind for kind, size in (("gamma", system.n_c), ("nonholonomic_gamma", system.n_a)) if size]
+    try:
+        gamma, force = np.concatenate([system.evaluate(kind, t0, q, v) for kind in kinds]), system.force(t0, q, v)
+        matrix = np.block([[mass, G[rows].T], [G[rows], np.zeros((len(rows), len(rows)))]])
+        right, exact = np.concatenate([force, gamma[rows]]), np.zeros(n + len(rows))
+        for _ in range(3):  # with refinement
+            exact += np.linalg.solve(matrix, right - matrix @ exact)
+    except ValueError:  # gamma is found by differences, or forces are not defined, or the matrix is singular
+        return 0.0
+    heavy = mass.diagonal() > 0.0
+    size = max(np.abs(exact[:n]).max(), np.abs(force[heavy] / mass.diagonal()[heavy]).max(initial=0.0))
+    return float(np.abs(a - exact[:n]).max() / max(size, np.finfo(float).tiny))
 
 
 @cache

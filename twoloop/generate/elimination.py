@@ -60,6 +60,8 @@ N_FEW_COORDINATES = 24  # largest number of coordinates for which MIN_INDEX_FEW,
 # well (Euler parameters lose two digits in sound models); MIN_INDEX_MANY with more coordinates: the code gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
+SCALE_STEP = 1024.0  # the scale of an added row is decreased by powers of this: other starts rarely need another one
+DISPLACEMENT = 0.2  # of coordinates, m or rad: far enough from positions where entries happen to vanish
 MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number
 # dependent coordinates are eliminated if G has at least this number of rows per coordinate; with fewer rows, the linear
 # system for the multipliers is smaller than this
@@ -76,9 +78,9 @@ class PivotChoice:
     ----------
     rows : tuple of int
         Indices of the independent rows of G.
-    added_rows, scale : tuple of int, float
-        Indices of the rows g of G with which M + scale g^T g is definite, and the factor `scale`: a power of two with
-        which the added terms are about as large as M.
+    added_rows, scales : tuple of int, tuple of float
+        Indices of the rows g of G with which M plus the sum of scale g^T g is definite, and the scales: powers of two
+        with which the added terms are about as large as M.
     min_pivot : float
         Smallest allowed pivot of a row of G, relative to its pivot without the other rows; a power of ten.
     blocks : tuple of (rows, columns)
@@ -91,7 +93,7 @@ class PivotChoice:
 
     rows: tuple[int, ...]
     added_rows: tuple[int, ...]
-    scale: float
+    scales: tuple[float, ...]
     min_pivot: float
     blocks: PivotBlocks = ()
     is_refined: bool | None = None
@@ -106,9 +108,10 @@ class PivotChoice:
             If M is singular on velocities that the constraints allow.
         """
         mass, G = mass_and_rows(system, t, q)
-        choice = PivotChooser(system).choose(mass, G)
+        choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
         # larger pivots need no test: with them, random models kept 10 digits; added rows have set `is_refined` already
-        if choice.rows and choice.min_pivot <= MIN_PIVOTS[-1] and choice.is_refined is None:
+        is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or len(set(choice.scales)) > 1
+        if choice.rows and is_uncertain and choice.is_refined is None:
             choice = replace(choice, is_refined=loses_digits(mass, G, choice))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
@@ -181,12 +184,13 @@ class PivotChooser:
             np.zeros(workspace_size(n_rows, system.n_q)),
             np.zeros(2 + 3 * n_rows, np.int64),
         )
-        self._last_key, self._last_choice = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
+        self._last_key, self._last_choice = (0, b"", 0.0), PivotChoice((), (), (), 0.0)
 
-    def choose(self, mass: Array, G: Array) -> PivotChoice:
+    def choose(self, mass: Array, G: Array, nearby: Callable[[], tuple[Array, Array]]) -> PivotChoice:
         """Return the PivotChoice, without blocks, for M (n_q, n_q) and G (n_c + n_a, n_q).
 
-        The exceptions are those of `PivotChoice.for_position`.
+        `nearby` returns M and G at another position, where no entry is zero that is not always zero. The exceptions are
+        those of `PivotChoice.for_position`.
         """
         system, scratch, chosen = self.system, self._scratch, self._row_indices
         is_definite = system.constant_mass and system.derived.get("no weak mass", False)
@@ -195,17 +199,33 @@ class PivotChooser:
         key = index, chosen.tobytes(), float(scratch[0])
         if key != self._last_key:
             self._last_choice, self._last_key = self._decode(index), key
-        is_singular = bool(self._last_choice.added_rows)
+        choice, is_singular = self._last_choice, bool(self._last_choice.added_rows)
+        factors = _scale_factors(choice.added_rows, *nearby()) if is_singular else np.ones(len(G))
+        scales = tuple((choice.scales[0] * factors[list(choice.added_rows)]).tolist()) if is_singular else ()
+        new_index = self._index_with(choice, scales, mass, G) if scales != choice.scales else -1
+        if new_index >= 0:
+            choice, index = replace(choice, scales=scales, min_pivot=float(MIN_PIVOTS[new_index])), new_index
         if index >= (
             (MIN_INDEX_FEW_SINGULAR if is_singular else MIN_INDEX_FEW)
             if len(mass) <= N_FEW_COORDINATES
             else MIN_INDEX_MANY + is_singular
         ):
-            return self._with_added_rows(mass, G, index)
-        return self._last_choice
+            return self._with_added_rows(choice, factors, mass, G, index)
+        return choice
 
-    def _with_added_rows(self, mass: Array, G: Array, index: int) -> PivotChoice:
-        """Return the choice for M + s G^T G if its smallest pivot is much larger than for M, else `self._last_choice`.
+    def _index_with(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
+        """Return the index in MIN_PIVOTS if `choice.added_rows` are added with `scales`; -1 if rows or M do not fit."""
+        scratch, chosen, added = (
+            np.zeros_like(self._scratch),
+            np.zeros_like(self._row_indices),
+            G[list(choice.added_rows)],
+        )
+        stiffened = mass + added.T @ (np.array(scales)[:, None] * added)
+        index = int(self._kernel(stiffened, G, RANK_TOL, 0.0, START_LIMITS, scratch, chosen))
+        return index if index >= 0 and chosen[2 : 2 + chosen[0]].tolist() == list(choice.rows) else -1
+
+    def _with_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
+        """Return the choice for M + s G^T G if its smallest pivot is much larger than for M, else `choice`.
 
         G: here the independent rows. Some bodies have little inertia about their joints, such as a rod with a mass
         in its middle.
@@ -213,15 +233,14 @@ class PivotChooser:
         lose up to 2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times
         as large as M, k digits are lost, which refinement restores. `index`: index in MIN_PIVOTS of the choice for M.
         """
-        last = self._last_choice
-        rows = G[list(last.rows)]
+        rows = G[list(choice.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
-        scratch, chosen = np.zeros_like(self._scratch), np.zeros_like(self._row_indices)
-        new_index = self._kernel(mass + scale * rows.T @ rows, G, RANK_TOL, 0.0, START_LIMITS, scratch, chosen)
-        if not 0 <= new_index <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
-            return last
-        min_pivot = float(MIN_PIVOTS[new_index])
-        return replace(last, added_rows=last.rows, scale=float(scale), min_pivot=min_pivot, is_refined=True)
+        scales = tuple((scale * factors[list(choice.rows)]).tolist())
+        stiffened = replace(choice, added_rows=choice.rows, scales=scales, is_refined=True)
+        new_index = self._index_with(stiffened, scales, mass, G)
+        if not 0 <= new_index <= index - MIN_GAIN:
+            return choice
+        return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _decode(self, index: int) -> PivotChoice:
         """Return the choice that `self._row_indices` describes; raise Untraceable if `index` is an error code."""
@@ -230,14 +249,39 @@ class PivotChooser:
         system, n_rows = self.system, self.system.n_c + self.system.n_a
         n_independent, n_added, *indices = self._row_indices.tolist()
         if n_independent == 0:
-            return PivotChoice((), (), 1.0, 0.0)
+            return PivotChoice((), (), (), 0.0)
         if index < 0:
             defect = "stays singular with constraints added" if index == STAYS_SINGULAR else "is too close to singular"
             raise Untraceable(f"the mass of {system.name!r} {defect}")
         if n_added == 0:
             system.derived["no weak mass"] = True
         added = tuple(indices[n_rows : n_rows + n_added])
-        return PivotChoice(tuple(indices[:n_independent]), added, float(self._scratch[0]), float(MIN_PIVOTS[index]))
+        scales = (float(self._scratch[0]),) * n_added
+        return PivotChoice(tuple(indices[:n_independent]), added, scales, float(MIN_PIVOTS[index]))
+
+
+def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
+    """Return M and G at a displaced position, or at q if callbacks are not defined there."""
+    try:
+        return mass_and_rows(system, t, q + DISPLACEMENT * np.cos(np.arange(len(q))))
+    except Exception:
+        return mass_and_rows(system, t, q)
+
+
+def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
+    """Return the factor of the scale of each row of G, if it is added to M: 1, or negative powers of SCALE_STEP.
+
+    Smaller ones are those of rows on coordinates in which M is singular without the rows `singular`. A row on Euler
+    parameters alone, such as their norm, would otherwise hide little inertia beside heavy bodies.
+    """
+    rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
+    own = np.array([np.abs(mass[np.ix_(row > 0.0, row > 0.0)]).max(initial=0.0) for row in rows])
+    own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
+    ratio = own / (np.abs(mass).max() / rows.max() ** 2)
+    smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
+    # of one step and a quarter: parts of one mechanism that differ by less keep their digits
+    steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
+    return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
 
 MAX_OPERATIONS = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
@@ -344,11 +388,11 @@ class Elimination:
                 raise Untraceable(
                     f"mass of {name!r} is not symmetric: its entry {(j, i)} is zero, and its entry {(i, j)} is not"
                 )
-        for k in self.choice.added_rows:
+        for k, scale in zip(self.choice.added_rows, self.choice.scales, strict=True):
             columns = [i for i in range(n) if not is_zero(self.all_rows[k, i])]
             for i in columns:
                 for j in columns:
-                    term = (self.all_rows[k, i] * self.all_rows[k, j]).times(self.choice.scale)
+                    term = (self.all_rows[k, i] * self.all_rows[k, j]).times(scale)
                     matrix[i, j] = matrix[i, j] + term if (i, j) in matrix else term
         for k, row in enumerate(self.rows):
             for i in range(n):

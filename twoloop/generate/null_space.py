@@ -386,7 +386,8 @@ def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
     motion that the rows prescribe (Q = 0). `mass` (n_q, n_q) and G (n_c + n_a, n_q) are values at the position.
     """
     rows, added, n = G[list(choice.rows)], G[list(choice.added_rows)], len(mass)
-    mass_with_rows = mass + choice.scale * added.T @ added
+    pull = added.T * np.array(choice.scales)
+    mass_with_rows = mass + pull @ added
     factors = np.block([[mass_with_rows, rows.T], [rows, np.zeros((len(rows), len(rows)))]])
     for k in range(len(factors)):
         if not 0.0 < abs(factors[k, k]) < np.inf:
@@ -400,9 +401,9 @@ def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
 
     a, b = np.random.default_rng(1).choice((-1.0, 1.0), (2, n))
     force, gamma = np.column_stack([mass @ a, np.zeros(n)]), np.outer(rows @ b, (0.0, 1.0))
-    solution = solve(np.vstack([force + choice.scale * added.T @ np.outer(added @ b, (0.0, 1.0)), gamma]))
+    solution = solve(np.vstack([force + pull @ np.outer(added @ b, (0.0, 1.0)), gamma]))
     r, c = force - mass @ solution[:n] - rows.T @ solution[n:], np.outer(added @ b, (0.0, 1.0)) - added @ solution[:n]
-    change = solve(np.vstack([r + choice.scale * added.T @ c, gamma - rows @ solution[:n]]))
+    change = solve(np.vstack([r + pull @ c, gamma - rows @ solution[:n]]))
     (change_a, change_lam), (max_a, max_lam) = ((abs(x[:n]).max(), abs(x[n:]).max(axis=0)) for x in (change, solution))
     return not (change_a <= ROUNDING_OF_SOLUTION * max_a and (change_lam <= ROUNDING_OF_SOLUTION * max_lam).all())
 
@@ -423,9 +424,9 @@ def solve_refined(
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:
         rhs = list(r)
-        for k in choice.added_rows:
+        for k, scale in zip(choice.added_rows, choice.scales, strict=True):
             for i, entry in enumerate(rows[k]):
-                rhs[i] = rhs[i] + (entry * c[k]).times(choice.scale)
+                rhs[i] = rhs[i] + (entry * c[k]).times(scale)
         return solve([*rhs, *(c[k] for k in choice.rows)])
 
     def subtract_products(total: Affine, products: Iterable[tuple[Affine, Affine]]) -> Affine:

@@ -176,7 +176,7 @@ class PythonFunctions:
     Attributes
     ----------
     samples : list of (arguments, value)
-        Forces of the calls 1, 2, 4, 8, ... since `restart`, which are computed again and compared at the end of a run.
+        Forces of calls since `restart`, at numbers that grow by a quarter: they are computed again at the end of a run.
     """
 
     registry: ClassVar[WeakValueDictionary[float, "PythonFunctions"]] = WeakValueDictionary()
@@ -206,7 +206,7 @@ class PythonFunctions:
         if kind == "force":
             self._calls += 1
             if self._calls == self._next:
-                self._next *= 2
+                self._next += 1 + self._next // 4
                 self.samples.append((tuple(np.copy(each) for each in arguments), out.copy()))
 
 

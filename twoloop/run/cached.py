@@ -68,6 +68,7 @@ from twoloop.run.rerun import (
     first_force,
 )
 from twoloop.run.run import CONTRADICTION, Run
+from twoloop.run.signals import raised_by_handler
 from twoloop.run.singular_positions import TURN_RATIO
 from twoloop.run.singular_start import Branch, branch_at
 from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
@@ -213,7 +214,9 @@ class CachedIntegrator:
             n = self._start_and_advance(*start, False)
             if n == loops.IN_DOUBT and self.evaluation.is_surely_consistent(0, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
-        except Exception:  # raised by a callback: `IntegrationLoop` will handle it
+        except Exception as error:  # raised by a callback: `IntegrationLoop` will handle it
+            if raised_by_handler(error):
+                raise
             self.skips, arrays.last_start[loops.N_EQUAL] = N_SKIPPED_CALLS, loops.NEVER
             return None
         self.cpu_time = clock() - began
@@ -464,9 +467,10 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
     # kernels do not measure the loss of digits: a choice that depends on it gets an index that no kernel returns
-    index = int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot)) if choice.is_refined is None else len(MIN_PIVOTS)
+    of_kernels = choice.is_refined is None and len(set(choice.scales)) < 2
+    index = int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot)) if of_kernels else len(MIN_PIVOTS)
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
-    return np.array(numbers, dtype=np.int64), choice.scale
+    return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
 
 
 # limits of a system's cache. MAX_OPTIONS: number of sets of options. MAX_WORKSPACE: number of floats in the workspace

@@ -69,7 +69,7 @@ from twoloop.run.record import (
 )
 from twoloop.run.rerun import compare_callbacks
 from twoloop.run.run import SMALL_SYSTEM, Buffers, Run
-from twoloop.run.signals import SignalHandlers, is_in_user_function
+from twoloop.run.signals import SignalHandlers, is_in_user_function, raised_by_handler
 from twoloop.run.singular_positions import TimedState, velocities_turned_last
 
 Array = NDArray[np.float64]
@@ -101,8 +101,10 @@ class Interrupts:
                 self._is_installed = True
         return self
 
-    def returns_result(self) -> bool:
+    def returns_result(self, error: BaseException) -> bool:
         """Return whether a run that Ctrl-C ended returns a result; else a handler has raised KeyboardInterrupt."""
+        if self.handlers is None and raised_by_handler(error):
+            return False
         self.install_handlers()  # a user's handler is not replaced, and raises; so does `_on_signal` after many signals
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 

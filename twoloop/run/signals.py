@@ -105,6 +105,18 @@ def is_in_compiler(frame: FrameType | None) -> bool:
     return False
 
 
+def raised_by_handler(error: BaseException) -> bool:
+    """Return whether an error was raised by a signal handler, according to its traceback."""
+    # a handler is a function, or a method or partial of one, or an object that is called
+    callables = [_signal.getsignal(number) for number in SIGNAL_NUMBERS]
+    functions = [getattr(each, "__func__", getattr(each, "func", each)) for each in callables if callable(each)]
+    codes = {getattr(each, "__code__", getattr(type(each).__call__, "__code__", None)) for each in functions} - {None}
+    at = error.__traceback__
+    while at is not None and at.tb_frame.f_code not in codes:
+        at = at.tb_next
+    return at is not None
+
+
 def is_keyboard_interrupt(error: BaseException) -> bool:
     """Return whether an error, such as a `SystemError` of machine code, is or was caused by a KeyboardInterrupt."""
     cause: BaseException | None = error

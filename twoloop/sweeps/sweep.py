@@ -29,6 +29,7 @@ from twoloop.checks.arguments import (
 from twoloop.kernels.compile.caches import n_compiled
 from twoloop.result.result import Result
 from twoloop.run.options import check_method
+from twoloop.run.signals import SignalHandlers
 from twoloop.solve import solve_dae
 from twoloop.sweeps.one_run import (
     STANDARD_COLUMNS,
@@ -299,12 +300,14 @@ def sweep(
     missing = [number for number in range(len(runs)) if number not in rows]
     kinds = {name: kind for row in rows.values() for name, value in row.items() if (kind := kind_of(value))}
     with (
+        SignalHandlers() as handlers,
         _progress_bar(progress, len(runs)) as report,
         closing(solve_runs(work, runs, missing, n_workers, parallel, client)) as solved,
     ):
         last_save = time.monotonic()
         try:
             for number, row in solved:
+                handlers.call_delayed()  # the exception of a handler is no failure of a run
                 rows[number] = {**runs[number], **fit_columns(row, kinds)}
                 report(len(rows))
                 if path is not None and time.monotonic() - last_save > SAVE_INTERVAL:
