@@ -94,23 +94,13 @@ def alike(one, other, allowed):
     assert other.stats.n_jacobians <= 1.5 * one.stats.n_jacobians + 2
 
 
+SLOW_RUNS = [("closed chain", "TRBDF2", 1e-5, 1e-5), ("ladder", "TRBDF2", 1e-5, 1e-5)]
+SLOW_RUNS += [("redundant rows", "RadauIIA9", 1e-10, 1e-9), ("open chain", "RadauIIA9", 1e-10, 1e-9)]
+SLOW_RUNS += [("closed chain", "RadauIIA13", 1e-10, 1e-9), ("closed chain", "BDF", 1e-7, 1e-6)]
+
+
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-@pytest.mark.parametrize(
-    ("case", "method", "tolerance", "allowed"),
-    [
-        *(
-            slow(*case)
-            for case in (
-                ("closed chain", "TRBDF2", 1e-5, 1e-5),
-                ("ladder", "TRBDF2", 1e-5, 1e-5),
-                ("redundant rows", "RadauIIA9", 1e-10, 1e-9),
-                ("open chain", "RadauIIA9", 1e-10, 1e-9),
-                ("closed chain", "RadauIIA13", 1e-10, 1e-9),
-                ("closed chain", "BDF", 1e-7, 1e-6),
-            )
-        ),
-    ],
-)
+@pytest.mark.parametrize(("case", "method", "tolerance", "allowed"), [slow(*case) for case in SLOW_RUNS])
 def test_runs_are_those_of_the_dense_forms(form, case, method, tolerance, allowed):
     ends = []
     for static in (False, True):
