@@ -214,12 +214,12 @@ class PivotChooser:
         return choice
 
     def _index_with(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
-        """Return the index in MIN_PIVOTS if `choice.added_rows` are added with `scales`; -1 if rows or M do not fit."""
-        scratch, chosen, added = (
-            np.zeros_like(self._scratch),
-            np.zeros_like(self._row_indices),
-            G[list(choice.added_rows)],
-        )
+        """Return the index in MIN_PIVOTS of the smallest allowed pivot if `choice.added_rows` are added with `scales`.
+
+        Return -1 if M is not positive definite with them, or if the independent rows are not `choice.rows`.
+        """
+        scratch, chosen = np.zeros_like(self._scratch), np.zeros_like(self._row_indices)
+        added = G[list(choice.added_rows)]
         stiffened = mass + added.T @ (np.array(scales)[:, None] * added)
         index = int(self._kernel(stiffened, G, RANK_TOL, 0.0, START_LIMITS, scratch, chosen))
         return index if index >= 0 and chosen[2 : 2 + chosen[0]].tolist() == list(choice.rows) else -1
@@ -308,7 +308,7 @@ class Elimination:
     mass_first_program : Program
         Program for "a" (n_q,), the accelerations at a state, by an elimination that begins with M.
     reduced_program : Program or None
-        Program for "a" by dependent coordinates, if it takes fewer operations; valid at fewer positions.
+        Program for "a" that eliminates dependent coordinates, if it takes fewer operations; valid at fewer positions.
     right_sides : Program
         Program for "r" (n_q,), Q, and "c" (n_c + n_a,), the right-hand sides of the rows of G; 0 for unused rows.
     position_projection : Program
@@ -420,7 +420,7 @@ class Elimination:
 
     @cached_property
     def reduced_program(self) -> Program | None:
-        """Return the program for the accelerations by dependent coordinates; None if it costs too much."""
+        """Return the program for accelerations that eliminates dependent coordinates; None if it costs too much."""
         blocks = self.choice.blocks
         if not blocks:
             return None

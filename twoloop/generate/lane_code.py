@@ -769,11 +769,11 @@ FILE_PREFIX = "lanes"  # first part of the names of cached files
 
 
 class GeneratedLanes(Generic[Code]):
-    """Compiled code of a mechanism for SIMD lanes, with a method that evaluates its coefficients.
+    """Compiled code of a mechanism for SIMD lanes, with a method that computes the code's coefficients from parameters.
 
     Parameters
     ----------
-    record : ParameterTape
+    tape : ParameterTape
         Tape of the parameters with which `code` was traced.
     code : LaneCode or LaneConstraints
     """

@@ -230,7 +230,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value of a quantity: as defined, or else as loaded in the current part of the function."""
+        """Return the value of a quantity: the defined one, or one loaded once in each part of a function."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._loaded_in_part()

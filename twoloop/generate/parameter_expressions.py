@@ -159,7 +159,7 @@ class ParameterTape(SymbolicObject):
         return product
 
     def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
-        """Return the values of numbers for other parameters (n_runs, n_p), as an array (n_runs, len(numbers))."""
+        """Return the values (n_runs, len(numbers)) that `numbers` take at `parameters` (n_runs, n_p)."""
         product = self.product_evaluator(parameters)
         rows = {powers: k for k, powers in enumerate(dict.fromkeys(parameter.powers for parameter in numbers))}
         products = np.empty((len(rows), len(parameters)))

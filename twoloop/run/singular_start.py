@@ -38,9 +38,9 @@ MAX_RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, 
 
 
 class Branch(NamedTuple):
-    """Branch of the motion through a singular position: accelerations there, and a state on the branch beside it.
+    """Branch of the motion through a singular position: accelerations there, and a nearby state on the branch.
 
-    `rank`: rank of the rows beside the position. `first_size`: first step size to try, s.
+    `rank`: rank of C_q near the position, on the branch. `first_size`: first step size to try, s.
     """
 
     a: Array

@@ -292,7 +292,7 @@ MAX_KITS = 16  # largest number of kits in the cache of a system
 def kit_of(
     system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
 ) -> Kit:
-    """Return a kit of a system: callbacks, flags that choose the form of linear algebra, and the steps of a plan."""
+    """Return a kit of a system: callbacks, flags that choose the linear algebra, and the step functions of `plan`."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     if static is not None:

@@ -180,8 +180,8 @@ N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # acceleration, while a velocity changes by its tolerance
 MAX_LASTING_CHANGE = 0.5
 CHANGE_MARGIN = 0.01  # a change up to this time after a step's beginning, in spacings of samples, counts as passed
-LARGEST_ROW = N_SAMPLES + 1  # index of the row of w.changes with the largest absolute values so far, after the samples
-MIDDLE_ROW = N_SAMPLES + 2  # index of the row of w.changes with values between two samples
+LARGEST_ROW = N_SAMPLES + 1  # row of w.changes, after the samples, that stores the largest |value| of each column
+MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes that stores values between two samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 

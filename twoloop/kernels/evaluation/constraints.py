@@ -136,7 +136,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(notes, t, e):
-    """Return 0 for central differences or, if C_t or b jumps near t, 1 (after t) or -1 (before t): one-sided."""
+    """Return the side of t for differences: 0 (both) or, if C_t or b jumps near t, the other: 1 (after t) or -1."""
     since_jump, until_jump = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0

@@ -87,8 +87,8 @@ CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR,
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
-# offsets in the memory of an explicit method, in units of n vectors: accelerations at STATE, the state at the beginning
-# of the step (2 n vectors), velocities before the projection, and accelerations of the stages
+# offsets in the memory of an explicit method, in units of n vectors. START: accelerations at STATE; BEGIN, _BEGIN_V: q
+# and v at the beginning of the step; PREDICTED_V: velocities before the projection; SLOPES: accelerations of the stages
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
 # indices in `settings`, whole numbers that describe the mechanism and the method

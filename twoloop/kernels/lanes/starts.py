@@ -44,7 +44,7 @@ GOLDEN_SECTION = 0.6180339887498949
 
 @merged
 def _subtract_four(work, target, x, dx, y, dy, count):
-    """Apply `subtract_products` to four adjacent lanes; `target`, x, y, dx and dy are indices of entries of `work`."""
+    """Apply `subtract_products` to four adjacent lanes; target, x, y are indices in `work`, dx, dy strides of x, y."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]

@@ -80,9 +80,9 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangent_entries_of(program):
-    """Return the rows and the columns of the entries of K and D, and the index of the first entry of each group.
+    """Return the rows and the columns of the entries of K and D, and the index of the first entry of each column group.
 
-    The last index is the number of entries.
+    The columns of a group are differenced together. The last index is the number of entries.
     """
     group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
