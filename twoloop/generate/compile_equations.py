@@ -36,7 +36,7 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-LARGEST_LOSS = 1e-7  # relative error of accelerations at a start: code that loses more to little inertia is not used
+LARGEST_LOSS = 1e-7  # largest relative error of accelerations at a start with which generated code is used
 
 
 def write_accelerations(
@@ -498,7 +498,7 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
             return SharedCode(Elimination(system, choice, cache.equations(system)), cache)
 
         code: GeneratedCode = derive_cached(system, ("code", choice), make, lambda code: check(code.traced))
-        if (choice.added_rows or choice.is_refined) and _loss(code, system, t0, q0) > LARGEST_LOSS:
+        if (choice.added_rows or choice.is_refined) and not _loss(code, system, t0, q0) <= LARGEST_LOSS:
             raise Untraceable(f"elimination without pivots loses the digits of little inertia in {system.name!r}")
     except Untraceable as error:
         raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error

@@ -189,8 +189,8 @@ class PivotChooser:
     def choose(self, mass: Array, G: Array, nearby: Callable[[], tuple[Array, Array]]) -> PivotChoice:
         """Return the PivotChoice, without blocks, for M (n_q, n_q) and G (n_c + n_a, n_q).
 
-        `nearby` returns M and G at another position, where no entry is zero that is not always zero. The exceptions are
-        those of `PivotChoice.for_position`.
+        `nearby` returns M and G at another position, at which only entries that are always zero are zero. The
+        exceptions are those of `PivotChoice.for_position`.
         """
         system, scratch, chosen = self.system, self._scratch, self._row_indices
         is_definite = system.constant_mass and system.derived.get("no weak mass", False)
@@ -269,10 +269,11 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 
 
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
-    """Return the factor of the scale of each row of G, if it is added to M: 1, or negative powers of SCALE_STEP.
+    """Return the factor by which to multiply the scale of each row of G that is added to M.
 
-    Smaller ones are those of rows on coordinates in which M is singular without the rows `singular`. A row on Euler
-    parameters alone, such as their norm, would otherwise hide little inertia beside heavy bodies.
+    The factor is a negative power of SCALE_STEP if the row has entries only in columns in which the rows `singular`
+    have some, and M is small there; else 1. A row on Euler parameters alone, such as their norm, would otherwise hide
+    little inertia beside heavy bodies.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     own = np.array([np.abs(mass[np.ix_(row > 0.0, row > 0.0)]).max(initial=0.0) for row in rows])

@@ -371,10 +371,10 @@ class _Checker:
             chosen = nonstiff_method() if method == "explicit" else stiff_method(method == "all")
             # the rank of the rows is too small at a start in a singular position, where lam is not known
             lam = np.asarray(self.result.lam)
-            place = int(lam.ndim == 2 and np.isnan(lam[:, :1]).any())
-            q, v = self.states[place].reshape(2, -1).copy()
+            first = int(lam.ndim == 2 and np.isnan(lam[:, :1]).any())
+            q, v = self.states[first].reshape(2, -1).copy()
             rtol, atol = (np.maximum(factor * tighter_tolerances(each), FINEST) for each in (self.rtol, self.atol))
-            run = self.system, float(self.t[place]), q, v, chosen, float(rtol), atol, self.longest
+            run = self.system, float(self.t[first]), q, v, chosen, float(rtol), atol, self.longest
             self.reruns[key] = IndependentRerun(*run)
         rerun, t0, t1 = self.reruns[key], float(self.t[i]), float(self.t[j])
         n_steps = int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)

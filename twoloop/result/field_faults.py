@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 NEAR = 1e-9  # difference of times, relative to the duration of the run, up to which they count as equal
 ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
-SINGULAR_START = 1e-5  # relative error of a by differences at a start in a singular position
+SINGULAR_START = 1e-5  # largest error of the accelerations at a start in a singular position, relative to the largest
 PATTERNS = 3  # number of sign patterns of the perturbations by which the effect of a tolerance is measured
 
 

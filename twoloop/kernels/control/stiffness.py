@@ -13,10 +13,10 @@ A trial also begins at smaller h rho if
   excite such components;
 - the whole run is expected to cost a thousand times as much as a trial.
 
-A trial that may be in vain waits until the run has cost a few times as much as a trial, or is expected to cost ten
+A trial that may bring nothing waits until the run has cost a few times as much as a trial, or is expected to cost ten
 times as much. Costs are counted in evaluations of the explicit method; with generated code, an evaluation of the
 implicit method counts several times. The explicit method is tried again if h rho is well below the limit, or if a
-second of motion costs more than before with the explicit method. A method that was tried in vain is tried again after
+second of motion costs more than before with the explicit method. A method that brought nothing is tried again after
 twice as many estimates.
 
 Kernels call both methods by their addresses, so that each method is compiled in its own module.
@@ -78,7 +78,7 @@ STABILITY_LIMIT = 3.0  # stability must limit the step of the explicit method if
 # needs finite differences, which take about eight evaluations per coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-# a trial that may be in vain begins only if the run has cost at least as much as this number of trials
+# a trial that may bring nothing begins only if the run has cost at least as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
 # after k trials, another one begins, whatever the rates are, if the run has cost k + 1 times this number, in units of
@@ -323,7 +323,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # a trial that may be in vain, or that needs finite differences, must cost little compared with the run so far
+    # a trial that may bring nothing, or that needs finite differences, must cost little compared with the run so far
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
