@@ -131,9 +131,13 @@ def processor() -> str:
 
 
 def named(known: Mapping[str, str]) -> str:
-    """The name of a processor, with its family where it has no number ("AMD EPYC"): times of generations differ."""
-    name, family = known.get("model name", ""), known.get("cpu family")
-    return f"{name} (family {family})" if name and family and not any(map(str.isdigit, name)) else name
+    """Name a processor and its vectors; with family and model where it has no number: times of generations differ."""
+    name, flags = known.get("model name", ""), known.get("flags", "").split()
+    width = "AVX-512" if "avx512f" in flags else "AVX2" if "avx2" in flags else ""
+    told = f"{name} with {width}" if name and width else name
+    for made in generation(known) if name and not any(map(str.isdigit, name)) else ():
+        told += f" ({made.removeprefix('cpu ')})"
+    return told
 
 
 def generation(known: Mapping[str, str]) -> list[str]:

@@ -77,8 +77,8 @@ def made_on(rows: pd.DataFrame, stamp: str) -> tuple[str, list[str]]:
 
 
 def short(processor: str) -> str:
-    """Name a processor in a table: without its family, and what makers add."""
-    return re.sub(r"\(R\)| \(family \d+\)| Processor", "", processor).strip()
+    """Name a processor in a table: without family and model, and what makers add."""
+    return re.sub(r"\(R\)| \(family [\w ]+\)| Processor", "", processor).strip()
 
 
 def write_index(output: Output) -> None:

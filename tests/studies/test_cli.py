@@ -34,10 +34,11 @@ def test_errors_and_ctrl_c_end_with_one_line(capsys):
     assert end.value.code == 130 and said.count("\n") == 1 and "the same command continues" in said
 
 
-def test_a_processor_is_known_by_its_family_where_its_name_is_short():
+def test_a_processor_is_named_with_its_vectors_and_its_family_where_its_name_is_short():
     assert cli.generation({"model name": "AMD EPYC", "cpu family": "26", "model": "2"}) == ["cpu family 26 model 2"]
     assert cli.generation({"model name": "a machine without families"}) == []
-    assert cli.named({"model name": "AMD EPYC", "cpu family": "26", "model": "2"}) == "AMD EPYC (family 26)"
+    known = {"model name": "AMD EPYC", "cpu family": "26", "model": "2", "flags": "fpu avx2 avx512f"}
+    assert cli.named(known) == "AMD EPYC with AVX-512 (family 26 model 2)"
     assert cli.named({"model name": "Xeon 8481C", "cpu family": "6"}) == "Xeon 8481C" and cli.named({}) == ""
 
 

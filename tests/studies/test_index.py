@@ -64,7 +64,7 @@ def test_one_study_runs_by_its_name(monkeypatch):
 STAMP = "# full crane; `python -m studies.crane`; 2026-11-2{}; commit abc; {}, 2 cores; Linux, Python 3.11.7"
 
 
-def made(folder, name, answer="It does.", rows="solver\na\n", day=5, machine="AMD EPYC (family 25)"):
+def made(folder, name, answer="It does.", rows="solver\na\n", day=5, machine="AMD EPYC (family 25 model 1)"):
     """Write a report with its findings and rows."""
     (folder / f"{name}.md").write_text("a report")
     (folder / f"{name}.json").write_text(json.dumps({"answer": answer} if answer else {}))

@@ -324,7 +324,8 @@ class IntegrationLoop:
         if self.deadline == np.inf or (run.system.n_q <= SMALL_SYSTEM and not run.system.called_in_python):
             yield
             return
-        timer = threading.Timer(self.deadline - time.monotonic(), notes.__setitem__, (indices.TIME_IS_UP, 1.0))
+        left = min(self.deadline - time.monotonic(), threading.TIMEOUT_MAX)
+        timer = threading.Timer(left, notes.__setitem__, (indices.TIME_IS_UP, 1.0))
         timer.daemon = True
         timer.start()
         try:
