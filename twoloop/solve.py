@@ -22,11 +22,11 @@ from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import begin_folder, check_folder, end_folder
-from twoloop.run.cached import STEPS, MissedChanges, Output, cached_result, fields_of, set_up
+from twoloop.run.cached import STEPS, MissedChanges, cached_result, fields_of, set_up
 from twoloop.run.fallbacks import MAX_REPETITIONS, gap_for_repetition, may_have_missed_changes
-from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_record
+from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_fields
 from twoloop.run.options import options_of
-from twoloop.run.record import FileStore, MemoryStore, OutputRequest, Status, record_of
+from twoloop.run.record import OutputRequest, Status, record_of
 from twoloop.run.run import SMALL_SYSTEM, Run
 from twoloop.run.signals import is_keyboard_interrupt
 
@@ -204,9 +204,8 @@ def solve_dae(
         run, every, spent, repeats = None, np.inf, 0.0, MAX_REPETITIONS
         in_time = time_limit is None or (time_limit >= LONGEST and system.n_q <= SMALL_SYSTEM)
         if folder is event_functions is options.own_tolerance is None and in_time and not progress:
-            is_default = times is time_limit is None and not dense_output
-            output = STEPS if is_default else Output(times, at_ends, bool(dense_output), time_limit)
-            outcome = cached_result(system, t0, t1, q0, v0, options, output, interrupts)
+            output = STEPS if times is None and not dense_output else OutputRequest(times, at_ends, bool(dense_output))
+            outcome = cached_result(system, t0, t1, q0, v0, options, output, time_limit, interrupts)
             if isinstance(outcome, tuple) and (not interrupts.n_signals or outcome[0]["status"] == Status.INTERRUPTED):
                 fields, rows_warning = outcome
                 if rows_warning:
@@ -226,17 +225,16 @@ def solve_dae(
                     run.control[run.a.APART] = every
             if left == repeats and run.rows_warning:
                 warnings.warn(run.rows_warning, ConstraintWarning, stacklevel=2)
-            with_code, lands = bool(run.plan.own), run.ends_at_outputs or at_ends
+            with_code = bool(run.plan.own)
             with _progress_bar(options.method.name, t0, t1) if progress else NO_BAR as report:
-                kept = MemoryStore() if folder is None else begin_folder(folder, system.n_q)
-                wanted = OutputRequest(times, lands, bool(dense_output), event_functions, kept)
+                files = None if folder is None else begin_folder(folder, system.n_q)
+                output = OutputRequest(times, at_ends, bool(dense_output), event_functions, files)
                 if deadline is None and time_limit is not None:  # setting up does not count
                     deadline = time.monotonic() + time_limit
                 limit = None if deadline is None else max(0.0, deadline - time.monotonic())
                 last = left == 0 or folder is not None
-                record = IntegrationLoop(run, t1, wanted, report, limit, interrupts, last).integrate_to_end(
-                    check_derivatives
-                )
+                loop = IntegrationLoop(run, t1, output, report, limit, interrupts, last)
+                record = loop.integrate_to_end(check_derivatives)
             keep_unused_workspace(run.work)
             if last or record.status < 0 or not may_have_missed_changes(run):
                 break
@@ -244,15 +242,15 @@ def solve_dae(
         if spent > 0.0:
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
         result = record_of(Result, fields_of(record, options, system, with_code, t1))
-        if isinstance(kept, FileStore):
-            end_folder(kept, result)
+        if folder is not None:
+            end_folder(files, result)
         return result
     except (KeyboardInterrupt, SystemError) as error:
         if not (is_keyboard_interrupt(error) and interrupts.returns_result(error)):
             raise
     finally:
         interrupts.restore_handlers()
-    return record_of(Result, vars(interrupted_record(system, t0, event_functions, options.method.name)))
+    return record_of(Result, interrupted_fields(system, t0, event_functions, options.method.name))
 
 
 @contextmanager

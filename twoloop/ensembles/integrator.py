@@ -18,7 +18,7 @@ from twoloop.methods.plan import Method
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
-from twoloop.run.options import check_method, check_options
+from twoloop.run.options import check_method, options_of
 from twoloop.run.record import record_of
 from twoloop.run.sampled import SampledRun, SampledState
 from twoloop.run.signals import signals_of
@@ -78,7 +78,7 @@ class Integrator:
         if unknown:
             raise TypeError(f"Integrator has no option {unknown[0]!r}; its options are {', '.join(sorted(names))}")
         option_values = {name: options.get(name, parameters[name].default) for name in names - {"events"}}
-        check_options(system, method, rtol, atol, **option_values)
+        options_of(system, method, rtol, atol, **option_values)
         check_events(options.get("events"))
         self.system = system
         self._options = {"method": check_method(method), "rtol": rtol, "atol": copy.copy(atol), **options}

@@ -50,7 +50,6 @@ from twoloop.run.record import (
     DEFAULTS,
     INITIAL_COUNTS,
     STEP_ARRAYS,
-    MemoryStore,
     OutputRequest,
     Record,
     Status,
@@ -87,25 +86,7 @@ HARMLESS = 0.01  # correction of v0 that is accepted in any case, relative to th
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
 
-class Output(NamedTuple):
-    """Requested output of a cached run."""
-
-    times: Array | None  # output times; None: the ends of all steps
-    at_ends: bool  # whether each output time is the start or the end of the run
-    dense: bool  # whether the dense solution `sol` is requested
-    time_limit: float | None  # limit of elapsed time, s
-
-    @property
-    def interpolated_times(self) -> Array | None:
-        """Output times if states must be interpolated, else None."""
-        return None if self.at_ends else self.times
-
-    def as_request(self, run: Run) -> OutputRequest:
-        """Return this output as an OutputRequest for `IntegrationLoop`."""
-        return OutputRequest(self.times, self.at_ends or run.ends_at_outputs, self.dense, None, MemoryStore())
-
-
-STEPS = Output(None, False, False, None)  # output at the ends of all steps
+STEPS = OutputRequest()  # output at the ends of all steps
 
 
 @dataclass(frozen=True)
@@ -169,7 +150,7 @@ class CachedIntegrator:
         return run.static_form is None and not run.start_warning and not run.system.called_in_python
 
     @staticmethod
-    def can_provide(run: Run, output: Output, shared: SharedSetup | None) -> bool:
+    def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
         """Return whether a cached integrator, which reuses its arrays, can provide the requested `output`."""
         # `sol` and interpolated output must agree; `sol` must not use arrays that are filled for other parameters
         if output.dense and (output.interpolated_times is not None or shared is not None):
@@ -185,7 +166,8 @@ class CachedIntegrator:
         t1: float,
         q0: Array,
         v0: Array,
-        output: Output,
+        output: OutputRequest,
+        time_limit: float | None,
         interrupts: Interrupts,
     ) -> dict[str, Any] | MissedChanges | None:
         """Integrate a system from a start; return the fields of the result, or a request to repeat the run.
@@ -229,7 +211,7 @@ class CachedIntegrator:
                 return None
             interrupts.install_handlers()
             n_rows, n = arrays.filled.tolist()
-            finished = self._finish_run(system, t1, q0, v0, output, interrupts, due, fields)
+            finished = self._finish_run(system, t1, q0, v0, output, time_limit, interrupts, due, fields)
             if not isinstance(finished, tuple):
                 return finished
             (timed_states,) = finished
@@ -247,7 +229,8 @@ class CachedIntegrator:
         t1: float,
         q0: Array,
         v0: Array,
-        output: Output,
+        output: OutputRequest,
+        time_limit: float | None,
         interrupts: Interrupts,
         due: bool,
         fields: dict[str, Any],
@@ -270,7 +253,7 @@ class CachedIntegrator:
                 return None
         if report[loops.END_CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.NOTHING_TO_CHECK]:
             self.loop_used = True
-            arguments = output.as_request(run), ignore_progress, output.time_limit, interrupts, False
+            arguments = output, ignore_progress, time_limit, interrupts, False
             loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
             loop.add_first_chunk(int(report[loops.END_CODE]), t[1:], rows[1:], steps, self.cpu_time)
             record = loop.integrate_to_end(self.check_derivatives)
@@ -291,7 +274,7 @@ class CachedIntegrator:
             fields["sol"] = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
         if output.times is not None:
             end_indices = [0 if time == run.t0 else -1 for time in output.times.tolist()]
-            states = rows[end_indices] if output.at_ends else self.interpolation.complete_rows(output.times)
+            states = rows[end_indices] if output.ends_at_outputs else self.interpolation.complete_rows(output.times)
             if states is None:
                 return None
             timed_states = output.times.copy(), states
@@ -502,7 +485,8 @@ def cached_result(
     q0: Array,
     v0: Array,
     options: Options,
-    output: Output,
+    output: OutputRequest,
+    time_limit: float | None,
     interrupts: Interrupts,
 ) -> tuple[dict[str, Any], str] | MissedChanges | Run | None:
     """Integrate with a cached integrator for a system and options; create it at the first call.
@@ -531,7 +515,7 @@ def cached_result(
             interrupts.install_handlers()
             run = entry.run.copy() if run is None else run
             integrator = CachedIntegrator(run, system, entry.code, entry.definite, options, entry.shared)
-        outcome = integrator.integrate(system, t0, t1, q0, v0, output, interrupts)
+        outcome = integrator.integrate(system, t0, t1, q0, v0, output, time_limit, interrupts)
         rows_warning = integrator.run.rows_warning
         if len(entry.idle) < MAX_IDLE:
             entry.idle.append(integrator)

@@ -55,6 +55,7 @@ from twoloop.run.record import (
     DEFAULTS,
     INITIAL_COUNTS,
     STEP_ARRAYS,
+    MemoryStore,
     OutputRequest,
     Record,
     Recorder,
@@ -64,6 +65,7 @@ from twoloop.run.record import (
     fields_of_run,
     interval_kinds,
     record_of,
+    state_fields,
     statistics,
     step_fields,
 )
@@ -81,14 +83,9 @@ class Interrupts:
     """Handler of Ctrl-C that replaces Python's own (never a user's) until `restore_handlers` is called.
 
     Before `install_handlers`, Ctrl-C raises KeyboardInterrupt, because there is no result yet that would be lost.
-
-    Attributes
-    ----------
-    n_signals : int
-        Number of signals so far.
     """
 
-    n_signals, _is_installed = 0, False
+    n_signals, _is_installed = 0, False  # number of signals so far
     handlers: SignalHandlers | None = None
 
     def install_handlers(self) -> "Interrupts":
@@ -128,28 +125,16 @@ def describe_interrupt(t: float, table: Array) -> str:
     return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{nan_note}"
 
 
-def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Record:
-    """Return the record, without states, of a run that Ctrl-C ended before its first step."""
-    n_q, empty = system.n_q, np.zeros(0)
-    columns = np.zeros((n_q, 0))
-    occurrences = None if events is None else [empty for _ in events]
-    states = None if events is None else [np.zeros((0, n_q)) for _ in events]
-    return Record(
-        t=empty,
-        q=columns,
-        v=columns.copy(),
-        a=columns.copy(),
-        lam=np.zeros((system.n_c + system.n_a, 0)),
-        h=empty.copy(),
-        status=Status.INTERRUPTED,
-        message=describe_interrupt(t0, columns.T) + failure_link(Status.INTERRUPTED),
-        stats=Statistics(n_accepted=0),
-        t_events=occurrences,
-        q_events=states,
-        v_events=states,
-        system=system,
-        method=method,
-    )
+def interrupted_fields(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> dict[str, Any]:
+    """Return the fields, without states, of a run that Ctrl-C ended before its first step."""
+    table = np.zeros((0, 3 * system.n_q + system.n_c + system.n_a))
+    fields = state_fields(system.n_q, np.zeros(0), table) | {"h": np.zeros(0), "stats": Statistics(n_accepted=0)}
+    message = describe_interrupt(t0, table) + failure_link(Status.INTERRUPTED)
+    fields |= {"status": Status.INTERRUPTED, "message": message, "system": system, "method": method}
+    if events is not None:
+        states = [np.zeros((0, system.n_q)) for _ in events]
+        fields |= {"t_events": [np.zeros(0) for _ in events], "q_events": states, "v_events": states}
+    return DEFAULTS | fields
 
 
 BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
@@ -170,24 +155,10 @@ _spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for 
 class IntegrationLoop:
     """Loop that integrates a run to its end, and records it.
 
-    Parameters
-    ----------
-    run : Run
-        A run at its start, or after a first chunk of steps, which `add_first_chunk` then records.
-    t1 : float
-        End of the run, s.
-    request : OutputRequest
-    report : callable
-        Called with the time reached after each chunk.
-    time_limit : float or None
-        Limit of elapsed time, s.
-    interrupts : Interrupts
-    is_final_attempt : bool
-        Whether the run warns if it may have missed short changes; else the caller repeats it.
-    start : ndarray, optional
-        The row [q, v, a, lam] at the start. None: the state of the run, which must be at its start.
-    system : ConstrainedSystem, optional
-        System of the result. None: the run's system, which must not be a copy whose arrays will be overwritten.
+    The run is at its start, or after a first chunk of steps, which `add_first_chunk` then records. In the second case,
+    `start` is the row [q, v, a, lam] at the start. `system`: the system of the result, if that of the run is a copy
+    whose arrays will be overwritten. `report` is called with the time reached after each chunk. `is_final_attempt`:
+    whether the run warns if it may have missed short changes; else the caller repeats it.
     """
 
     def __init__(
@@ -202,7 +173,9 @@ class IntegrationLoop:
         start: Array | None = None,
         system: ConstrainedSystem | None = None,
     ):
-        self.run, self.t1, self.request, self.is_final_attempt = run, t1, request, is_final_attempt
+        ends_at_outputs, store = request.ends_at_outputs or run.ends_at_outputs, request.store or MemoryStore()
+        self.request = request = request._replace(ends_at_outputs=ends_at_outputs, store=store)
+        self.run, self.t1, self.is_final_attempt = run, t1, is_final_attempt
         run.t1 = t1
         self.start, self.system = run.state if start is None else start, run.system if system is None else system
         self.report, self.interrupts = report, interrupts

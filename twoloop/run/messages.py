@@ -20,7 +20,7 @@ from twoloop.kernels.control.loop_state import DISPLACEMENT, INNER_TOL, initial_
 from twoloop.kernels.control.singular_positions import EPS
 from twoloop.kernels.data import indices
 from twoloop.methods.plan import Plan
-from twoloop.run.record import LaterFields, Status
+from twoloop.run.record import Status
 from twoloop.run.singular_positions import (
     WEAK_RATIO,
     TimedState,
@@ -47,15 +47,10 @@ STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
 class StallDetector:
     """Monitor of the sizes of accepted steps, to detect a run that makes no progress.
 
-    Parameters
-    ----------
-    t0 : float
-        Start of the run, s.
-    max_steps_left : float
-        Largest number of steps that the rest of the run may take, with the mean size of the last steps.
+    With the mean size of the last steps, the rest of the run may take at most `max_steps_left` steps.
     """
 
-    def __init__(self, t0: float, max_steps_left: float = MAX_STEPS_LEFT):
+    def __init__(self, t0: float, max_steps_left: float):
         self.max_steps_left = max_steps_left
         self.window_t, self.window_n = t0, 0
         self.longest_step = self.mean_step = 0.0
@@ -230,19 +225,17 @@ def _describe_jumps_and_crossings(run: "Run") -> str:
     return text + (CROSSINGS_MARK if run.crossings else "")
 
 
-def message_of(run: "Run", text: str, system: "ConstrainedSystem", later: LaterFields | None = None) -> dict[str, Any]:
+def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} with a function that computes the text when it is read.
 
     The text is computed later if it describes crossings, because that takes longer than many runs. Until then `system`
-    must not change; the arrays of the run may. `later`: function that computes other deferred fields by their names.
+    must not change; the arrays of the run may.
     """
     if CROSSINGS_MARK not in text:
         return {"message": text}
     crossings, end_state, rank = run.crossings, (float(run.clock[run.a.T]), run.state.copy()), run.rank
 
     def fields_of(name: str) -> dict[str, Any]:
-        if name != "message" and later is not None:
-            return later(name)
         return {"message": text.replace(CROSSINGS_MARK, describe_crossings(system, crossings, end_state, rank))}
 
     # functions called in Python may depend on variables that change: compute the message now

@@ -80,7 +80,10 @@ def options_of(
     check_derivatives: Any,
     compiled: Any,
 ) -> Options:
-    """Return the validated options of a call; arguments that are the objects of the last call are not checked again."""
+    """Return the validated options of a call; raise TypeError or ValueError if one is wrong.
+
+    Arguments that are the objects of the last call are not checked again.
+    """
     last_arguments, options = system.shared.get("options", NO_OPTIONS)
     m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last_arguments
     # written out, because a loop or a tuple would take a tenth of the time of a short repeated call
@@ -88,42 +91,18 @@ def options_of(
     same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
     if same and checks is check_derivatives and code is compiled:
         return options  # type: ignore[no-any-return]
-    last_arguments = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
-    last_arguments = *last_arguments, check_derivatives, compiled
-    options = check_options(system, *last_arguments)
-    if type(atol) is float and is_preset(method):  # the caller may change objects of other types
-        system.shared["options"] = last_arguments, options
-    return options
-
-
-def check_options(
-    system: ConstrainedSystem,
-    method: Any,
-    rtol: Any,
-    atol: Any,
-    first_step: Any,
-    max_step: Any,
-    max_steps: Any,
-    step_size: Any,
-    dense_output: Any,
-    progress: Any,
-    time_limit: Any,
-    check_derivatives: Any,
-    compiled: Any,
-) -> Options:
-    """Return the validated options of a call; raise TypeError or ValueError if one is wrong."""
     check_flag("dense_output", dense_output)
     if progress is not None:
         check_flag("progress", progress)
-    compiled = check_compiled(compiled)
+    generates = check_compiled(compiled)
     check_flag("check_derivatives", check_derivatives)
     method_object = check_method(method)
     check_positive("rtol", rtol)
-    atol = check_tolerance("atol", atol, system.n_q)
-    if max(rtol, atol.min()) < SMALLEST_TOLERANCE:
+    tolerances = check_tolerance("atol", atol, system.n_q)
+    if max(rtol, tolerances.min()) < SMALLEST_TOLERANCE:
         raise ValueError(
             f"rtol and atol must not both be below {SMALLEST_TOLERANCE:g}, where rounding hides the error; given "
-            f"{rtol!r} and {float(atol.min())!r}"
+            f"{rtol!r} and {float(tolerances.min())!r}"
         )
     if first_step is not None:
         check_positive("first_step", first_step)
@@ -140,7 +119,11 @@ def check_options(
     if time_limit is not None:
         check_positive("time_limit", time_limit)
     step_options = first_step, float(max_step), max_steps, step_size
-    return Options(method_object, float(rtol), atol, *step_options, compiled, bool(check_derivatives))
+    options = Options(method_object, float(rtol), tolerances, *step_options, generates, bool(check_derivatives))
+    if type(atol) is float and is_preset(method):  # the caller may change objects of other types
+        arguments = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress
+        system.shared["options"] = (*arguments, time_limit, check_derivatives, compiled), options
+    return options
 
 
 def check_method(method: str | Method) -> Method:

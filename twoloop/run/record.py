@@ -115,9 +115,6 @@ class FileStore:
         self._shapes[name] = dtype, shape
 
 
-Store = MemoryStore | FileStore
-
-
 def memory_map(path: Path) -> NDArray[Any]:
     """Return the array in a NumPy file as a memory map, copy-on-write: changes of the array do not change the file."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
@@ -138,29 +135,19 @@ Array = NDArray[np.float64]
 MAX_PENDING_STATES = 1024  # largest number of states that wait for the search for events, and for interpolation
 
 
-@dataclass(frozen=True)
-class OutputRequest:
-    """Requested output of a run.
+class OutputRequest(NamedTuple):
+    """Requested output of a run."""
 
-    Attributes
-    ----------
-    times : ndarray or None
-        Output times; None: the ends of all accepted steps.
-    ends_at_outputs : bool
-        Whether steps end at all output times, so that no states are interpolated.
-    dense : bool
-        Whether the dense solution is requested.
-    events : list of Event or None
-        Events to be searched for; None: no events were requested.
-    store : MemoryStore or FileStore
-        Store to which the output is added.
-    """
+    times: Array | None = None  # output times; None: the ends of all accepted steps
+    ends_at_outputs: bool = False  # whether steps end at all output times, so that no states are interpolated
+    dense: bool = False  # whether the dense solution is requested
+    events: list[Event] | None = None  # events to be searched for; None: no events were requested
+    store: Any = None  # `MemoryStore` or `FileStore` to which the output is added; None: a new MemoryStore
 
-    times: Array | None
-    ends_at_outputs: bool
-    dense: bool
-    events: list[Event] | None
-    store: Store
+    @property
+    def interpolated_times(self) -> Array | None:
+        """Output times if states must be interpolated, else None."""
+        return None if self.ends_at_outputs else self.times
 
     @property
     def every_step(self) -> bool:
@@ -170,7 +157,7 @@ class OutputRequest:
     @property
     def between_steps(self) -> bool:
         """Whether states within steps are needed: for output times, the dense solution, or events."""
-        return (self.times is not None and not self.ends_at_outputs) or self.dense or self.events is not None
+        return self.interpolated_times is not None or self.dense or self.events is not None
 
 
 class _TableInterpolation(NamedTuple):
@@ -369,7 +356,6 @@ class Recorder:
 
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
-LaterFields = Callable[[str], dict[str, Any]]  # computes a deferred field by its name, with related fields
 
 
 class Status(IntEnum):

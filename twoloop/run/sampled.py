@@ -26,7 +26,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.fallbacks import MAX_REPETITIONS, gap_for_repetition, may_have_missed_changes, warn_of_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
-from twoloop.run.record import MemoryStore, OutputRequest, Record, Status, statistics
+from twoloop.run.record import OutputRequest, Record, Status, statistics
 from twoloop.run.run import Run
 from twoloop.run.signals import signals_of
 from twoloop.run.singular_start import branch_at
@@ -275,10 +275,10 @@ class SampledRun:
         """Integrate to `end` by IntegrationLoop (after many steps, or at a jump); raise RuntimeError if that fails."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
-        request = OutputRequest(np.array([end]), True, False, None, MemoryStore())
         interrupts = Interrupts().install_handlers()
         try:
-            record = IntegrationLoop(run, end, request, lambda t: None, None, interrupts).integrate_to_end(False)
+            output = OutputRequest(np.array([end]), ends_at_outputs=True)
+            record = IntegrationLoop(run, end, output, lambda t: None, None, interrupts).integrate_to_end(False)
         finally:
             interrupts.restore_handlers()
         run.control[run.a.STORE_ALL], run.work.notes[indices.KINK_AFTER] = 0.0, np.inf
