@@ -100,19 +100,8 @@ class MissedChanges:
 class CachedIntegrator:
     """Integrator that reuses one plan and the same arrays for many starts, one after another.
 
-    Parameters
-    ----------
-    run : Run
-        A run at its start, which no other object uses.
-    system : ConstrainedSystem
-        System given by the user; `run.system` may be a copy with derived callbacks.
-    code : GeneratedCode or None
-        The generated code that the plan of the run calls.
-    definite : bool
-        Whether M is definite at the start.
-    options : Options
-    shared : SharedSetup or None
-        Setup for systems with other parameters; None: the integrator is used for `system` only.
+    `run` is at its start, and used by no other object; its plan calls `code`, and its system may be a copy of `system`
+    with derived callbacks. With `shared`, the integrator serves systems with other parameters, too.
     """
 
     def __init__(
@@ -137,7 +126,7 @@ class CachedIntegrator:
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
-        self.attributes_at_start = {key: getattr(run, key) for key in ("plan", "memory", "chunk", "kit", "functions")}
+        self.attributes_at_start = {key: getattr(run, key) for key in ("plan", "memory", "chunk", "kit")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.interpolation = OutputInterpolation(run)
         self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether generated code is called
@@ -300,7 +289,7 @@ class CachedIntegrator:
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
             # the run's own plan is unchanged, but its kit may have been renewed to load a step: use the new kit
-            self.attributes_at_start |= {"kit": run.kit, "functions": run.functions}
+            self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
     def _compare_callbacks(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
@@ -341,8 +330,8 @@ def fields_of(
 
 
 def _deferred_field(
-    data: Array,
-    timed_states: tuple[Array, Array] | None,
+    data: Array,  # copy of the run's report, times, steps and states
+    timed_states: tuple[Array, Array] | None,  # output times and states; None: all steps
     run_fields: tuple[int, NDArray[np.int64], bool],
     cpu_time: float,
     system: ConstrainedSystem,
@@ -350,10 +339,7 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Return a dict with the deferred field `name` of a result, and with other fields that are computed with it.
-
-    `data`: copy of the run's report, times, steps and states. `timed_states`: output times and states; None: all steps.
-    """
+    """Return a dict with the deferred field `name` of a result, and with other fields that are computed with it."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -529,12 +515,8 @@ def set_up(
 ) -> tuple[Run, CacheEntry | None]:
     """Return a run at its start (new, or a copy of a cached run), and the cache entry if one was added for it, or None.
 
-    Runs are cached if the method is one of twoloop's own, callbacks are compiled, and traces are trusted.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the start is refused, the method cannot run the system, or requested code cannot be generated.
+    Runs are cached if the method is one of twoloop's own, callbacks are compiled, and traces are trusted. Raise
+    TypeError or ValueError if the start is refused, the method cannot run the system, or code cannot be generated.
     """
     if system.called_in_python:  # functions called in Python may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None

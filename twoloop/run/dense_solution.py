@@ -60,21 +60,8 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 class Interpolator:
     """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-        The problem.
-    t0, row : float, ndarray (3 n_q,)
-        Time and row [q, v, a] of a state of the run.
-    rtol : float
-        Relative tolerance of the run.
-    atol : ndarray (n_q,)
-        Absolute tolerances.
-    ranks : (int, int)
-        Rank of C_q, and rank of [C_q; A].
-    plans : dict, optional
-        By kind of interval, the plan that divides intervals of this kind into `plan.parts` equal steps. Intervals of
-        other kinds are not divided.
+    `t0` and `row`: time and [q, v, a] of a state of the run. `ranks`: those of C_q and [C_q; A]. `plans`: by kind of
+    interval, the plan that divides it into `plan.parts` equal steps; intervals of other kinds are not divided.
     """
 
     def __init__(
@@ -436,12 +423,7 @@ def _warn_of_lost_rank(consequence: str, stacklevel: int = 4) -> None:
 
 
 class OutputInterpolation:
-    """Interpolation of states at output times, for successive runs that use the arrays of one Run.
-
-    Parameters
-    ----------
-    run : Run
-    """
+    """Interpolation of states at output times, for successive runs that use the arrays of one Run."""
 
     def __init__(self, run: Run):
         self.run, self._rows = run, np.zeros((0, 0))
@@ -571,13 +553,7 @@ class DenseSolution:
         self.t_min, self.t_max = float(table.t[0]), t_max
 
     def __call__(self, t: ArrayLike) -> DenseState:
-        """Return the state at one time or at times (n,) in any order.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If t is no number or vector, or not within the run.
-        """
+        """Return the state at one time, or at times (n,) in any order; raise if one is not within the run."""
         times = check_real("t", t)
         if times.ndim > 1:
             raise ValueError(f"t must be a number or have shape (n,); given {shaped(times)}")

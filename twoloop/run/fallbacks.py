@@ -157,10 +157,9 @@ def load_next_step(run: Run) -> None:
 def _renew_kit(run: Run) -> None:
     """Replace the kit of a run by one that calls the steps of the run's current plan."""
     if run.static_form is None:
-        run.kit = kit_for_plan(run.system, run.functions.flags, run.plan)
+        run.kit = kit_for_plan(run.system, run.kit.flags, run.plan)
     else:
         run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static_form)
-    run.functions = run.kit.functions
 
 
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:

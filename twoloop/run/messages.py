@@ -473,7 +473,7 @@ def describe_not_finite(run: "Run") -> str:
     """Return words that name the callback that returned a value that is not finite, or that say where to look."""
     kind, fault_time = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
-        name = run.functions._fields[kind]
+        name = run.kit.functions._fields[kind]
         return f"{name} of {run.system.name!r} returned a value that is not finite at t = {fault_time:.10g}"
     n, t = run.system.n_q, float(run.clock[run.a.T])
     q, v = run.state[:n], run.state[n : 2 * n]

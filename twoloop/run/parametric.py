@@ -35,20 +35,10 @@ PLAN_FIELDS = ("interior", "substitute", "within_newton")  # fields of a plan wh
 class SharedSetup:
     """Setup shared by the runs of systems that differ only in their parameters.
 
-    Parameters
-    ----------
-    run : Run
-        A run of one of the systems at its start; copies of this run are integrated.
-    code : GeneratedCode or None
-        The generated code that its plan calls.
-    method, fixed, compiled
-        Options with which the code was requested; `fixed`: whether the step size is constant.
-
-    Raises
-    ------
-    ValueError
-        If setup cannot be shared: because the system is large, because a callback may branch on its parameters, or
-        because numbers in the plan of `run` differ from the values of their traced expressions.
+    Copies of `run`, a run of one of the systems at its start, are integrated; its plan calls `code`, requested with
+    `method`, `fixed` (whether the step size is constant) and `compiled`. Raise ValueError if setup cannot be shared:
+    because the system is large, because a callback may branch on its parameters, or because numbers in the plan differ
+    from the values of their traced expressions.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -83,18 +73,8 @@ class SharedSetup:
 class ParametricRun:
     """Run whose arrays `use_parameters_of` fills with the parameters of one system after another.
 
-    Parameters
-    ----------
-    shared : SharedSetup
-    run : Run
-        A copy of the run of `shared`, at its start.
-
-    Attributes
-    ----------
-    current_system : ConstrainedSystem
-        The system whose parameters the arrays contain.
-    system : ConstrainedSystem
-        A copy of `current_system` with the arrays of this run, and with a cache of its own.
+    `run` is a copy of the run of `shared`, at its start. The arrays contain the parameters of `current_system`;
+    `system` is a copy of that system with these arrays, and with a cache of its own.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
@@ -112,7 +92,6 @@ class ParametricRun:
         }
         self._fill_arrays(run.system)
         run.kit = kit_for_plan(self.system, run.kit.flags, run.plan)
-        run.functions = run.kit.functions
 
     def use_parameters_of(self, system: ConstrainedSystem) -> bool:
         """Fill the arrays with the parameters of a system; return False if they contained these parameters already."""

@@ -32,15 +32,9 @@ STEP_ARRAYS = ("h", "rejected_error", "rejected_convergence", "partitioned", "un
 
 
 class MemoryStore:
-    """Store of named arrays in memory; an array is a list of parts until it is read.
+    """Store of named arrays in memory; an array is a list of parts until it is read."""
 
-    Attributes
-    ----------
-    append_only : bool
-        Whether rows cannot be changed after they were added, so that they must be complete.
-    """
-
-    append_only = False
+    append_only = False  # whether rows cannot be changed after they were added, so that they must be complete
 
     def __init__(self) -> None:
         self._parts: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
@@ -60,17 +54,7 @@ class MemoryStore:
 
 
 class FileStore:
-    """Store of named arrays in a new folder: each array is a NumPy file, which is valid after each call of `add`.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Raises
-    ------
-    OSError
-        In `add`, if the disk is full.
-    """
+    """Store of named arrays in a new folder: each array is a NumPy file, which is valid after each call of `add`."""
 
     append_only = True
 
@@ -178,16 +162,6 @@ class Recorder:
 
     The interval of a step is searched for events when all states through which its polynomials go are known, so that
     the output does not depend on the chunks. Event functions are evaluated at least every `max_gap` seconds.
-
-    Attributes
-    ----------
-    search : EventSearch or None
-        Search for events, which contains the events so far.
-    n_steps, last_step_size : int, float
-        Number of steps searched so far, at most up to a terminal event; time, s, from the beginning of the last step to
-        this event, else 0.
-    interrupted : bool
-        Whether Ctrl-C interrupted the search for events, or the interpolation between the steps.
     """
 
     def __init__(
@@ -200,8 +174,9 @@ class Recorder:
         max_gap: float,
     ):
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
-        self.n_steps, self.last_step_size = 0, 0.0
-        self.interrupted = False
+        self.n_steps = 0  # number of steps searched so far, at most up to a terminal event
+        self.last_step_size = 0.0  # time, s, from the beginning of the last step to a terminal event
+        self.interrupted = False  # whether Ctrl-C interrupted the search for events, or the interpolation
         # states at the ends of intervals still to be searched for events, and earlier nodes of their polynomials
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)

@@ -228,17 +228,8 @@ class RerunPiece(NamedTuple):
 class IndependentRerun:
     """Integrator that reruns pieces of a run with another method, each from a given state.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    t, q, v : float, ndarray (n_q,)
-        A state of the run.
-    method : (method object, ndarray)
-        The method of the reruns, and the nodes (fractions of a step) at which it evaluates the equations.
-    rtol, atol : float, ndarray (n_q,)
-        Tolerances.
-    max_step : float
-        Largest step size, s.
+    t, q and v are a state of the run. `method`: the method of the reruns, and the nodes (fractions of a step) at which
+    it evaluates the equations.
     """
 
     def __init__(

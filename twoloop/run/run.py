@@ -23,7 +23,7 @@ from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.evaluation.tasks import SOLVE
-from twoloop.kernels.layout import cached_run, copy_workspace, empty_workspace
+from twoloop.kernels.layout import cached_run, copy_workspace
 from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
@@ -35,7 +35,7 @@ from twoloop.run.singular_positions import (
     describe_singular_start,
     singular_threshold,
 )
-from twoloop.run.workspace import kit_for_plan, kit_of, prepare_workspace, static_form, with_newton, workspace
+from twoloop.run.workspace import kit_for_plan, kit_of, static_form, with_newton, workspace
 
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
@@ -52,10 +52,7 @@ CONTRADICTION = 1e-6  # smallest residual of a row of C_q a = gamma, relative to
 class Run:
     """Data of an integration: plan, kit, workspace, state and controls; a new object is at the start of the run.
 
-    Raises
-    ------
-    ValueError
-        If the accelerations at the start cannot be computed, or the constraints contradict one another.
+    Raise ValueError if the accelerations there cannot be computed, or the constraints contradict one another.
     """
 
     def __init__(
@@ -82,7 +79,6 @@ class Run:
         self.static_form = static_form(system, t0, q0, *plans)
         self.matrices = max(each.matrices for each in plans)
         self.kit = kit_of(system, t0, q0, plan, self.static_form)
-        self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
         # ranks are computed at every start; those of the last start are a guess that often saves a second workspace
@@ -149,11 +145,8 @@ class Run:
         The run must not use the static form of linear algebra.
         """
         new_run = self._copy_without_workspace()
-        new_run.t0, new_run.compared_until = t0, [-np.inf]
-        work = empty_workspace(self.work.sizes)
-        prepare_workspace(work, self.system, self.kit.flags, new_run._pattern(q0), q0, self.rtol, self.reuse)
-        work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
-        new_run.work = work
+        new_run.t0, new_run.compared_until, new_run.state[: len(q0)] = t0, [-np.inf], q0
+        new_run.work = new_run._workspace(len(self.work.rows), len(self.work.rows_v))
         if new_run.restart(t0, q0, v0) != indices.DONE:
             return None
         new_run.redundant, new_run.rows_warning = new_run.find_redundant_rows()
@@ -196,16 +189,8 @@ class Run:
     ) -> int:
         """Take compiled steps to the last output time, or until Python must act; return the code of the reason.
 
-        Parameters
-        ----------
-        outputs : ndarray
-            Times at which steps must end.
-        buffers : tuple of ndarray
-            Arrays that are filled with times, states, and rows of steps.
-        filled : ndarray (2,)
-            Becomes the numbers of states and of steps in the buffers.
-        active : (Plan, ndarray, Kit), optional
-            Plan, controls and kit for this call. None: those of the run.
+        Steps must end at the times `outputs`. `filled` becomes the numbers of states and of steps in the buffers.
+        `active`: plan, controls and kit for this call, if they are not those of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
         tolerances = self.tolerances if plan is self.plan else self.crossing_tolerances
@@ -229,7 +214,6 @@ class Run:
         new_run.crossing_tolerances = new_run.tolerances
         if self.static_form is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # its flags may change
             new_run.kit = kit_for_plan(self.system, self.kit.flags, new_run.plan)
-            new_run.functions = new_run.kit.functions
         return new_run
 
     @property
@@ -252,18 +236,13 @@ class Run:
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Return a new workspace for the rank of C_q and the rank of all rows; None: full rank."""
         q0 = self.state[: self.system.n_q]
-        pattern = self._pattern(q0) if self.static_form is None else NO_PATTERN
+        pattern = pattern_of(self.system, self.t0, q0) if self.static_form is None else NO_PATTERN
         ranks = rank, rank_v
         work = workspace(
             self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static_form, self.matrices
         )
         work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         return work
-
-    def _pattern(self, q: Array) -> Array:
-        """Return the pattern (n_c + n_a, n_q) of [C_q; A]: 1 at entries that are not zero, else 0."""
-        system, t0 = self.system, self.t0
-        return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
     def may_succeed_in_other_form(self, code: int) -> bool:
         """Return whether steps failed in the static form of linear algebra, but may succeed in another form."""
@@ -289,7 +268,6 @@ class Run:
         if self.static_form is not None and self.plan.first is not None:
             self.plan = with_matrix_cost(self.plan, self.static_form.matrix_cost())
         self.kit = kit_of(self.system, t, q, self.plan, self.static_form)
-        self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = old_work.counters
         notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.KINK_BEFORE, indices.KINK_AFTER]
@@ -321,7 +299,6 @@ class Run:
                 self.system.derived["static form"] = None
             self.static_form = None
             self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
-            self.functions = self.kit.functions
             self.control[self.a.BRIDGE] = 1.0
             self.work = self._workspace()
             code = start(self.kit, self.work, self.t0, self.state)
@@ -353,14 +330,14 @@ class Run:
             f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {describe_not_finite(self)}"
         )
 
-    def find_redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
-        """Return the indices of dependent rows of [C_q; A] at the start, and a warning; `rows`: [C_q; A] there."""
+    def find_redundant_rows(self) -> tuple[NDArray[np.int64], str]:
+        """Return the indices of dependent rows of [C_q; A] at the start, and a warning."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
         independent_rows = set(self.work.rows_v.tolist())
         redundant = [i for i in range(n_rows) if i not in independent_rows]
-        rows = self._rows_at_start() if rows is None else rows
+        rows = self._rows_at_start()
         violated = self.violated_rows(rows).tolist()
         if violated:
             raise ValueError(

@@ -63,21 +63,8 @@ class SampledState(NamedTuple):
 class SampledRun:
     """Integration from sample to sample, with parameters of the forces that may change at samples.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-        A system that only this object uses: `set_parameters` changes its parameters.
-    method : Method
-    rtol, atol : float, ndarray (n_q,)
-    max_step : float
-    derivatives : bool
-        Whether derivatives are checked at the start.
-    t0, q0, v0 : float, ndarray (n_q,)
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the start is refused, or the method is a Taylor series, whose code is valid for given parameters only.
+    Only this object uses `system`, whose parameters `set_parameters` changes. Raise TypeError or ValueError if the
+    start is refused, or the method is a Taylor series, whose code is valid for given parameters only.
     """
 
     def __init__(

@@ -27,11 +27,7 @@ class SignalHandlers:
     exception becomes a `SystemError`; during compilation, it breaks numba for the rest of the process. So the call of a
     handler is delayed if a signal arrives in a compiler. Elsewhere the handler is called at once. As its exception may
     be mistaken for that of a callback, `call_delayed` (between chunks of steps) and `restore` raise it again.
-
-    Parameters
-    ----------
-    ctrl_c : bool
-        Whether to replace Python's own handler of Ctrl-C, too. `Interrupts` replaces that handler during integrations.
+    `ctrl_c`: whether to replace Python's own handler of Ctrl-C, too, as `Interrupts` does during integrations.
     """
 
     def __init__(self, ctrl_c: bool = False) -> None:
