@@ -242,7 +242,7 @@ def solve_dae(
         if spent > 0.0:
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
         result = record_of(Result, fields_of(record, options, system, with_code, t1))
-        if folder is not None:
+        if files is not None:
             end_folder(files, result)
         return result
     except (KeyboardInterrupt, SystemError) as error:

@@ -110,10 +110,7 @@ def consistent_states(
 class _LaneProjection:
     """Generated code that projects guesses onto the constraints of a system, in SIMD lanes.
 
-    Raises
-    ------
-    Untraceable
-        If code cannot be generated, or does not pay; the message says why.
+    Raise Untraceable if code cannot be generated, or does not pay; the message says why.
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts):

@@ -3,8 +3,7 @@
 from __future__ import annotations  # so that help() shows the name ArrayLike
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from twoloop.ensembles.lanes import (
 )
 from twoloop.ensembles.starts import Starts, all_starts, generic_system, is_inconsistent, system_of
 from twoloop.generate.graph import Untraceable
+from twoloop.methods.plan import Method
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.run.options import check_method
@@ -107,52 +107,28 @@ MAX_COMPILATION = 20.0
 
 @dataclass
 class LaneEnsemble:
-    """Runs of one system from t0 to t1, and their results so far.
-
-    Attributes
-    ----------
-    system : ConstrainedSystem
-    starts : Starts
-    t1 : float
-    times : ndarray (n_t,)
-        Output times.
-    rtol, atol : float, ndarray (n_q,)
-    q, v : ndarray (n_runs, n_q, n_t)
-        NaN where there is no result yet.
-    n_steps, n_evaluations : ndarray (n_runs,)
-    methods : list of str
-        Methods that integrated runs in lanes.
-    method_of : ndarray (n_runs,)
-        Index in `methods` of the method that integrated each run in lanes; -1: none.
-    reasons : dict
-        Why runs were left to `solve_dae`, by their numbers.
-    refusal : str
-        Why no run was integrated in lanes, or none by the first method.
-    deadline : float
-        Time of `time.monotonic` at which runs stop; compilation delays it.
-    """
+    """Runs of one system from t0 to t1, and their results so far."""
 
     system: ConstrainedSystem
     starts: Starts
     t1: float
-    times: Array
+    times: Array  # output times
     rtol: float
     atol: Array
-    q: Array = field(init=False)
-    v: Array = field(init=False)
-    n_steps: Integers = field(init=False)
-    n_evaluations: Integers = field(init=False)
-    method_of: NDArray[np.int8] = field(init=False)
-    methods: list[str] = field(default_factory=list)
-    reasons: dict[int, str] = field(default_factory=dict)
-    refusal: str = ""
-    deadline: float = np.inf
+    method: Method
+    events: Any
 
     def __post_init__(self) -> None:
         n_runs = len(self.starts.q)
+        # coordinates and velocities (n_runs, n_q, n_t); NaN where there is no result yet
         self.q, self.v = np.full((2, n_runs, self.system.n_q, len(self.times)), np.nan)
-        self.n_steps, self.n_evaluations = np.zeros((2, n_runs), dtype=np.int64)
-        self.method_of = np.full(n_runs, -1, dtype=np.int8)
+        self.status, self.n_steps, self.n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
+        self.methods: list[str] = []  # methods that integrated runs in lanes
+        self.method_of = np.full(n_runs, -1, dtype=np.int8)  # index in `methods` for each run in lanes; -1: none
+        self.reasons: dict[int, str] = {}  # why runs were left to `solve_dae`, by their numbers
+        self.messages: dict[int, str] = {}  # messages of the runs that failed, by their numbers
+        self.refusal = ""  # why no run was integrated in lanes, or none by the first method
+        self.deadline = np.inf  # time of `time.monotonic` at which runs stop; compilation delays it
 
     @property
     def in_lanes(self) -> Flags:
@@ -164,12 +140,7 @@ class LaneEnsemble:
         """Integrate the runs that can be integrated in lanes, by the methods of a preset.
 
         `first` is the first run, integrated by `solve_dae`. It shows whether the motion is stiff and what runs cost,
-        and its end is compared with that of the same run in lanes.
-
-        Raises
-        ------
-        ValueError
-            If a start is not consistent, naming the run.
+        and its end is compared with that of the same run in lanes. Raise ValueError if a start is not consistent.
         """
         stiff = (first.stats.n_jacobians or 0) > 0
         series_is_costly = method == "auto" and not stiff and is_series_costly(generic_system(self.system, self.starts))
@@ -191,18 +162,31 @@ class LaneEnsemble:
             except Untraceable as reason:
                 self.refusal = self.refusal or str(reason)
 
-    def max_step(self, run: int) -> float:
-        """Return the largest step size, s, of a run integrated singly: small if lanes found short forces in it."""
-        return (self.t1 - self.starts.t0) / N_SHORT if self.reasons.get(run) == REASONS[SHORT_FORCE] else np.inf
+    def solve_singly(self, run: int, time_limit: float, factor: float = 1.0) -> Result:
+        """Integrate a run by `solve_dae`, with `factor` times the tolerances, and record its result."""
+        options: dict[str, Any] = {"time_limit": time_limit} if time_limit < np.inf else {}
+        if self.reasons.get(run) == REASONS[SHORT_FORCE]:  # lanes found short forces in this run
+            options["max_step"] = (self.t1 - self.starts.t0) / N_SHORT
+        options |= {"method": self.method, "rtol": factor * self.rtol, "atol": factor * self.atol}
+        options |= {"t_eval": self.times, "events": self.events}
+        start, system = (self.starts.q[run], self.starts.v[run]), system_of(self.system, self.starts, run)
+        try:
+            result = solve_dae(system, (self.starts.t0, self.t1), *start, **options)
+        except ValueError as error:
+            raise with_run_number(run, error) from error
+        if result.status is Status.INTERRUPTED:  # Ctrl-C ends all runs, as it does in lanes
+            raise KeyboardInterrupt
+        for out, states in ((self.q, result.q), (self.v, result.v)):
+            out[run, :, : len(result.t)], out[run, :, len(result.t) :] = states, np.nan
+        self.status[run], self.n_steps[run] = int(result.status), result.stats.n_accepted or 0
+        self.n_evaluations[run] = result.stats.n_evaluations or 0
+        self.messages.pop(run, None)
+        if not result.success:
+            self.messages[run] = result.message
+        return result
 
     def _integrate(self, lanes: LaneRuns, numbers: Integers, first: Result, threads: int) -> None:
-        """Integrate the runs with these numbers in lanes.
-
-        Raises
-        ------
-        Untraceable
-            If the first run does not end where it does by `solve_dae`.
-        """
+        """Integrate these runs in lanes; raise Untraceable if the first does not end where `first` does."""
         starts, t1, times, rtol, atol = self.starts, self.t1, self.times, self.rtol, self.atol
         for run in numbers[is_inconsistent(lanes.kit, starts)[numbers]].tolist():
             _check_start(self.system, starts, run)
@@ -353,39 +337,6 @@ def ensemble(
     >>> runs.q.shape, bool(runs.success.all())  # runs, coordinates, times
     ((3, 2, 3), True)
     """
-    with SignalHandlers():
-        return _integrate(
-            system,
-            t_span,
-            q0,
-            v0,
-            parameters=parameters,
-            rtol=rtol,
-            atol=atol,
-            t_eval=t_eval,
-            method=method,
-            events=events,
-            threads=threads,
-            time_limit=time_limit,
-        )
-
-
-def _integrate(
-    system: ConstrainedSystem,
-    t_span: tuple[float, float],
-    q0: ArrayLike,
-    v0: ArrayLike,
-    *,
-    parameters: ArrayLike | None,
-    rtol: float,
-    atol: ArrayLike,
-    t_eval: ArrayLike | None,
-    method: str,
-    events: Any,
-    threads: int | None,
-    time_limit: float | None,
-) -> Runs:
-    """Integrate the runs of `ensemble`."""
     check_system(system)
     t0, t1 = check_span(t_span)
     if time_limit is not None:
@@ -396,59 +347,38 @@ def _integrate(
     times = np.array([t0, t1]) if t_eval is None else check_times(t_eval, t0, t1, None)
     n_threads = threads_of(None if threads is None else check_size("threads", threads, 1))
     starts = all_starts(system, t0, q0, v0, parameters)
-    runs = LaneEnsemble(system, starts, t1, times, float(rtol), tolerance)
-    n_runs = len(starts.q)
-    status = np.zeros(n_runs, dtype=np.int64)
-    options = {"rtol": float(rtol), "atol": tolerance, "t_eval": times, "method": method_object, "events": events}
-    messages: dict[int, str] = {}
-
-    def solve_singly(run: int, max_step: float = np.inf, limit: float = np.inf) -> Result:
-        limited = {"time_limit": limit} if limit < np.inf else {}
-        result = _solve_one(system, starts, run, (t0, t1), options | {"max_step": max_step} | limited)
-        if result.status is Status.INTERRUPTED:  # Ctrl-C ends all runs, as it does in lanes
-            raise KeyboardInterrupt
-        for out, states in ((runs.q, result.q), (runs.v, result.v)):
-            out[run, :, : len(result.t)], out[run, :, len(result.t) :] = states, np.nan
-        status[run], runs.n_steps[run] = int(result.status), result.stats.n_accepted or 0
-        runs.n_evaluations[run] = result.stats.n_evaluations or 0
-        messages.pop(run, None)
-        if not result.success:
-            messages[run] = result.message
-        return result
-
-    may_use_lanes = events is None and method in IN_LANES and n_runs > 1
-    # the first run, with which lanes are compared, gets smaller tolerances
-    if may_use_lanes and float(rtol) > TIGHT_TOLERANCE and tolerance.min() > TIGHT_TOLERANCE:
-        options |= {"rtol": FIRST_RUN_FACTOR * float(rtol), "atol": FIRST_RUN_FACTOR * tolerance}
-    total_time = np.inf if time_limit is None else float(time_limit)
-    # the first run checks the system and its derivatives
-    first = solve_singly(0, limit=total_time if n_runs == 1 else MAX_FIRST_SHARE * total_time)
-    runs.deadline = time.monotonic() + total_time - min(first.stats.cpu_time, MAX_FIRST_SHARE * min(total_time, 1e9))
-    options |= {"rtol": float(rtol), "atol": tolerance}
+    runs = LaneEnsemble(system, starts, t1, times, float(rtol), tolerance, method_object, events)
     if events is not None:
         runs.refusal = "events are looked for in single runs only"
     elif method not in IN_LANES:
         runs.refusal = f"{method_object.name} does not go in lanes"
-    elif n_runs > 1:
-        runs.integrate_in_lanes(str(method), first, n_threads)
+    with SignalHandlers():
+        return _integrate(runs, str(method), n_threads, np.inf if time_limit is None else float(time_limit))
+
+
+def _integrate(runs: LaneEnsemble, method: str, threads: int, time_limit: float) -> Runs:
+    """Integrate the first run, then the others, in lanes unless `runs.refusal` says why not."""
+    n_runs, may_use_lanes = len(runs.status), not runs.refusal and len(runs.status) > 1
+    # the first run checks the system and its derivatives; lanes are compared with it, so it gets smaller tolerances
+    is_tight = min(runs.rtol, float(runs.atol.min())) <= TIGHT_TOLERANCE
+    factor = FIRST_RUN_FACTOR if may_use_lanes and not is_tight else 1.0
+    first = runs.solve_singly(0, time_limit if n_runs == 1 else MAX_FIRST_SHARE * time_limit, factor)
+    runs.deadline = time.monotonic() + time_limit - min(first.stats.cpu_time, MAX_FIRST_SHARE * min(time_limit, 1e9))
+    if may_use_lanes:
+        runs.integrate_in_lanes(method, first, threads)
     singly = ~runs.in_lanes
-    _share_time(np.flatnonzero(singly).tolist(), solve_singly, status, messages, runs)
-    reasons = {run: runs.reasons.get(run, runs.refusal) for run in np.flatnonzero(singly).tolist()}
+    numbers = np.flatnonzero(singly).tolist()
+    _share_time(numbers, runs)
+    reasons = {run: runs.reasons.get(run, runs.refusal) for run in numbers}
     if runs.methods or not runs.refusal:
         reasons[0] = FIRST_RUN_REASON
-    message, counts = _summary(status, runs, reasons), (runs.n_steps, runs.n_evaluations)
-    return Runs(times, runs.q, runs.v, status, *counts, singly, message, messages, reasons)
+    message, counts = _summary(runs, reasons), (runs.n_steps, runs.n_evaluations)
+    return Runs(runs.times, runs.q, runs.v, runs.status, *counts, singly, message, runs.messages, reasons)
 
 
-def _share_time(
-    run_numbers: list[int],
-    solve_singly: Callable[..., Result],
-    status: Integers,
-    messages: dict[int, str],
-    runs: LaneEnsemble,
-) -> None:
+def _share_time(run_numbers: list[int], runs: LaneEnsemble) -> None:
     """Integrate runs one at a time; each has a share of the time limit, and later rounds share the rest."""
-    queue = [run for run in run_numbers if run > 0 or status[run] == Status.TIME_LIMIT]
+    queue = [run for run in run_numbers if run > 0 or runs.status[run] == Status.TIME_LIMIT]
     limits, longest = dict.fromkeys(queue, 0.0), 0.0
     for _ in range(N_ROUNDS):
         for position, run in enumerate(queue):
@@ -459,27 +389,17 @@ def _share_time(
             )
             if limit > 2.0 * limits[run]:  # each attempt starts from t0
                 limits[run] = limit
-                if solve_singly(run, runs.max_step(run), limit).success:
+                if runs.solve_singly(run, limit).success:
                     longest = max(longest, time.monotonic() - began)
             elif limits[run] == 0.0 and run > 0:
-                status[run], messages[run] = int(Status.TIME_LIMIT), TIME_LIMIT_MESSAGE
+                runs.status[run], runs.messages[run] = int(Status.TIME_LIMIT), TIME_LIMIT_MESSAGE
                 if runs.times[0] == runs.starts.t0:
                     runs.q[run, :, 0], runs.v[run, :, 0] = runs.starts.q[run], runs.starts.v[run]
-        queue = [run for run in queue if status[run] == Status.TIME_LIMIT]
+        queue = [run for run in queue if runs.status[run] == Status.TIME_LIMIT]
 
 
-def _solve_one(
-    system: ConstrainedSystem, starts: Starts, run: int, span: tuple[float, float], options: dict[str, Any]
-) -> Result:
-    run_system = system_of(system, starts, run)
-    try:
-        return solve_dae(run_system, span, starts.q[run], starts.v[run], **options)
-    except ValueError as error:
-        raise with_run_number(run, error) from error
-
-
-def _summary(status: Integers, runs: LaneEnsemble, reasons: dict[int, str]) -> str:
-    failed, n_runs = int((status < 0).sum()), len(status)
+def _summary(runs: LaneEnsemble, reasons: dict[int, str]) -> str:
+    failed, n_runs = int((runs.status < 0).sum()), len(runs.status)
     ending_text = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
     by_reason: dict[str, list[int]] = {}
     for run, reason in reasons.items():

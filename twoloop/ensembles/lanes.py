@@ -45,12 +45,7 @@ BLOCK_VALUES = 30_000  # largest number of sampled values that are compared toge
 class ForceSampling:
     """Sampling of the forces and drives of many runs, to detect short forces.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-        A system whose callbacks run on symbols, without nonholonomic rows.
-    values, varying
-        Arguments of `ParameterTape`: generic parameters, and the indices of those that differ between runs.
+    The callbacks of the system run on symbols. `values`, `varying`: see `ParameterTape`.
     """
 
     def __init__(self, system: ConstrainedSystem, values: Array, varying: Sequence[int]):
@@ -118,36 +113,18 @@ IN_LANES = ("auto", "Taylor", "DOP853", *N_STAGES)  # presets that can run in la
 
 @dataclass(frozen=True)
 class LaneMethod:
-    """Method prepared for runs in lanes.
-
-    Attributes
-    ----------
-    name : str
-    series : bool
-        Whether it needs code for Taylor series.
-    order : int
-        Argument `order` of the generated functions.
-    evaluations : int
-        Number of evaluations in an attempted step that the kernel does not count, without the one at its end.
-    options : ndarray
-        Numbers that the step kernel reads.
-    tableau : tuple of ndarray or None
-        For an explicit method with generated code: A, b, c and the weights of two error estimates.
-    max_gap : float
-        Largest time between evaluations in a step, relative to the step size.
-    step, memory : callable
-        Functions that return the step kernel, and the size of its memory for given code, in vectors.
-    """
+    """Method prepared for runs in lanes."""
 
     name: str
-    series: bool
-    order: int
-    evaluations: int
-    options: Array
-    step: Callable[[], Any]
-    memory: Callable[[LaneCode], int]
+    series: bool  # whether it needs code for Taylor series
+    order: int  # argument `order` of the generated functions
+    evaluations: int  # number of evaluations in an attempt that the kernel does not count, without the one at its end
+    options: Array  # numbers that the step kernel reads
+    step: Callable[[], Any]  # returns the step kernel
+    memory: Callable[[LaneCode], int]  # returns the size of the kernel's memory for given code, in vectors
+    # for an explicit method with generated code: A, b, c and the weights of two error estimates
     tableau: tuple[Array, Array, Array, Array, Array] | None = None
-    max_gap: float = 1.0
+    max_gap: float = 1.0  # largest time between evaluations in a step, relative to the step size
 
 
 def is_series_costly(system: ConstrainedSystem) -> bool:
@@ -265,16 +242,7 @@ REASONS = {  # reasons for which a run is left to `solve_dae`, by its status in 
 class LaneRuns:
     """Generated code of a system for lanes, and the runs that it integrates.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    starts : Starts
-    method : LaneMethod
-
-    Raises
-    ------
-    Untraceable
-        If lanes cannot integrate the system; the message says why.
+    Raise Untraceable if lanes cannot integrate the system; the message says why.
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):

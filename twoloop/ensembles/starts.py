@@ -32,13 +32,7 @@ class Starts:
 def all_starts(
     system: ConstrainedSystem, t0: float, q0: Any, v0: Any, parameters: Any, names: tuple[str, str] = ("q0", "v0")
 ) -> Starts:
-    """Check the arguments, and return one row of starts and parameters for each run.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong; the message names it.
-    """
+    """Return one row of starts and parameters for each run; raise TypeError or ValueError if an argument is wrong."""
     arrays = {name: check_real(name, value) for name, value in zip(names, (q0, v0), strict=True)}
     sizes = {**dict.fromkeys(names, system.n_q), "parameters": system.parameters.size}
     if parameters is not None:
