@@ -83,15 +83,7 @@ def problem_of(where: str) -> Problem:
 
 
 def solve(given: argparse.Namespace) -> None:
-    """Solve a problem, say how the run ended, and write the requested files.
-
-    Raises
-    ------
-    ImportError
-        If a file needs a package that is not installed.
-    ValueError
-        If an argument is wrong, or a file cannot be written as asked.
-    """
+    """Solve a problem, say how the run ended, and write the requested files."""
     files = [Path(name) for name in given.out]
     for file in files:
         if file.suffix.lower() not in ENDINGS:
@@ -143,13 +135,7 @@ def write(result: Result, file: Path) -> None:
 
 
 def audit(given: argparse.Namespace) -> None:
-    """Compare MuJoCo's motion of a file with that of rigid loops, and write the requested files.
-
-    Raises
-    ------
-    RuntimeError, ValueError
-        Of `audit_mjcf`, or if a file cannot be written as asked.
-    """
+    """Compare MuJoCo's motion of a file with that of rigid loops, and write the requested files."""
     for file in given.out:
         check_ending(file)
         if not file.parent.is_dir():
@@ -164,13 +150,7 @@ def audit(given: argparse.Namespace) -> None:
 
 
 def check_rows(files: Sequence[Path]) -> None:
-    """Say what files of rows hold, or what is wrong with them.
-
-    Raises
-    ------
-    SystemExit
-        If a row has a mistake, or there is none.
-    """
+    """Say what files of rows hold, or what is wrong with them: then, or without a row, raise SystemExit."""
     failed = False
     for file in files:
         rows, wrong = find_errors(read_lines(file))

@@ -312,13 +312,7 @@ def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
 
 
 def needed(module: str, package: str, what: str) -> Any:
-    """Import a module of an optional package.
-
-    Raises
-    ------
-    ImportError
-        If the package is not installed; the message says what needs it and how to install it.
-    """
+    """Import a module of an optional package; raise ImportError, saying what needs it, if it is not installed."""
     try:
         return import_module(module)
     except ImportError as error:

@@ -37,11 +37,7 @@ def check_bounds(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Non
     """Run every compiled callback of a system once at (t, q, v) with bounds checked; later calls do nothing.
 
     Large dense matrices of systems that give values of entries are left out: they are checked before their first use.
-
-    Raises
-    ------
-    ValueError
-        If an index is out of bounds; the message names the callback, the index and the sizes of its arrays.
+    Raise ValueError if an index is out of bounds; the message names the callback, the index and the sizes of arrays.
     """
     if len(system.within_bounds) == len(KINDS):
         return

@@ -125,14 +125,9 @@ def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array
 class Violation:
     """Violation of constraints by a state, as the change of coordinates (or velocities) that would correct it.
 
-    Attributes
-    ----------
-    correction : ndarray (n_q,)
-        The Newton correction, by least squares with C_q, coordinates weighted by their scales.
-    allowed : ndarray (n_q,)
-        The accepted correction: 1e-8 of the mechanism's size, plus rounding.
-    left : ndarray (n_c,)
-        Residual after the correction, where rows of C_q depend on one another or are zero; `allowed_left` is its limit.
+    `correction` is the Newton correction, by least squares with C_q, coordinates weighted by their scales. `allowed` is
+    the accepted correction: 1e-8 of the mechanism's size, plus rounding. `left` is the residual after the correction,
+    where rows of C_q depend on one another or are zero, and `allowed_left` its limit.
     """
 
     def __init__(
@@ -273,12 +268,8 @@ def check_start(
     """Call every callback once at the start; check shapes, finiteness, rank, consistency and, if asked, derivatives.
 
     `exact` returns whether derivatives were derived from traces: then they are not compared with differences.
-    Velocities may be corrected by `harmless`, (n_q,), in any case.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a check fails; the message names the callback or the argument, the value found and a remedy.
+    Velocities may be corrected by `harmless`, (n_q,), in any case. Raise TypeError or ValueError if a check fails; the
+    message names the callback or the argument, the value found and a remedy.
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
@@ -317,12 +308,7 @@ def check_start(
 class StartEvaluation:
     """First evaluation of compiled callbacks at one start after another: its arrays, and the result of the last one.
 
-    Attributes
-    ----------
-    mass, rows, pattern : ndarray
-        M, C_q with A, and 1 where rows have entries there or nearby.
-    definite : bool or None
-        Whether an M that varies has an inverse; None: not certain, or M is constant.
+    `pattern` is 1 where the rows C_q and A have entries there or nearby.
     """
 
     def __init__(self, system: ConstrainedSystem):
@@ -338,7 +324,7 @@ class StartEvaluation:
             **{"start_values": values, "lam": _ones(system.n_c), "room": self._room, "mass": self.mass},
             **{"rows": self.rows, "shifts": shifts(n)[1:], "pattern": self.pattern, "roundings": ROUNDINGS},
         }
-        self.definite: bool | None = None
+        self.definite: bool | None = None  # whether an M that varies has an inverse; None: not certain, or constant
 
     def evaluate(self, t: float, q: Array, v: Array) -> int:
         """Evaluate the callbacks at a start; return the flags of kernels/evaluation/checks.py, or 0 on an exception."""

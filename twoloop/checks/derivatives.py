@@ -65,12 +65,8 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Call
 
     Every entry is compared on its own, with a suitable displacement; an entry that differences cannot decide is
     accepted. C_q comes first, then C_t, then gamma, whose check relies on both. This takes a few dozen calls of each
-    callback for each coordinate, once for each system; none if `exact` returns that the derivatives are exact.
-
-    Raises
-    ------
-    ValueError
-        If an entry is wrong; the message names the callback, the entry, the value given and the one differenced.
+    callback for each coordinate, once for each system; none if `exact` returns that the derivatives are exact. Raise
+    ValueError if an entry is wrong; the message names the callback, the entry, the value given and the one differenced.
     """
     if system.checked:
         return

@@ -353,28 +353,14 @@ def differentiate(
 ) -> Estimate:
     """Differentiate at a place until each entry is accurate enough to judge the given one.
 
-    Parameters
-    ----------
-    function : callable
-        function(shift) -> (m,), at place + shift; an exception or a value that is not finite means undefined there.
-    place, scale : float
-        The place, and a first guess of the distance over which the function changes.
-    noise : ndarray (m,)
-        Effect of rounding of the arguments on the function.
-    given, largest : ndarray (m,)
-        The given entries to check, and the largest entry beside each.
-    spacing : float
-        Smallest displacement that rounding does not hide, if larger than the spacing of numbers at the place.
-    sides : tuple of int
-        0: around the place; 1: after it; -1: before it. The next side is tried if the function is undefined on this
-        one.
-    max_widths : int
-        Largest number of half-widths to try.
+    Each entry gets the estimate of the half-width with the smallest estimated error; at most `max_widths` are tried.
+    The function is evaluated at place + shift; an exception or a value that is not finite means undefined there.
 
-    Returns
-    -------
-    Estimate
-        For each entry, the estimate of the half-width with the smallest estimated error.
+    - `scale`: a first guess of the distance over which the function changes
+    - `noise`: effect of rounding of the arguments on the function
+    - `given`, `largest`: the given entries to check, and the largest entry beside each
+    - `spacing`: smallest displacement that rounding does not hide, if larger than the spacing of numbers at the place
+    - `sides`: 0 around the place, 1 after it, -1 before it; the next is tried if the function is undefined on this one
     """
     m = len(given)
     for side in sides:

@@ -11,14 +11,7 @@ Integers = NDArray[np.int64]
 
 
 class SparseRows:
-    """Sparse matrix (m, n) stored by entries, without duplicates, with the array operations that checks need.
-
-    Attributes
-    ----------
-    rows, columns : ndarray of int
-    values : ndarray
-    shape : (int, int)
-    """
+    """Sparse matrix (m, n) stored by entries, without duplicates, with the array operations that checks need."""
 
     def __init__(self, rows: Integers, columns: Integers, values: Array, shape: tuple[int, int]):
         places, self.place_of = np.unique(rows * shape[1] + columns, return_inverse=True)

@@ -60,13 +60,7 @@ class Adams:
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control.
-
-        Raises
-        ------
-        ValueError
-            If the step size is fixed: the first steps need a variable size for their order and accuracy.
-        """
+        """Return the Plan of a run of n_q coordinates; the first steps need a variable size to reach their order."""
         from twoloop.kernels.steps import adams_step as kernels
 
         if fixed:

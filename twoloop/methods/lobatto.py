@@ -60,13 +60,7 @@ class Lobatto16:
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = accept_traces
     ) -> "Lobatto16":
-        """Return the method with the generated code of this system.
-
-        Raises
-        ------
-        ValueError
-            If there is no code for it, or it is too long.
-        """
+        """Return the method with the generated code of this system; raise ValueError if there is none, or too long."""
         if code is None or not compiles_quickly(code.shared):
             raise ValueError(
                 f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. "

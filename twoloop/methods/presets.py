@@ -96,8 +96,7 @@ def code_for(
     """Return the generated code for a run; None if the run uses no generated code.
 
     With compiled="auto" this depends on the arguments only, so that the same call always returns the same numbers.
-
-    Raises ValueError if code is requested but does not suit the method, or cannot be generated.
+    Raise ValueError if code is requested but does not suit the method, or cannot be generated.
     """
     if compiled is True:
         _check_takes_code(method, fixed)

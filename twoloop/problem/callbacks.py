@@ -172,11 +172,6 @@ class PythonFunctions:
 
     A number, the handle, is stored before the parameters and identifies this object. It is valid in this process and
     its forks; unpickling registers the functions again. Functions of the kinds in `taking` get the parameters.
-
-    Attributes
-    ----------
-    samples : list of (arguments, value)
-        Forces of calls since `restart`, at numbers that grow by a quarter: they are computed again at the end of a run.
     """
 
     registry: ClassVar[WeakValueDictionary[float, "PythonFunctions"]] = WeakValueDictionary()
@@ -189,6 +184,7 @@ class PythonFunctions:
 
     def restart(self) -> None:
         """Discard the samples, at the beginning of a run."""
+        # arguments and value of calls of force whose numbers grow by a quarter: computed again at the end of a run
         self.samples: list[tuple[tuple[Any, ...], Any]] = []
         self._calls, self._next = 0, 1
 
@@ -349,12 +345,8 @@ class ConstantMatrix:
 def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -> bool:
     """Return whether a function that returns its array takes `p` after the arguments of its kind.
 
-    If the system has `parameters`, it does, unless this argument is missing, or has a default and another name.
-
-    Raises
-    ------
-    TypeError
-        If the function names its arguments t, q, v in another order, or takes another number of arguments.
+    If the system has `parameters`, it does, unless this argument is missing, or has a default and another name. Raise
+    TypeError if the function names its arguments in another order, or takes another number of them.
     """
     expected = ("t", *KINDS[kind].state)
     try:

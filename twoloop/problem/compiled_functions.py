@@ -43,18 +43,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GeneratedCode:
-    """Source code of the callbacks of a mechanism and of its energy.
+    """Source code of the callbacks of a mechanism and of its energy."""
 
-    Attributes
-    ----------
-    key : str
-        Digest of the equations.
-    source : str
-        One function for each callback, named by its kind, and energy(t, q, v, p).
-    """
-
-    key: str
-    source: str
+    key: str  # digest of the equations
+    source: str  # one function for each callback, named by its kind, and energy(t, q, v, p)
 
     @classmethod
     def stored(cls, key: str) -> GeneratedCode | None:
@@ -162,13 +154,7 @@ class Change(NamedTuple):
 
 
 class FrozenValues:
-    """Values that numba froze into compiled callbacks, stored to detect later changes.
-
-    Parameters
-    ----------
-    callbacks : dict of str to Dispatcher
-        Callbacks by kind. Their compiled helpers, tuples and the user's modules are followed.
-    """
+    """Values that numba froze into callbacks, their compiled helpers, tuples and modules, to detect later changes."""
 
     def __init__(self, callbacks: dict[str, Dispatcher]):
         cells, names, arrays = {}, {}, {}
@@ -235,13 +221,7 @@ def by_name(module: str, name: str) -> Any:
 
 
 def portable(system_name: str, kind: str, function: Any) -> Any:
-    """Return the object to pickle in place of a function.
-
-    Raises
-    ------
-    TypeError
-        If the function is a plain one that pickle cannot find by its name.
-    """
+    """Return the object to pickle in place of a function; raise TypeError if pickle cannot find it by its name."""
     if isinstance(function, Dispatcher):
         if (code := code_of(function)) is not None:
             return PickledCall(GeneratedCode.callback, code, kind)

@@ -100,27 +100,13 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Description:
-    """Names, energy and drawing of a system, for its results; a `Problem` gives them to its system.
+    """Names, energy and drawing of a system, for its results; a `Problem` gives them to its system."""
 
-    Attributes
-    ----------
-    coordinates : tuple of str
-        Names of the coordinates with their units, such as "x of crank (m)". Empty: q0, q1, ...
-    energy : callable or None
-        energy(t, q, v), J, of one state or of the columns of many.
-    conserved : bool or None
-        Whether the energy is an invariant; None: not known.
-    drawing : Drawing or None
-        Drawing of the mechanism.
-    joint_coordinates : tuple of JointCoordinate
-        Angles and displacements of the joints of a model.
-    """
-
-    coordinates: tuple[str, ...] = ()
-    energy: Callable[[Any, Any, Any], Any] | None = None
-    conserved: bool | None = None
+    coordinates: tuple[str, ...] = ()  # names with units, such as "x of crank (m)"; empty: q0, q1, ...
+    energy: Callable[[Any, Any, Any], Any] | None = None  # energy(t, q, v), J, of one state or of the columns of many
+    conserved: bool | None = None  # whether the energy is an invariant; None: not known
     drawing: Drawing | None = None
-    joint_coordinates: tuple[Any, ...] = ()
+    joint_coordinates: tuple[Any, ...] = ()  # angles and displacements of the joints of a model
 
     def with_parameters(self, p: NDArray[Any]) -> Description:
         """Return the description for other parameters, without an energy or a drawing that may enclose the old ones."""

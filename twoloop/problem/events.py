@@ -102,30 +102,15 @@ def _event(number: int, function: Any) -> Event:
 
 
 class EventSearch:
-    """Search for the events of a run, step by step.
+    """Search for the events of a run from t0 and `row`, [q, v] there, step by step.
 
-    Parameters
-    ----------
-    events : list of Event
-    t0, row : float, ndarray
-        The start, and [q, v] there.
-    every : float
-        Longest time between two samples, s, unless an event function has an attribute `every` of its own.
-
-    Attributes
-    ----------
-    found : list of list of (float, ndarray)
-        For each event its times and rows [q, v].
-    ended : (Event, float) or None
-        The terminal event that ends the run, and its time, s.
-    reached : float
-        End of the last step that was searched, s.
+    Two samples are at most `every` seconds apart, unless an event function has an attribute `every` of its own.
     """
 
     def __init__(self, events: list[Event], t0: float, row: Array, every: float):
-        self.events, self.reached = events, t0
-        self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
-        self.ended: tuple[Event, float] | None = None
+        self.events, self.reached = events, t0  # end of the last step that was searched, s
+        self.found: list[list[tuple[float, Array]]] = [[] for _ in events]  # times and rows [q, v] of each event
+        self.ended: tuple[Event, float] | None = None  # terminal event that ended the run, and its time, s
         self._n_q = len(row) // 2
         self._every = min((getattr(event.function, "every", every) for event in events), default=every)
         self._rates = [rate for event in events if (rate := getattr(event.function, "gap_rate", None)) is not None]

@@ -169,29 +169,20 @@ def _tolerances(result: Record, n_q: int, rtol: float | None, atol: ArrayLike | 
 
 
 class _Checker:
-    """Checker of the intervals between the states of a result, by reintegration.
-
-    Attributes
-    ----------
-    t, states : ndarray (n,), (n, 2 n_q)
-        Times, all different, and states [q, v].
-    every_state, place : ndarray (m, 2 n_q), (m,)
-        All states, of which several may have equal times, and the index in `t` of each.
-    gap : float
-        Longest time between evaluations so far, s.
-    """
+    """Checker of the intervals between the states of a result, by reintegration."""
 
     def __init__(self, result: Record, system: ConstrainedSystem, rtol: float, atol: Array, handlers: SignalHandlers):
         self.handlers = handlers
         self.result, self.sol, self.system, self.rtol, self.atol = result, result.sol, system, rtol, atol
-        every_t, self.every_state = all_states(result)
+        every_t, self.every_state = all_states(result)  # all states [q, v], of which several may have equal times
+        # times, all different, and the states there; index in `t` of every state
         self.t, first, self.place = np.unique(every_t, return_index=True, return_inverse=True)
         self.states = self.every_state[first]
         self.n_steps, self.untested = self._steps(result)
         self.longest = float(self.t[-1] - self.t[0]) / PIECES
         magnitudes = np.nan_to_num(np.abs(self.states), posinf=0.0).reshape(len(self.t), 2, len(atol))
         self.rounding = ROUNDING * np.repeat(magnitudes.max(axis=(0, 2)), len(atol))
-        self.gap = 0.0
+        self.gap = 0.0  # longest time between evaluations so far, s
         self.reruns: dict[tuple[str, float], IndependentRerun] = {}
 
     def _steps(self, result: Record) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

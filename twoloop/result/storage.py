@@ -138,13 +138,7 @@ def read_fields(path: Path, system: ConstrainedSystem | None) -> dict[str, Any]:
 
 
 def _read_folder(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return the arrays and other fields of a folder, as for a file of `Result.save`.
-
-    Raises
-    ------
-    ValueError
-        If the folder was not written by a run.
-    """
+    """Return the arrays and other fields of a folder; raise ValueError if it was not written by a run."""
     try:
         metadata = json.loads((path / METADATA_FILE).read_text(encoding="utf-8"))
         arrays, n = read_arrays(path), int(metadata["n_q"])
@@ -210,13 +204,7 @@ def _is_number(value: Any) -> bool:
 
 
 class SavedFields:
-    """Fields of a file, which are checked one by one.
-
-    Raises
-    ------
-    ValueError
-        If a field is invalid; the message names the field, the expected and the actual value.
-    """
+    """Fields of a file; raise ValueError if one is invalid, with the expected and the actual value."""
 
     def __init__(self, path: str, arrays: dict[str, NDArray[Any]], metadata: dict[str, Any]):
         self.path, self.arrays, self.metadata = path, arrays, metadata

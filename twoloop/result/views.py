@@ -129,28 +129,16 @@ SUFFIXES = (".html", ".gif", ".mp4")
 
 @dataclass(frozen=True)
 class Scene:
-    """Contents of the frames of an animation.
-
-    Attributes
-    ----------
-    name : str
-    times : ndarray (n,)
-        Times of the frames, s.
-    points : ndarray (n_points, 2 or 3, n)
-    paths : ndarray (n_traces, 2 or 3, PATH_POINTS (n - 1) + 1)
-        Points of the drawn paths.
-    bars, traces, fixed, joints : list
-        Pairs of points connected by a line; points with paths, fixed points, and points drawn as circles.
-    """
+    """Contents of the n frames of an animation."""
 
     name: str
-    times: Array
-    points: Array
-    paths: Array
-    bars: list[tuple[int, int]]
-    traces: list[int]
+    times: Array  # times of the frames, s
+    points: Array  # (n_points, 2 or 3, n)
+    paths: Array  # points of the drawn paths, (n_traces, 2 or 3, PATH_POINTS (n - 1) + 1)
+    bars: list[tuple[int, int]]  # pairs of points connected by a line
+    traces: list[int]  # points with paths
     fixed: list[int]
-    joints: list[int]
+    joints: list[int]  # points drawn as circles
 
 
 def animate(result: Record, path: str | os.PathLike[str], seconds: float | None) -> Path:

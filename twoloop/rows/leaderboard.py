@@ -132,60 +132,31 @@ CALL = (
 
 @dataclass(frozen=True)
 class Entry:
-    """A solver with its time at an error.
-
-    Attributes
-    ----------
-    solver, version, called_from : str
-    seconds : float
-        Time at the error: interpolated log-log between two runs, or that of the cheapest run that reaches it.
-    over : float
-        Time relative to that of the first.
-    doubt : {"", "undecided", "few runs"}
-        Whether it differs significantly from the first, by a bootstrap of the repetitions and a margin of 5 %.
-    calibrated : float or None
-        Time relative to that of the calibration in the same process.
-    evaluations : float or None
-    keeps_constraints : bool or None
-    """
+    """A solver with its time at an error."""
 
     solver: str
     version: str
     called_from: str
-    seconds: float
-    over: float
+    seconds: float  # interpolated log-log between two runs, or that of the cheapest run that reaches the error
+    over: float  # time relative to that of the first
+    # "undecided" unless it differs from the first, by a bootstrap of the repetitions and a margin of 5 %; or "few runs"
     doubt: str
-    calibrated: float | None
+    calibrated: float | None  # time relative to that of the calibration in the same process
     evaluations: float | None
     keeps_constraints: bool | None
 
 
 @dataclass(frozen=True)
 class Board:
-    """Ranking of the solvers on one mechanism, on one processor, at one error.
-
-    Attributes
-    ----------
-    mechanism : str
-    t_end : float
-        s.
-    measure : {"error_end", "error"}
-    processor : str
-    target : float
-        Target error.
-    entries : list of Entry
-        Cheapest first.
-    others : list of (str, str)
-        Solvers without a time at the error, with reasons.
-    """
+    """Ranking of the solvers on one mechanism, on one processor, at one error."""
 
     mechanism: str
-    t_end: float
-    measure: str
+    t_end: float  # s
+    measure: str  # key of MEASURES
     processor: str
-    target: float
-    entries: list[Entry]
-    others: list[tuple[str, str]]
+    target: float  # target error
+    entries: list[Entry]  # cheapest first
+    others: list[tuple[str, str]]  # solvers without a time at the error, with reasons
 
     def __str__(self) -> str:
         error = f"error {self.target:g} {MEASURES[self.measure]}"
@@ -299,10 +270,7 @@ def _reason(runs: Runs, rows: Sequence[Row], target: float) -> str:
 
 
 def select_rows(rows: Iterable[Row], mechanism: str, t_end: float | None = None) -> list[Row]:
-    """Return the rows of a mechanism, and of a span if given.
-
-    Raises ValueError if there are none.
-    """
+    """Return the rows of a mechanism, and of a span if given; raise ValueError if there are none."""
     rows = list(rows)
     names = {row["mechanism"] for row in rows}
     if mechanism not in names:

@@ -59,20 +59,10 @@ def calibration_s() -> float:
 
 @dataclass(frozen=True)
 class Field:
-    """A field of a row.
-
-    Attributes
-    ----------
-    expected : str
-    holds : callable
-        Predicate for valid JSON values.
-    about : str
-    needed : bool
-        True if the field is mandatory. null is equivalent to a missing field.
-    """
+    """A field of a row; null is equivalent to a missing field."""
 
     expected: str
-    holds: Callable[[Any], bool]
+    holds: Callable[[Any], bool]  # predicate for valid JSON values
     about: str
     needed: bool = False
 
@@ -155,14 +145,7 @@ FIELDS: dict[str, Field] = {
 
 
 def find_errors(lines: Iterable[str]) -> tuple[list[Row], list[str]]:
-    """Return the valid rows in lines of text, and the errors: line, field, given and expected value.
-
-    Returns
-    -------
-    list of dict
-        Rows of the lines without errors; null fields are omitted.
-    list of str
-    """
+    """Return the rows of lines without errors, without null fields, and the errors: line, field, given and expected."""
     rows, errors, first_lines = [], [], dict[tuple[Any, ...], int]()
     for number, line in enumerate(lines, 1):
         if not line.strip():
@@ -243,10 +226,7 @@ def _format_value(value: Any) -> str:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a file, which may be compressed by gzip (.gz).
-
-    Raises ValueError if it cannot be read.
-    """
+    """Return the lines of a file, which may be compressed by gzip (.gz); raise ValueError if it cannot be read."""
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -258,10 +238,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Return the rows of a file.
-
-    Raises ValueError if it cannot be read, has no rows, or a row is invalid.
-    """
+    """Return the rows of a file; raise ValueError if it cannot be read, has no rows, or a row is invalid."""
     rows, errors = find_errors(read_lines(path))
     if errors:
         remainder = [f"... and {len(errors) - MAX_ERRORS} more"] if len(errors) > MAX_ERRORS else []

@@ -195,25 +195,14 @@ OF_SYSTEM = ("n_q", "n_c", "n_a", "parameters", "constant_mass", "bandwidth", "g
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything the rows depend on other than their parameters.
+    """Everything the rows depend on other than their parameters."""
 
-    Attributes
-    ----------
-    words : str
-        Description for messages.
-    fingerprints : dict
-        Fingerprints of code and values, by name.
-    """
-
-    words: str
-    fingerprints: dict[str, str]
+    words: str  # description for messages
+    fingerprints: dict[str, str]  # fingerprints of code and values, by name
 
 
-def sweep_settings(work: tuple[Any, Any, dict[str, Any]]) -> Settings:
-    """Return everything on which the rows of a sweep depend.
-
-    Raises ValueError if a value that a function refers to cannot be compared.
-    """
+def sweep_settings(work: Work) -> Settings:
+    """Return everything the rows of a sweep depend on; raise ValueError if a value cannot be compared."""
     problem_of, measure, options = work
     words = [_in_words(problem_of), _in_words(measure)] + [_in_words(options)] * bool(options)
     values = {"problem_of": problem_of, "measure": measure, **options}
@@ -233,10 +222,7 @@ def write_rows(table: Any, path: Path, current: Settings) -> None:
 def read_rows(
     pandas: Any, path: Path, parameters: list[dict[str, Any]], current: Settings
 ) -> dict[int, dict[str, Any]]:
-    """Return the rows of a file by run number; empty if there is no file.
-
-    Raises ValueError if the file belongs to a sweep with other functions, options or parameters.
-    """
+    """Return the rows of a file, if there is one, by run number; raise ValueError if they are of another sweep."""
     needed("pyarrow", "pyarrow", "out=")
     if not path.parent.is_dir():
         raise ValueError(f"out must be a file in a folder that exists; given {str(path)!r}")
@@ -289,13 +275,7 @@ def _in_words(value: Any) -> str:
 def _fingerprint(name: str, value: Any) -> str:
     """Return a hash of a value, of the code of all functions that it reaches, and of the values they refer to.
 
-    Parameters
-    ----------
-    name : str
-        Name of the value in messages.
-    value : object
-
-    Raises ValueError if it reaches something whose state cannot be read, such as an open file or a lock.
+    Raise ValueError if it reaches something whose state cannot be read, such as an open file or a lock.
     """
     fingerprint = _Fingerprint()
     try:

@@ -30,27 +30,10 @@ POSITIONS, VELOCITIES = "positions", "velocities"  # permitted dependence, besid
 
 
 class Reader:
-    """Replace coordinates, velocities, speeds, time and parameters by the symbols of the generated code.
+    """Replace coordinates, velocities, speeds, time and parameters by t, q, v and p, symbols of the generated code.
 
-    Parameters
-    ----------
-    coordinates : sequence
-        Functions of time, as created by `dynamicsymbols`.
-    parameters : mapping
-        Values by symbol.
-    speeds : mapping
-        Generalised speeds (functions of time) as expressions in the coordinates and their derivatives.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the coordinates.
-    values : dict
-        Values of the parameters by name, in the order of `p`.
-    t, q, v, p : symbols
-        Symbols of the generated code.
-    differentiation : Differentiation
-        Derivatives of expressions in these symbols.
+    `coordinates`: functions of time, as created by `dynamicsymbols`. `parameters`: values by symbol. `speeds`:
+    generalised speeds (functions of time) as expressions in the coordinates and their derivatives.
     """
 
     def __init__(self, coordinates: Any, parameters: Any, speeds: Mapping[Any, Any] | None = None):
@@ -74,11 +57,8 @@ class Reader:
     def read(self, argument: str, expression: Any, depends: str) -> Expr:
         """Return an expression in plain symbols.
 
-        Raises
-        ------
-        TypeError, ValueError
-            If it is not an expression, or contains an unknown symbol, a velocity that is not permitted, an
-            acceleration, or a function that is not smooth.
+        Raise TypeError or ValueError if it is not an expression, or contains an unknown symbol, a velocity that is not
+        permitted, an acceleration, or a function that is not smooth.
         """
         expression = _sympified(argument, expression)
         self._check(argument, expression, depends)
@@ -302,32 +282,15 @@ MAX_FACTORS = 4  # integer powers up to this are written as products
 
 @dataclass(frozen=True)
 class Equations:
-    """M a + C_q^T lam + A^T mu = Q with C(t, q) = 0 and A v + b = 0.
+    """M a + C_q^T lam + A^T mu = Q with C(t, q) = 0 and A v + b = 0."""
 
-    Attributes
-    ----------
-    symbols : Reader
-        The symbols of the expressions.
-    M : matrix (n_q, n_q)
-        Mass matrix, independent of the velocities; the upper triangle is used.
-    Q : sequence (n_q,)
-        Generalised forces.
-    C : sequence (n_c,)
-        Position constraints.
-    W : sequence (n_a,)
-        Non-holonomic constraints A v + b, linear in v.
-    energy : expression
-    conserved : bool
-        True if the energy is an invariant.
-    """
-
-    symbols: Reader
-    M: sympy.MatrixBase
-    Q: Sequence[Expr]
-    C: Sequence[Expr]
-    W: Sequence[Expr]
+    symbols: Reader  # the symbols of the expressions
+    M: sympy.MatrixBase  # mass matrix, independent of the velocities; the upper triangle is used
+    Q: Sequence[Expr]  # generalised forces
+    C: Sequence[Expr]  # position constraints
+    W: Sequence[Expr]  # non-holonomic constraints A v + b, linear in v
     energy: Expr
-    conserved: bool
+    conserved: bool  # whether the energy is an invariant
 
     @property
     def constant_mass(self) -> bool:
