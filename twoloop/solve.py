@@ -5,15 +5,15 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 import os
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_span, check_times, check_vector, is_vector
+from twoloop.checks.arguments import check_span, check_times, check_vector, is_vector, needed
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.kernels.layout import keep_unused_workspace
 from twoloop.methods.plan import Method
@@ -32,7 +32,6 @@ from twoloop.run.signals import is_keyboard_interrupt
 
 Array = NDArray[np.float64]
 
-NO_BAR = nullcontext(lambda t: None)  # in the place of what shows how far a run is
 LONGEST = 0.1  # s of wall-clock time that the first chunk of steps may take
 SAME = 1e-9  # relative: a step and a span that differ by less are one, however they were rounded
 
@@ -226,14 +225,14 @@ def solve_dae(
             if left == repeats and run.rows_warning:
                 warnings.warn(run.rows_warning, ConstraintWarning, stacklevel=2)
             with_code = bool(run.plan.own)
-            with _progress_bar(options.method.name, t0, t1) if progress else NO_BAR as report:
+            with progress_bar(progress, f"{options.method.name}, t = {t0:g} to {t1:g} s", t1 - t0) as show:
                 files = None if folder is None else begin_folder(folder, system.n_q)
                 output = OutputRequest(times, at_ends, bool(dense_output), event_functions, files)
                 if deadline is None and time_limit is not None:  # setting up does not count
                     deadline = time.monotonic() + time_limit
                 limit = None if deadline is None else max(0.0, deadline - time.monotonic())
                 last = left == 0 or folder is not None
-                loop = IntegrationLoop(run, t1, output, report, limit, interrupts, last)
+                loop = IntegrationLoop(run, t1, output, lambda t: show(t - t0), limit, interrupts, last)
                 record = loop.integrate_to_end(check_derivatives)
             keep_unused_workspace(run.work)
             if last or record.status < 0 or not may_have_missed_changes(run):
@@ -254,12 +253,11 @@ def solve_dae(
 
 
 @contextmanager
-def _progress_bar(name: str, t0: float, t1: float) -> Iterator[Any]:
-    """A function that takes the time reached, and draws it."""
-    try:
-        from rich.progress import Progress
-    except ImportError as error:
-        raise ImportError("progress=True needs the package rich: pip install rich") from error
-    with Progress() as bar:
-        task = bar.add_task(f"{name}, t = {t0:g} to {t1:g} s", total=t1 - t0)
-        yield lambda t: bar.update(task, completed=t - t0)
+def progress_bar(is_shown: bool | None, label: str, total: float) -> Iterator[Callable[[float], None]]:
+    """Yield a function that takes how much of `total` is done, and draws it if the bar is shown."""
+    if not is_shown:
+        yield lambda done: None
+        return
+    with needed("rich.progress", "rich", "progress=True").Progress() as bar:
+        task = bar.add_task(label, total=total)
+        yield lambda done: bar.update(task, completed=done)

@@ -6,7 +6,6 @@ A violation is measured by the correction that would make the state consistent.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -321,7 +320,7 @@ class StartEvaluation:
         self._room, mass, rows, pattern = np.split(values, np.cumsum([size, n * n, n_rows * n]))
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
         self.arrays = {
-            **{"start_values": values, "lam": _ones(system.n_c), "room": self._room, "mass": self.mass},
+            **{"start_values": values, "lam": np.ones(system.n_c), "room": self._room, "mass": self.mass},
             **{"rows": self.rows, "shifts": shifts(n)[1:], "pattern": self.pattern, "roundings": ROUNDINGS},
         }
         self.definite: bool | None = None  # whether an M that varies has an inverse; None: not certain, or constant
@@ -366,8 +365,3 @@ def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) 
     if evaluation.definite is not None:
         system.remember_at("definite mass", place_of_mass(system, t, q), evaluation.definite)
     return evaluation.is_surely_consistent(bits, t, q, v)
-
-
-@cache
-def _ones(n: int) -> Array:
-    return np.ones(n)

@@ -38,25 +38,6 @@ WEAK = 1e-9  # relative to the largest singular value: above it, a direction cer
 NO_DIRECTION = 1e-12  # relative to a row: a smaller remainder, after its dependent components are subtracted, is zero
 
 
-def eigenvalues(matrix: Array) -> Array:
-    """Return the eigenvalues of a symmetric matrix in ascending order, by LAPACK directly (5 times faster if small)."""
-    values: Array = lapack.dsyevd(matrix, compute_v=0)[0]
-    return values
-
-
-def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
-    """Orthonormalize rows; return the basis, the lower triangle that gives the independent rows, and their indices.
-
-    A row is independent if more than the share `least` of it is no combination of the rows before.
-    """
-    from twoloop.kernels.linalg.rank import independent_rows
-
-    max_rank, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
-    basis, factors = np.zeros((max_rank + 1, rows.shape[1])), np.zeros((max_rank + 1, max_rank + 1))
-    n = entry_point(independent_rows)(np.ascontiguousarray(rows), least, basis, factors, kept)
-    return basis[:n], factors[:n, :n], kept[:n].tolist()
-
-
 def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
     """Solve rows x = values by the pseudo-inverse, for rows of length 1 or less; return x and the residual.
 
@@ -76,16 +57,15 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
     """Return whether `rank` singular values certainly exceed `ratio` times the largest, by bounds, without an SVD."""
-    from twoloop.kernels.linalg.rank import norm_of_inverse, singular_values_exceed
+    from twoloop.kernels.linalg.rank import independent_rows, norm_of_inverse, singular_values_exceed
 
-    if rank == len(rows) > 0 and entry_point(singular_values_exceed)(
-        np.ascontiguousarray(rows), ratio, np.empty((rank, rank))
-    ):
+    rows, size, kept = np.ascontiguousarray(rows), min(rows.shape) + 1, np.zeros(len(rows), dtype=np.int64)
+    if rank == len(rows) > 0 and entry_point(singular_values_exceed)(rows, ratio, np.empty((rank, rank))):
         return True
-    _, factors, kept = orthogonalised(rows, NO_DIRECTION)
-    if len(kept) != rank or rank == 0:
+    basis, factors = np.zeros((size, rows.shape[1])), np.zeros((size, size))
+    if rank == 0 or entry_point(independent_rows)(rows, NO_DIRECTION, basis, factors, kept) != rank:
         return False
-    inverse = entry_point(norm_of_inverse)(np.ascontiguousarray(factors), rank, np.zeros(rank))
+    inverse = entry_point(norm_of_inverse)(np.ascontiguousarray(factors[:rank, :rank]), rank, np.zeros(rank))
     return bool(ratio * float(np.linalg.norm(rows)) * inverse < 1.0)
 
 
@@ -166,8 +146,8 @@ def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
 
 
 def is_definite(mass: Array) -> bool:
-    """Return whether M has an inverse."""
-    return bool(eigenvalues(mass)[0] > SINGULAR_MASS * np.abs(mass).max())
+    """Return whether M has an inverse; LAPACK, called directly, takes a fifth of the time of NumPy for small M."""
+    return bool(lapack.dsyevd(mass, compute_v=0)[0][0] > SINGULAR_MASS * np.abs(mass).max())
 
 
 def place_of_mass(system: ConstrainedSystem, t: float, q: Array) -> Any:

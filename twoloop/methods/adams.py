@@ -1,6 +1,7 @@
 """Adams(): a multistep method on the accelerations of all coordinates."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -50,10 +51,7 @@ class Adams:
     True
     """
 
-    @property
-    def name(self) -> str:
-        """Return the name of the method for messages and tables."""
-        return "Adams"
+    name: ClassVar[str] = "Adams"
 
     def takes_code(self, fixed: bool) -> bool:
         """Return whether the steps of this method can run with generated code."""

@@ -1,6 +1,7 @@
 """Auto(...): the default method, which chooses a method for the system and switches during a run."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from twoloop.generate.collocation_code import compiles_quickly
 from twoloop.generate.compile_equations import GeneratedCode
@@ -145,6 +146,8 @@ class Auto:
     True
     """
 
+    name: ClassVar[str] = "auto"
+    tested: ClassVar[str] = "positions"  # quantities that the error estimate of implicit steps counts
     few: Method
     many: Method
     series: Taylor | None
@@ -160,16 +163,6 @@ class Auto:
     sparse: bool = False
     # whether forces may change much over a distance shorter than a step, so that every method must limit its steps
     narrow: bool = True
-
-    @property
-    def name(self) -> str:
-        """Return the name of the method for messages and tables."""
-        return "auto"
-
-    @property
-    def tested(self) -> str:
-        """Return the quantities that the error estimate of implicit steps counts."""
-        return "positions"
 
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = accept_traces

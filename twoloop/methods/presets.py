@@ -98,16 +98,24 @@ def code_for(
     With compiled="auto" this depends on the arguments only, so that the same call always returns the same numbers.
     Raise ValueError if code is requested but does not suit the method, or cannot be generated.
     """
-    if compiled is True:
-        _check_takes_code(method, fixed)
-        return generated_code(system, t0, q0, check)
-    if needs_code(method):
-        return _required_code(system, method, compiled, t0, q0, check)
+    requirement = f"method={method.name!r} needs code made for {system.name!r}"
+    if compiled is True and not takes_code(method, fixed):
+        implicit = " with step_size, by which it is implicit" if takes_code(method, False) else ""
+        raise ValueError(
+            "compiled=True goes with 'auto', 'Lobatto16', 'Taylor', 'DOP853', 'Adams'; "
+            f"given method {method.name}{implicit}"
+        )
+    if needs_code(method) and not compiled:
+        raise ValueError(f"{requirement}; given compiled=False. Leave it out, or take method='auto'")
     if not may_have_code(system, method, fixed, compiled):
         return None
     try:
         return generated_code(system, t0, q0, check)
-    except ValueError:
+    except ValueError as error:
+        if compiled is True:
+            raise
+        if needs_code(method):
+            raise ValueError(f"{requirement}, which cannot be had; {error.__cause__}. Take method='auto'") from error
         return None
 
 
@@ -118,29 +126,6 @@ def may_have_code(system: ConstrainedSystem, method: Method, fixed: bool, compil
     if compiled == "auto":
         return not fixed and takes_code(method, False) and is_small(system)
     return compiled
-
-
-def _required_code(
-    system: ConstrainedSystem, method: Method, compiled: Compiled, t0: float, q0: Array, check: Check
-) -> GeneratedCode:
-    """Return the generated code for a method that needs it; raise ValueError if there is none."""
-    requirement = f"method={method.name!r} needs code made for {system.name!r}"
-    if not compiled:
-        raise ValueError(f"{requirement}; given compiled=False. Leave it out, or take method='auto'")
-    try:
-        return generated_code(system, t0, q0, check)
-    except ValueError as error:
-        raise ValueError(f"{requirement}, which cannot be had; {error.__cause__}. Take method='auto'") from error
-
-
-def _check_takes_code(method: Method, fixed: bool) -> None:
-    """Raise ValueError if the method cannot use generated code; called before code is generated."""
-    if not takes_code(method, fixed):
-        implicit = " with step_size, by which it is implicit" if takes_code(method, False) else ""
-        raise ValueError(
-            "compiled=True goes with 'auto', 'Lobatto16', 'Taylor', 'DOP853', 'Adams'; "
-            f"given method {method.name}{implicit}"
-        )
 
 
 def is_small(system: ConstrainedSystem) -> bool:

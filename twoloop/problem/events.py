@@ -147,8 +147,6 @@ class EventSearch:
 
     def _with_turns(self, states: States, times: Array, rows: Array) -> tuple[Array, Array]:
         """Return times and rows with samples added where a gap is smallest: it may be closed only between samples."""
-        if not self._rates:
-            return times, rows
         states_at = zip(times.tolist(), *np.split(rows, 2, axis=1), strict=True)
         values = np.array([[rate(*state) for rate in self._rates] for state in states_at])
         turns = [

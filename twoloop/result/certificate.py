@@ -14,12 +14,14 @@ from twoloop.kernels.data.indices import APART
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.field_faults import NEAR, all_states, end_of_run, field_faults
 from twoloop.run.record import Record
-from twoloop.run.rerun import FINEST, IndependentRerun, RerunPiece, nonstiff_method, stiff_method, tighter_tolerances
+from twoloop.run.rerun import IndependentRerun, RerunPiece
 from twoloop.run.signals import SignalHandlers
 
 PIECES = 200  # smallest number of intervals into which the run is divided; also limits the step size of reruns
 LIMIT = 100.0  # largest defect of a step, and largest error of a state, in tolerances, of a run that passes
 FASTEST = 10.0  # largest rate, 1/s, by which errors of velocities are divided; by this rate, if they are untested
+TOLERANCE_FACTOR = 0.1  # ratio of the tolerances of a reintegration to those of the run
+FINEST = 1e-13  # smallest tolerance of a reintegration, relative or absolute: rounding hides smaller errors
 SECOND_RUN_FACTOR = 0.1  # factor on the tolerances of the second run, because its errors grow over the whole run
 STIFF = 4  # number of explicit steps per step of the run above which the run did not resolve untested velocities
 CHAOTIC = 10.0  # largest ratio of an error to the growth of an initial error of one tolerance that explains this error
@@ -359,13 +361,15 @@ class _Checker:
         """Integrate from `start`, at the time of state i, to the time of state j; land on `times`; None on failure."""
         key = (method, factor)
         if key not in self.reruns:
-            chosen = nonstiff_method() if method == "explicit" else stiff_method(method == "all")
             # the rank of the rows is too small at a start in a singular position, where lam is not known
             lam = np.asarray(self.result.lam)
             first = int(lam.ndim == 2 and np.isnan(lam[:, :1]).any())
             q, v = self.states[first].reshape(2, -1).copy()
-            rtol, atol = (np.maximum(factor * tighter_tolerances(each), FINEST) for each in (self.rtol, self.atol))
-            run = self.system, float(self.t[first]), q, v, chosen, float(rtol), atol, self.longest
+            rtol, atol = (
+                np.maximum(factor * np.minimum(each, np.maximum(TOLERANCE_FACTOR * each, FINEST)), FINEST)
+                for each in (self.rtol, self.atol)
+            )
+            run = self.system, float(self.t[first]), q, v, method, float(rtol), atol, self.longest
             self.reruns[key] = IndependentRerun(*run)
         rerun, t0, t1 = self.reruns[key], float(self.t[i]), float(self.t[j])
         n_steps = int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)

@@ -228,8 +228,8 @@ class SavedFields:
             self._check("atol", bool((self._finite("atol", (n_q,)) > 0.0).all()), "positive")
         self.numbers = {name: self._number(name) for name in NUMBERS if metadata.get(name) is not None}
         for name, value in self.numbers.items():
-            self._check_value(name, value >= 0.0 or name == "t_end", "a number that is not negative")
-        self.rank = self._whole("rank", 0, min(n_q, n_rows), or_none=True)
+            self._check(name, value >= 0.0 or name == "t_end", "a number that is not negative")
+        self.rank = self._whole_or_none("rank", min(n_q, n_rows))
         if "redundant" in arrays:
             rows = self._array("redundant", (None,), np.int64)
             fits = len(set(rows.tolist())) == len(rows) == n_rows - (self.rank or 0)
@@ -238,9 +238,11 @@ class SavedFields:
         self.method = self._value("method", str, "")  # absent in older files
         self.changes = self._value("changes", str, "")
         self.compiled: bool | None = None if metadata.get("compiled") is None else self._value("compiled", bool)
-        self.status = Status(self._choice("status", [int(status) for status in Status]))
+        statuses, value = [int(status) for status in Status], self._value("status", int)
+        self._check("status", value in statuses, f"one of {statuses}")
+        self.status = Status(value)
         self.statistics = self._statistics()
-        self.n_events = self._whole("n_events", 0, len(arrays), or_none=True)
+        self.n_events = self._whole_or_none("n_events", len(arrays))
         for k in range(self.n_events or 0):
             n = len(self._times(f"t_events_{k}"))
             self._array(f"q_events_{k}", (n, n_q))
@@ -257,14 +259,12 @@ class SavedFields:
         kinds = self._array("sol_kinds", (len(t) - 1,), np.int64)
         self._check("sol_kinds", bool(np.isin(kinds, KINDS).all()), f"numbers from {min(KINDS)} to {max(KINDS)}")
         end, rtol = self._number("sol_end"), self._number("sol_rtol")
-        self._check_value("sol_end", float(t[0]) <= end <= float(t[-1]), f"a time from {t[0]} to {t[-1]}")
-        self._check_value("sol_rtol", rtol > 0.0, "a positive number")
+        self._check("sol_end", float(t[0]) <= end <= float(t[-1]), f"a time from {t[0]} to {t[-1]}")
+        self._check("sol_rtol", rtol > 0.0, "a positive number")
         ranks = self._value("sol_ranks", list)
         whole = len(ranks) == 2 and all(type(rank) is int for rank in ranks)
         valid = whole and 0 <= ranks[0] <= ranks[1] <= min(n_q, n_rows) and self.rank in (None, ranks[1])
-        self._check_value(
-            "sol_ranks", valid, f"two ranks, the second {min(n_q, n_rows) if self.rank is None else self.rank}"
-        )
+        self._check("sol_ranks", valid, f"two ranks, the second {min(n_q, n_rows) if self.rank is None else self.rank}")
         if ("sol_interior_t" in self.arrays) != ("sol_interior_states" in self.arrays):
             raise self._error("sol_interior_t and sol_interior_states", "given together", None)
         if "sol_interior_t" in self.arrays:
@@ -331,11 +331,7 @@ class SavedFields:
 
     def _check(self, name: str, valid: bool, expected: str) -> None:
         if not valid:
-            raise self._error(name, expected, shown(self.arrays[name]))
-
-    def _check_value(self, name: str, valid: bool, expected: str) -> None:
-        if not valid:
-            raise self._error(name, expected, shown(self.metadata[name]))
+            raise self._error(name, expected, shown((self.arrays | self.metadata)[name]))
 
     def _value(self, name: str, kind: type, default: Any = None) -> Any:
         value = self.metadata.get(name, default)
@@ -349,16 +345,11 @@ class SavedFields:
             raise self._error(name, "a finite number", shown(value))
         return float(value)
 
-    def _whole(self, name: str, minimum: int, maximum: int, or_none: bool) -> int | None:
+    def _whole_or_none(self, name: str, maximum: int) -> int | None:
         value = self.metadata.get(name)
-        if (value is None and or_none) or (type(value) is int and minimum <= value <= maximum):
+        if value is None or (type(value) is int and 0 <= value <= maximum):
             return value
-        raise self._error(name, f"a whole number from {minimum} to {maximum}", shown(value))
-
-    def _choice(self, name: str, choices: list[int]) -> int:
-        value = self._value(name, int)
-        self._check_value(name, value in choices, f"one of {choices}")
-        return int(value)
+        raise self._error(name, f"a whole number from 0 to {maximum}", shown(value))
 
     def _error(self, name: str, expected: str, actual: str | None) -> ValueError:
         return ValueError(

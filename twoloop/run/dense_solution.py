@@ -82,8 +82,7 @@ class Interpolator:
         self.system, self.rtol, self.ranks = system, rtol, ranks
         self.tolerances = np.concatenate([np.zeros(ATOL), atol])
         self.tolerances[RTOL] = rtol
-        self.parts = max((plan.parts for plan in self.plans.values()), default=N_REPAIR_STEPS)
-        self.parts = max(self.parts, N_REPAIR_STEPS)
+        self.parts = max([N_REPAIR_STEPS, *(plan.parts for plan in self.plans.values())])
         self.static_form = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()

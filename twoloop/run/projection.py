@@ -272,18 +272,21 @@ def consistent_state(
     (True, True)
     """
     check_system(system)
-    with signals_of(system):
-        return _consistent_state(system, t, q, v, keep, check_assembly)
-
-
-def _consistent_state(
-    system: ConstrainedSystem, t: float, q: ArrayLike, v: ArrayLike, keep: Any, check_assembly: bool
-) -> ConsistentState:
     check_flag("check_assembly", check_assembly)
     t = check_finite("t", t)
     guess = check_vector("q", q, system.n_q)
     speeds = check_vector("v", v, system.n_q)
     kept = [] if keep is None else check_indices("keep", keep, system.n_q)
+    with signals_of(system):
+        state = _project(system, t, guess, speeds, kept, check_assembly)
+    state.moved_q, state.moved_v = _largest_move(state[0] - guess), _largest_move(state[1] - speeds)
+    return state
+
+
+def _project(
+    system: ConstrainedSystem, t: float, guess: Array, speeds: Array, kept: list[int], check_assembly: bool
+) -> ConsistentState:
+    """Return the projected state, without its moves."""
     free = np.array([j for j in range(system.n_q) if j not in kept], dtype=int)
     check_bounds(system, t, guess, speeds)
     system.check_returned(t, guess, speeds)
@@ -292,7 +295,9 @@ def _consistent_state(
         raise ValueError(f"q and v cannot be projected: {reason} at t = {t:g}")
     sparse_result = None if kept else project_sparsely(system, t, guess, speeds, check_assembly)
     if sparse_result is not None:
-        return _large_state(system, t, guess, speeds, *sparse_result)
+        large = _LargeState(sparse_result)
+        large.system, large.t = system, t
+        return large
     position = _projected_position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
     jacobian = system.rows(t, position)
     change = _least_change(jacobian, free, -system.velocity_constraint(t, position, speeds))
@@ -303,7 +308,6 @@ def _consistent_state(
         why = f"max|C_q v + C_t| stays at {_format_largest(violation.values)}"
         raise ValueError(_describe_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
     state = ConsistentState((position, velocity))
-    state.moved_q, state.moved_v = _largest_move(position - guess), _largest_move(velocity - speeds)
     state.dependent, state.determinant_sign, state.margin = _assembly(scales.scaled(jacobian), free)
     return state
 
@@ -322,15 +326,6 @@ class _LargeState(ConsistentState):
         scaled = scales_of(self.system, self.t, q, jacobian).scaled(jacobian)
         self.dependent, self.determinant_sign, self.margin = _assembly(scaled, np.arange(len(q)))
         return vars(self)[name]
-
-
-def _large_state(
-    system: ConstrainedSystem, t: float, guess: Array, speeds: Array, position: Array, velocity: Array
-) -> ConsistentState:
-    state = _LargeState((position, velocity))
-    state.system, state.t = system, t
-    state.moved_q, state.moved_v = _largest_move(position - guess), _largest_move(velocity - speeds)
-    return state
 
 
 def _projected_position(

@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import run_inconsistency
@@ -16,7 +16,6 @@ from twoloop.generate.traced_values import CLEAR_DIFFERENCE, MAX_STATES_IN_PYTHO
 from twoloop.kernels.data import indices
 from twoloop.methods import dop853
 from twoloop.methods.dop853 import DOP853
-from twoloop.methods.plan import Method
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
 from twoloop.problem.callbacks import PythonFunctions
@@ -196,25 +195,7 @@ def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
 FIRST_FRACTION = 0.1  # first step size in a piece, relative to its duration, unless the last piece proposed one
-TOLERANCE_FACTOR = 0.1  # ratio of the tolerances of a rerun to those of the run
-FINEST = 1e-13  # smallest tolerance of a rerun, relative or absolute: rounding hides smaller errors
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
-
-
-def tighter_tolerances(tolerance: ArrayLike) -> Array:
-    """Return the tolerances of a rerun, given those of the run (relative, or absolute of each coordinate)."""
-    return np.minimum(tolerance, np.maximum(TOLERANCE_FACTOR * np.asarray(tolerance), FINEST))
-
-
-def nonstiff_method() -> tuple[Method, Array]:
-    """Return the method for reruns of pieces that are not stiff, and the nodes of its steps."""
-    return DOP853(), dop853.C
-
-
-def stiff_method(velocities: bool) -> tuple[Method, Array]:
-    """Return the method for reruns of stiff pieces, and its nodes; `velocities`: whether to test errors of v, too."""
-    tableau = radau_iia(7)
-    return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
 
 
 class RerunPiece(NamedTuple):
@@ -226,10 +207,9 @@ class RerunPiece(NamedTuple):
 
 
 class IndependentRerun:
-    """Integrator that reruns pieces of a run with another method, each from a given state.
+    """Integrator that reruns pieces of a run with another method, each from a given state; t, q, v: a state of the run.
 
-    t, q and v are a state of the run. `method`: the method of the reruns, and the nodes (fractions of a step) at which
-    it evaluates the equations.
+    `method`: "explicit" (`DOP853`), or what a Radau method, for stiff pieces, tests: "all" or "positions".
     """
 
     def __init__(
@@ -238,14 +218,17 @@ class IndependentRerun:
         t: float,
         q: Array,
         v: Array,
-        method: tuple[Method, Array],
+        method: str,
         rtol: float,
         atol: Array,
         max_step: float,
     ):
-        method_object, nodes = method
+        tableau = radau_iia(7)
+        stiff = RungeKutta(tableau, outer="newton", tested="all" if method == "all" else "positions")
+        chosen = DOP853() if method == "explicit" else stiff
+        nodes = dop853.C if method == "explicit" else tableau.c  # fractions of a step at which equations are evaluated
         self.spacing = float(np.diff(np.unique(np.concatenate([[0.0], nodes, [1.0]]))).max())
-        plan = method_object.plan(system.n_q, rtol, float(atol.min()), False)
+        plan = chosen.plan(system.n_q, rtol, float(atol.min()), False)
         self.run = Run(system, plan, t, q, v, rtol, atol, None)
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0

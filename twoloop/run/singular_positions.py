@@ -56,7 +56,16 @@ def describe_crossings(system: ConstrainedSystem, crossings: list[list[TimedStat
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
     """Return the ratio of the `rank`-th largest singular value of the rows to the largest; 1 if there are no rows."""
-    values = np.linalg.svd(system.rows(t, q), compute_uv=False)[:rank]
+    return _ratio(system.rows(t, q), rank)
+
+
+def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
+    """Return `singular_ratio` of rows scaled by `scaled_to_unit_masses`: it does not depend on units."""
+    return _ratio(scaled_to_unit_masses(system, t, q)[1], rank)
+
+
+def _ratio(rows: Array, rank: int) -> float:
+    values = np.linalg.svd(rows, compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
@@ -87,9 +96,10 @@ def describe_turn(
     At such a place, other branches of the motion are within the tolerances, and the steps may have switched to one.
     """
     n = system.n_q
+    of_q, of_v = slice(n), slice(n, 2 * n)
     for (t0, first), (t1, last), across in _crossing_ends(crossings, now):
-        largest_q, largest_v = (max(np.abs(first[p]).max(), np.abs(last[p]).max()) for p in (_q_slice(n), _v_slice(n)))
-        change = np.abs(last[_v_slice(n)] - first[_v_slice(n)])
+        largest_q, largest_v = (max(np.abs(first[p]).max(), np.abs(last[p]).max()) for p in (of_q, of_v))
+        change = np.abs(last[of_v] - first[of_v])
         least_a = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
         if not (change > np.maximum(MIN_TURN * (atol + rtol * largest_v), TURN_RATIO * (t1 - t0) * least_a)).any():
             continue
@@ -102,8 +112,7 @@ def describe_turn(
         if ratio >= threshold:
             continue
         largest_a = max(
-            _largest_acceleration(system, t, state[_q_slice(n)], state[_v_slice(n)], threshold)
-            for t, state in (here, there)
+            _largest_acceleration(system, t, state[of_q], state[of_v], threshold) for t, state in (here, there)
         )
         change[change <= np.maximum(MIN_TURN * (atol + rtol * largest_v), TURN_RATIO * (t1 - t0) * largest_a)] = 0.0
         if change.any():
@@ -139,14 +148,6 @@ def _crossing_ends(crossings: list[list[TimedState]], now: TimedState) -> Iterat
         yield before, now, False
 
 
-def _q_slice(n: int) -> slice:
-    return slice(n)
-
-
-def _v_slice(n: int) -> slice:
-    return slice(n, 2 * n)
-
-
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
     """Return max|a_j|, computed without singular values of the rows below `min_ratio` times the largest."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
@@ -158,12 +159,6 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
     equations = np.block([[mass, right[is_kept].T], [right[is_kept], np.zeros((int(is_kept.sum()),) * 2)]])
     solution = np.linalg.lstsq(equations, np.append(units * system.force(t, q, v), gamma), rcond=None)[0]
     return float(np.abs(units * solution[: len(q)]).max())
-
-
-def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return `singular_ratio` of rows scaled by `scaled_to_unit_masses`: it does not depend on units."""
-    values = np.linalg.svd(scaled_to_unit_masses(system, t, q)[1], compute_uv=False)[:rank]
-    return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:

@@ -13,7 +13,7 @@ import signal
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
-from contextlib import closing, contextmanager
+from contextlib import closing
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,7 @@ from twoloop.kernels.compile.caches import n_compiled
 from twoloop.result.result import Result
 from twoloop.run.options import check_method
 from twoloop.run.signals import SignalHandlers
-from twoloop.solve import solve_dae
+from twoloop.solve import progress_bar, solve_dae
 from twoloop.sweeps.one_run import (
     STANDARD_COLUMNS,
     Row,
@@ -301,7 +301,7 @@ def sweep(
     kinds = {name: kind for row in rows.values() for name, value in row.items() if (kind := kind_of(value))}
     with (
         SignalHandlers() as handlers,
-        _progress_bar(progress, len(runs)) as report,
+        progress_bar(progress, f"{len(runs)} runs", len(runs)) as report,
         closing(solve_runs(work, runs, missing, n_workers, parallel, client)) as solved,
     ):
         last_save = time.monotonic()
@@ -341,14 +341,3 @@ def _check_pickles(work: Work) -> None:
                 f"{name} cannot be sent to another process: write its functions at the top level of a module, or take "
                 f"parallel='threads'. Pickle says: {error}"
             ) from None
-
-
-@contextmanager
-def _progress_bar(progress: bool, n: int) -> Iterator[Callable[[int], None]]:
-    """Yield a function that takes the number of finished rows and draws a progress bar if requested."""
-    if not progress:
-        yield lambda n_done: None
-        return
-    with needed("rich.progress", "rich", "progress=True").Progress() as bar:
-        task = bar.add_task(f"{n} runs", total=n)
-        yield lambda n_done: bar.update(task, completed=n_done)
