@@ -70,7 +70,7 @@ COMPARED = (
 
 
 def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: Compiled = False) -> Result:
-    start, limit = case.start, case.time_limit
+    start, limit = case.start, case.own_limit
     with user_call:  # as around the calls of other solvers: nothing of the study is timed
         return solve_dae(*start, method, tolerance, tolerance, time_limit=limit, compiled=compiled)
 

@@ -276,7 +276,8 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     little inertia beside heavy bodies.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
-    own = np.array([np.abs(mass[np.ix_(row > 0.0, row > 0.0)]).max(initial=0.0) for row in rows])
+    has_entry = rows > 0.0
+    own = np.where(has_entry[:, :, None] & has_entry[:, None, :], np.abs(mass), 0.0).max(axis=(1, 2), initial=0.0)
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)

@@ -15,10 +15,16 @@ REORTHOGONALISE_BELOW = 0.5
 
 @compiled
 def _dot(x, y):
-    total = 0.0
-    for j in range(x.size):
-        total += x[j] * y[j]
-    return total
+    whole = x.size - x.size % 4
+    a = b = c = d = 0.0  # four sums, so that an addition need not wait for the one before
+    for j in range(0, whole, 4):
+        a += x[j] * y[j]
+        b += x[j + 1] * y[j + 1]
+        c += x[j + 2] * y[j + 2]
+        d += x[j + 3] * y[j + 3]
+    for j in range(whole, x.size):
+        a += x[j] * y[j]
+    return (a + b) + (c + d)
 
 
 @compiled
@@ -187,6 +193,9 @@ SIMILAR_EIGENVALUES = 1e-7
 # dead centre of the slider-crank with two rods; hence redundant rows with large coefficients become independent ones.
 # The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
 MAX_COEFFICIENT = 1.5
+# a coefficient counts as larger than another one if their ratio exceeds this: in symmetrical mechanisms many are equal,
+# and rounding would decide among them, at each start anew
+CLEARLY = 1.01
 
 
 def workspace_size(n_rows: int, n: int) -> int:
@@ -329,7 +338,7 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_ke
             for k in range(n_kept):
                 kept_square = _dot(G[kept[k]], G[kept[k]])
                 coefficient = abs(coefficients[k]) * math.sqrt(kept_square / max(row_square, TINY))
-                if coefficient > largest:
+                if coefficient > largest and (leaving < 0 or coefficient > CLEARLY * largest):
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
             return
