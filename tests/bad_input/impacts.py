@@ -83,6 +83,8 @@ IMPACTS = [
     of_stops("a start beyond a stop", against(Stop(lambda t, q: q[8] - 9.0, name="wall"))).says("gaps must not be negative at q0; that of 'wall' is", "change the sign of the gap, or start elsewhere"),
     of_stops("a gap that branches", against(Stop(lambda t, q: q[8] if q[0] > 0.0 else 1.0))).says("gap of 'stop' must be a number computed from t and q by numpy functions", "give one stop for each branch"),
     of_stops("`restitution=1.1`", lambda: Stop(lambda t, q: q[0], 1.1), "restitution of 'stop' must be from 0 to 1", "give a number from 0 to 1"),
+    of_stops("an unknown law", against(Stop(lambda t, q: 9.0 - q[8]), law="newton"), "law must be one of 'moreau', 'poisson', 'sequential', or None; given 'newton'", "choose one of them"),
+    of_stops("Poisson's law with friction", against(Stop(lambda t, q: 9.0 - q[8], slide=lambda t, q: q[6], friction=0.3), law="poisson"), "law='poisson' is for stops without friction", "choose another law"),
     of_stops("`events=`", against(Stop(lambda t, q: 9.0 - q[8]), events=[]), "no option 'events'", "leave it out", TypeError),
     of_step("a step before a start", lambda: Integrator(LINKAGE.system).step(1e-3)).says("step goes on from a start", "call `start(t0, q0, v0)` first"),
     of_step("`dt=0`", step(0.0), "dt must be positive", "give the length of a sample"),

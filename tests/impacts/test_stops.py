@@ -215,15 +215,19 @@ def test_impacts_that_follow_ever_faster_come_one_by_one(masses, restitutions, x
     assert result.success and np.abs(result.q[:, -1] - known).max() < 10.0 * tolerance, result.message
 
 
-@pytest.mark.parametrize(("law", "after"), [("sequential", [0, 0, 0, 1.0]), ("moreau", [-0.5, 0.5, 0.5, 0.5])])
-def test_touching_balls_act_by_the_law(law, after):
-    system, stops = line([1.0] * 4, [1.0] * 3)
+EQUAL, UNEQUAL = ([1.0] * 4, [1.0] * 3), ([1.0, 2.0, 1.5, 0.5], [0.3, 0.8, 0.2])  # masses and restitutions
+BALLS = [("sequential", EQUAL, [0, 0, 0, 1.0]), ("moreau", EQUAL, [-0.5, 0.5, 0.5, 0.5])]
+
+
+@pytest.mark.parametrize(("law", "balls", "after"), [*BALLS, ("poisson", UNEQUAL, [-0.04, 0.16, 0.36, 0.36])])
+def test_touching_balls_act_by_the_law(law, balls, after):
+    system, stops = line(*balls)
     start = np.array([0.0, 1.0, 1.0, 1.0]), np.array([1.0, 0.0, 0.0, 0.0])
     result = solve_with_stops(system, (0.0, 2.0), *start, stops, law=law)
     np.testing.assert_allclose(result.v[:, -1], after, atol=1e-12)
     with pytest.warns(match="small gap between the bodies or set law="):
         default = solve_with_stops(system, (0.0, 2.0), *start, stops)
-    assert "depends on the law" in default.message and abs(default.v[3, -1] - 0.5) < 1e-12
+    assert "depends on the law" in default.message and (law != "moreau" or abs(default.v[3, -1] - 0.5) < 1e-12)
 
 
 def test_a_stop_that_opens_is_hit_when_the_impact_at_another_turns_the_body_back():

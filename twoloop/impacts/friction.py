@@ -163,18 +163,27 @@ def _least_squares_form(D: Array, b: Array) -> tuple[Array, Array]:
     return roots[:, None] * vectors[:, is_significant].T, -components[is_significant] / roots
 
 
-def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents) -> Array:
-    """Return the impulses at k stops, followed by those of friction, for rates u before the impact, by Moreau's law.
+def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents, law: str | None = None) -> Array:
+    """Return the impulses at k stops, followed by those of friction, for rates u before the impact.
 
     J. J. Moreau, Unilateral contact and dry friction in finite freedom dynamics, CISM 302 (1988): u+ + e u- >= 0, the
     impulse is non-negative, and their product is zero; the impulse of friction opposes the rate of sliding after the
     impact, and is at most the coefficient times the impulse. Without friction the energy does not increase if all e are
     equal; with friction it may if the rate of sliding is reversed (T. R. Kane, 1984), which raises Undetermined.
+
+    If `law` is "poisson", bodies are compressed until no stop closes, and e times these impulses drive them apart, with
+    further impulses where stops would close again (C. Glocker and F. Pfeiffer, Nonlinear Dynamics 7 (1995) 471).
     """
-    shift = np.append(restitution * u[: len(restitution)], 0.0 * tangents.coefficient)
-    P = coulomb_forces(D, u + shift, np.zeros(0), tangents)[0]
-    if len(tangents.normal) and P @ (u + 0.5 * (D @ P)) > NEGLIGIBLE_RATIO * (np.abs(P) @ np.abs(u)):
-        raise Undetermined("an impact with friction would add energy by the law of impacts; use another restitution")
+    none = np.zeros(0)
+    if law == "poisson":  # without friction, see `check_law`
+        P = (1.0 + restitution) * coulomb_forces(D, u, none, tangents)[0]
+        P += coulomb_forces(D, u + D @ P, none, tangents)[0]
+    else:
+        shift = np.append(restitution * u[: len(restitution)], 0.0 * tangents.coefficient)
+        P = coulomb_forces(D, u + shift, none, tangents)[0]
+    adds_energy = P @ (u + 0.5 * (D @ P)) > NEGLIGIBLE_RATIO * (np.abs(P) @ np.abs(u))
+    if adds_energy and (len(tangents.normal) or law == "poisson"):
+        raise Undetermined("an impact would add energy by the law of impacts; use another restitution")
     return P
 
 

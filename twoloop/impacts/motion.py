@@ -74,7 +74,7 @@ MIN_RATE_RATIO = 1e-13  # smallest rate in a sequence of impacts, relative to th
 MAX_DIFFERENCE = 1e-6  # largest difference between two laws of impact that does not count, relative to velocities
 TOUCHING_EVENT = "an impact reaches stops that touch"
 MAX_LISTED = 100  # largest number of impacts of a sequence that are listed one by one
-LAWS = ("moreau", "sequential")
+LAWS = ("moreau", "poisson", "sequential")
 
 
 class Motion:
@@ -88,8 +88,9 @@ class Motion:
     t, q, v : float, ndarray (n_q,), ndarray (n_q,)
     options : dict
         Options of the runs.
-    law : "moreau", "sequential" or None
-        Law of impacts at stops that touch; None: Moreau's, with a warning where the other one gives other velocities.
+    law : "moreau", "poisson", "sequential" or None
+        Law of impacts at stops that touch; None: Moreau's, with a warning where impacts one by one give other
+        velocities.
     """
 
     def __init__(
@@ -271,11 +272,11 @@ class Motion:
         D, n = W @ X, len(near)
         v_before, u = self.v, np.append(gap.u[near], slide.u)
         u[np.abs(u) <= ROUNDING * (np.abs(W) @ self.speeds)] = 0.0
-        P = impulses(D, u, self.restitution[near], tangents)
+        P = impulses(D, u, self.restitution[near], tangents, self.law)
         v = v_before + X @ P
         is_slow = self._has_low_rebound(near, v)
         if (is_slow & (P[:n] > 0.0) & (self.restitution[near] > 0.0)).any():
-            P = impulses(D, u, np.where(is_slow, 0.0, self.restitution[near]), tangents)
+            P = impulses(D, u, np.where(is_slow, 0.0, self.restitution[near]), tangents, self.law)
             v = v_before + X @ P
             is_slow = self._has_low_rebound(near, v)
         self.v = v
@@ -312,7 +313,7 @@ class Motion:
         W = np.vstack([gap.W[reach], slide.W])
         X = responses(self.system, self.t, self.q, W)
         u = np.append(np.where(np.abs(gap.u) <= at_rest, 0.0, gap.u)[reach], slide.u)
-        impacts = Impacts(W @ X, self.restitution[reach], tangents, self.noise, rounding[reach])
+        impacts = Impacts(W @ X, self.restitution[reach], tangents, self.noise, rounding[reach], self.law)
         a = self._free_accelerations(*self._sliding_directions(self.v), self.v)[0]
         largest_v, largest_a = float(np.abs(self.v).max()), float(np.abs(a).max())
         limit = min(
@@ -591,7 +592,7 @@ def solve_with_stops(
     atol: ArrayLike = 1e-8,
     *,
     t_eval: ArrayLike | None = None,
-    law: Literal["moreau", "sequential"] | None = None,
+    law: Literal["moreau", "poisson", "sequential"] | None = None,
     **options: Any,
 ) -> Result:
     """Integrate a system with stops: impacts with restitution, rest in contact, and release.
@@ -616,11 +617,13 @@ def solve_with_stops(
         E.g. `Stop(lambda t, q: q[1], restitution=0.5)`, or `problem.stops` of a model.
     t_eval : array_like, optional
         Output times. None: the ends of steps, with two columns at an impact, before and after it.
-    law : "moreau" or "sequential", optional
+    law : "moreau", "poisson" or "sequential", optional
         Law of an impact at stops that touch already or close at once. "moreau": they share one impact, by Moreau's law,
-        which keeps the symmetry of a box that lands flat. "sequential": impacts follow one another, the fastest first,
-        as in Newton's cradle and as with small gaps. None: Moreau's law, with an `ImpactWarning` where the other one
-        gives other velocities.
+        which keeps the symmetry of a box that lands flat; restitution is the ratio of the rates at each stop.
+        "poisson": they share one impact, by Poisson's law; restitution is the ratio of the impulses of expansion and
+        compression, so that a stop at rest opens, too. Without friction only. "sequential": impacts follow one another,
+        the fastest first, as in Newton's cradle and as with small gaps. None: Moreau's law, with an `ImpactWarning`
+        where impacts one by one give other velocities.
     **options
         Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
 
@@ -661,13 +664,16 @@ def solve_with_stops(
         raise TypeError(f"stops must be a Stop or a list of them; given {shown(stops)}")
     options |= checked_options("solve_with_stops", options, method, rtol, atol, system.n_q)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
-    return Motion(stops, Modes(system), t0, q, v, options, check_law(law)).integrate(t1, times)
+    return Motion(stops, Modes(system), t0, q, v, options, check_law(law, stops)).integrate(t1, times)
 
 
-def check_law(law: str | None) -> str | None:
-    """Return the name of a law of impacts; raise ValueError for an unknown one."""
+def check_law(law: str | None, stops: Stops[Stop]) -> str | None:
+    """Return the name of a law of impacts; raise ValueError for an unknown one, or one that does not suit the stops."""
     if law is not None and law not in LAWS:
-        raise ValueError(f"law must be {' or '.join(map(repr, LAWS))}, or None; given {shown(law)}")
+        raise ValueError(f"law must be one of {', '.join(map(repr, LAWS))}, or None; given {shown(law)}")
+    rough = [stop.name for stop in stops if stop.friction > 0.0]
+    if law == "poisson" and rough:
+        raise ValueError(f"law='poisson' is for stops without friction; {rough[0]!r} has some. Choose another law")
     return law
 
 
@@ -691,7 +697,7 @@ def solve_with_friction(
     atol: ArrayLike = 1e-8,
     *,
     t_eval: ArrayLike | None = None,
-    law: Literal["moreau", "sequential"] | None = None,
+    law: Literal["moreau", "poisson", "sequential"] | None = None,
     **options: Any,
 ) -> Result:
     """Integrate a model with dry friction, and with its stops: joints slide, stop, stick, and are released.
@@ -712,7 +718,7 @@ def solve_with_friction(
         As for `solve_with_stops`.
     t_eval : array_like, optional
         Output times. None: the ends of steps.
-    law : "moreau" or "sequential", optional
+    law : "moreau", "poisson" or "sequential", optional
         As for `solve_with_stops`.
     **options
         Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
@@ -759,4 +765,6 @@ def solve_with_friction(
     options |= checked_options("solve_with_friction", options, method, rtol, atol, problem.system.n_q)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
     start = t0, problem.q0.copy(), problem.v0.copy()
-    return Motion(problem.stops, FrictionModes(problem), *start, options, check_law(law)).integrate(t1, times)
+    return Motion(problem.stops, FrictionModes(problem), *start, options, check_law(law, problem.stops)).integrate(
+        t1, times
+    )

@@ -67,14 +67,18 @@ class Impacts:
         Largest gap that counts as closed; stops with such gaps close at the same time.
     min_rates : ndarray (k,)
         Smallest rates of the stops that are not rounding errors.
+    law : str or None
+        Law of an impact that several stops share, see `impulses`.
     """
 
-    def __init__(self, D: Array, restitution: Array, tangents: Tangents, noise: float, min_rates: Array):
-        self.D, self.restitution, self.tangents = D, restitution, tangents
+    def __init__(
+        self, D: Array, restitution: Array, tangents: Tangents, noise: float, min_rates: Array, law: str | None
+    ):
+        self.D, self.restitution, self.tangents, self.law = D, restitution, tangents, law
         self.noise, self.min_rates, self.n_stops = noise, min_rates, len(restitution)
 
     def joint_impulses(self, stops: NDArray[np.int64], rates: Array, restitution: Array) -> Array:
-        """Return the impulses (k + n_tangents,) of one impact that all of these stops share, by Moreau's law."""
+        """Return the impulses (k + n_tangents,) of one impact that all of these stops share."""
         P = np.zeros(len(rates))
         index_of_stop = {int(k): i for i, k in enumerate(stops)}
         friction_indices = [i for i, k in enumerate(self.tangents.normal.tolist()) if k in index_of_stop]
@@ -87,7 +91,7 @@ class Impacts:
         tangents = Tangents(
             normal, self.tangents.coefficient[friction_indices], np.zeros(len(friction_indices), dtype=np.int64)
         )
-        P[rows] = impulses(self.D[np.ix_(rows, rows)], rates[rows], restitution[stops], tangents)
+        P[rows] = impulses(self.D[np.ix_(rows, rows)], rates[rows], restitution[stops], tangents, self.law)
         return P
 
     def follow(self, gaps: Array, rates: Array, limit: float, together: bool) -> Sequence:
@@ -99,7 +103,7 @@ class Impacts:
         limit : float
             Longest duration, s.
         together : bool
-            Whether stops that touch share an impact by Moreau's law. False: the stop that closes fastest is hit first.
+            Whether stops that touch share an impact. False: the stop that closes fastest is hit first.
         """
         n, D = self.n_stops, self.D
         g, u = np.maximum(gaps, 0.0), rates.copy()
