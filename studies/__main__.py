@@ -3,7 +3,7 @@
 import sys
 import traceback
 
-from studies.bench.index import STUDIES, module_of, run_study
+from studies.bench.study import STUDIES, module_of, run_study
 
 USAGE = "usage: python -m studies [NAME | all | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
 

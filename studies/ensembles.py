@@ -65,10 +65,8 @@ def varied_row(n: int, block: int = 2 * BLOCK) -> dict[str, Any]:
 
 
 def assembled(n: int) -> tuple[Array, Array]:
-    """Draw n linkages, and return those that can be assembled (m, 6) with their positions (m, 9).
-
-    Columns of the first: those of `RANGES`, and the branch. Joint 2-3 is the third corner of a triangle with O.
-    """
+    """Draw n linkages, and return those that can be assembled (m, 6) with their positions (m, 9). Columns of the first:
+    those of `RANGES`, and the branch. Joint 2-3 is the third corner of a triangle with O."""
     low, high = np.array(list(RANGES.values())).T
     uniform = np.random.default_rng(SEED_DRAWN).uniform(size=(n, 6))
     given = np.column_stack([low + (high - low) * uniform[:, :5], np.where(uniform[:, 5] < 0.5, -1.0, 1.0)])
@@ -114,11 +112,9 @@ def end_error(given: Array, q: Array, t_end: float) -> float:
 
 
 def drawn_row(n: int, t_end: float = SPAN) -> dict[str, Any]:
-    """Draw, assemble and run n linkages, time it, and measure errors of energy and of some ends.
-
-    `end_error_hard`: of the runs of largest energy errors and most steps, and of those not made in lanes;
-    `end_error_any`: of the first ones.
-    """
+    """Draw, assemble and run n linkages, time it, and measure errors of energy and of some ends. `end_error_hard`: of
+    the runs of largest energy errors and most steps, and of those not made in lanes; `end_error_any`: of the first
+    ones."""
     times, system, began = np.linspace(0.0, t_end, N_TIMES + 1)[1:], four_bar().system, time.perf_counter()
     given, q0 = assembled(n)
     errors, steps, ends, singly, failed = [], [], [], [], 0
@@ -203,10 +199,8 @@ def linkages_of(n: int, t_end: float = SPAN) -> Ensemble:
 
 
 def of_starts(name: str, n: int, t_end: float) -> Ensemble:
-    """Return runs of a mechanism that differ by their velocities at the start.
-
-    Raises StudyError if two unlike methods do not agree where a run ends.
-    """
+    """Return runs of a mechanism that differ by their velocities at the start. Raises StudyError if two unlike methods
+    do not agree where a run ends."""
     problem = getattr(mechanisms, name)()
     random = np.random.default_rng(7)
     fastest = max(1.0, float(np.abs(problem.v0).max()))
@@ -258,10 +252,8 @@ def ways(of: Ensemble) -> dict[str, Callable[[], Solve]]:
 
 
 def rows_of(of: Ensemble, names: Sequence[str], quick: bool) -> Iterator[dict[str, Any]]:
-    """Make a row for each way, tolerance and repetition: CPU time by a run, errors at the end.
-
-    The calls after the first are repeated in turn, so that a slow minute of the machine affects all alike.
-    """
+    """Make a row for each way, tolerance and repetition: CPU time by a run, errors at the end. The calls after the
+    first are repeated in turn, so that a slow minute of the machine affects all alike."""
     setups, solves = ways(of), {}
     head = {"group": GROUP, "case": of.name, "n_runs": len(of.problems), "t_end": of.t_end}
     for name in names:
@@ -303,10 +295,8 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """Compare `ensemble` with the fastest other solver at equal error; then the random linkages.
-
-    The error of a way is the largest of its runs, at a tolerance at which none failed.
-    """
+    """Compare `ensemble` with the fastest other solver at equal error; then the random linkages. The error of a way is
+    the largest of its runs, at a tolerance at which none failed."""
     runs = _runs(rows)
     found: dict[str, Any] = {"errors": list(ERRORS), "shown": SHOWN, "n_single": N_SINGLE, "cases": []}
     for case, own_rows in runs.groupby("case", sort=False):

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 
 from studies.bench.apart import heard
-from studies.bench.sharp_callbacks import GRAVITY
 from studies.bench.sharp_forces import T_END, Sharp, families, force_along
-from studies.bench.sharp_mechanisms import TINY, Mechanism, chain, row, turning
-from studies.bench.sharp_motion import TIMES, Motion, motion, off
+from studies.bench.sharp_mechanisms import GRAVITY, TIMES, TINY, Mechanism, Motion, chain, motion, off, row, turning
 from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.problem import Array

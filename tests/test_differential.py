@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from studies.bench.sharp_forces import KIND, SIZE, A
-from studies.bench.sharp_motion import TIMES
+from studies.bench.sharp_mechanisms import TIMES
 from tests.differential_motions import FAMILIES, RIGHT, SILENT, judged, mechanism_of, read
 from tests.problems import quick
 

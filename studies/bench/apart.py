@@ -12,6 +12,8 @@ from references.driver import user_call
 from studies.bench.store import Row
 from twoloop import Result
 
+SEPARATOR = " / "  # of warnings
+
 
 def heard(call: Callable[[], Result]) -> tuple[Result | None, Row]:
     """The result of a call, or None; its status and message, or what was raised; and what it warned of."""
@@ -21,15 +23,13 @@ def heard(call: Callable[[], Result]) -> tuple[Result | None, Row]:
             result, told = (made := call()), {"status": made.status.name, "message": made.message}
         except Exception as error:  # of whatever kind: a row
             result, told = None, {"status": "RAISED", "message": f"{type(error).__name__}: {error}"}
-    return result, told | {"warned": " / ".join(str(each.message) for each in said)}
+    return result, told | {"warned": SEPARATOR.join(str(each.message) for each in said)}
 
 
 def apart(work: Callable[[], Any], limit: float | None = None) -> Any:
-    """Return what work() returns in a fork of this process, which is ended after `limit` s.
-
-    Raises TimeoutError if it does not come back. Raises EOFError if the process ends without an answer; its argument is
-    the code, as of `multiprocessing.Process.exitcode`.
-    """
+    """Return what work() returns in a fork of this process, which is ended after `limit` s. Raises TimeoutError if it
+    does not come back. Raises EOFError if the process ends without an answer; its argument is the code, as of
+    `multiprocessing.Process.exitcode`."""
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
 
@@ -54,9 +54,7 @@ class TimeLimit(Exception):
 
 class Alarm:
     """Raise TimeLimit in this process when a user's call, or all around it, has used up its CPU time, where it can.
-
-    Compiled code is not interrupted but at its return to Python. `rang` says why the exception was raised.
-    """
+    Compiled code is not interrupted but at its return to Python. `rang` says why the exception was raised."""
 
     def __init__(self, seconds: float, around: float):
         self.seconds, self.around, self.rang = seconds, around, ""

@@ -78,10 +78,8 @@ def parallelogram() -> ModelProblem:
 
 
 def parallelogram_motion(times: Array) -> tuple[Array, Array, float]:
-    """Return q and v (9, n_t) of the parallelogram that does not fold, and the difference of two solutions.
-
-    Its bars turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m.
-    """
+    """Return q and v (9, n_t) of the parallelogram that does not fold, and the difference of two solutions. Its bars
+    turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m."""
 
     def rates(t: float, y: Array) -> list[float]:
         return [y[1], -3.0 * 9.81 * math.cos(y[0]) / (2.0 / 3.0 + 2.0)]

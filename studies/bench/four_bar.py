@@ -1,7 +1,5 @@
 """The paper's first example, the four-bar linkage, in two geometries; its motion is known apart from all solvers.
-
-Lengths, masses and start are assumed: Table 2 is missing from the text that we worked from.
-"""
+Lengths, masses and start are assumed: Table 2 is missing from the text that we worked from."""
 
 from functools import cache, partial
 from typing import Any

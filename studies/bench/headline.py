@@ -1,8 +1,6 @@
 """How twoloop stands beside the fastest of the other solvers, on one mechanism at each error, by the time of the call.
-
 Four stand in for twoloop: the default, which a user gets who changes nothing; the same with and without code made for
-the mechanism, of which it is one; and the fastest of its methods, which a user finds by running them all.
-"""
+the mechanism, of which it is one; and the fastest of its methods, which a user finds by running them all."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -25,13 +23,9 @@ COMPARED_BY = ("solver", "family", "status", "message", "error_q", "floor", "ast
 
 
 def of_errors(rows: pd.DataFrame, errors: Iterable[float], given: str = DEFAULT) -> list[dict[str, dict[str, Any]]]:
-    """Compare each of WHOSE with the fastest other solver on one case at each of some errors.
-
-    `rows`: medians, of all solvers; `given`: the solver that the default is on this case.
-
-    Returns for each error and name solver and call_s, those of the fastest other one ("other"), and what
-    `tables.compared` does.
-    """
+    """Compare each of WHOSE with the fastest other solver on one case at each of some errors. `rows`: medians, of all
+    solvers; `given`: the solver that the default is on this case. Returns for each error and name solver and call_s,
+    those of the fastest other one ("other"), and what `tables.compared` does."""
     rows, found = rows[[name for name in (*COMPARED_BY, *SETTINGS) if name in rows]], []
     ours = rows["family"] == "two-loop"
     solvers = {name: given if name == GIVEN else name for name in WHOSE}
@@ -63,11 +57,9 @@ def _cheapest(costs: tables.Costs) -> dict[str, Any]:
 
 
 def counted(pairs: Iterable[Mapping[str, Mapping[str, Any]]], name: str) -> dict[str, Any]:
-    """Count the verdicts on one of WHOSE over pairs of mechanism and error that any solver reaches.
-
-    `faster` and `slower`, which includes errors that only others reach, are what reports say; the rest are not
-    distinguishable, or only twoloop reaches them.
-    """
+    """Count the verdicts on one of WHOSE over pairs of mechanism and error that any solver reaches. `faster` and
+    `slower`, which includes errors that only others reach, are what reports say; the rest are not distinguishable, or
+    only twoloop reaches them."""
     reached = [each for each in pairs if any(it["verdict"] != "none" for it in each.values())]
     verdicts = [each[name]["verdict"] for each in reached]
     count = {verdict: verdicts.count(verdict) for verdict in VERDICTS}

@@ -24,10 +24,7 @@ class Assembly(NamedTuple):
 
 
 class Bars:
-    """Uniform bars with pins at given places, each 1 / n m long and 1 / n kg heavy.
-
-    `angles`: rad.
-    """
+    """Uniform bars with pins at given places, each 1 / n m long and 1 / n kg heavy. `angles`: rad."""
 
     def __init__(self, angles: Array):
         self.angles, n = np.asarray(angles), len(angles)

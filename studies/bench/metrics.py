@@ -51,21 +51,16 @@ def deviation(result: Result, motion: ReferenceMotion, instants: Array) -> tuple
 
 
 def correct_digits(deviation: Array, truth: Array) -> float:
-    """Significant correct digits, -log10 of the largest relative error of a component.
-
-    As the Test Set for IVP Solvers defines scd (F. Mazzia and C. Magherini, release 2.4, 2008), with components whose
-    true value is 0 left out.
-    """
+    """Significant correct digits, -log10 of the largest relative error of a component. As the Test Set for IVP Solvers
+    defines scd (F. Mazzia and C. Magherini, release 2.4, 2008), with components whose true value is 0 left out."""
     known = truth != 0.0
     relative = np.abs(deviation[known] / truth[known])
     return float(-np.log10(max(relative.max(initial=0.0), 1e-17)))
 
 
 def violations(system: ConstrainedSystem, result: Result) -> tuple[Array, dict[str, Array]]:
-    """Times, and at each the largest residual of the constraints in position, velocity and acceleration.
-
-    At CHECKED of the stored instants at most; "a" is C_q a - Q_d with the solver's accelerations.
-    """
+    """Times, and at each the largest residual of the constraints in position, velocity and acceleration. At CHECKED of
+    the stored instants at most; "a" is C_q a - Q_d with the solver's accelerations."""
     chosen = np.unique(np.linspace(0, result.t.size - 1, CHECKED).astype(int))
     gamma, p = compiled_gamma(system), system.functions.p
     levels = {level: np.empty(chosen.size) for level in "qva"}
@@ -105,10 +100,8 @@ def _error_lam(system: ConstrainedSystem, result: Result, motion: ReferenceMotio
 
 
 def keeps_energy(problem: Problem, motion: ReferenceMotion, instants: Array) -> bool:
-    """Whether the energy is an invariant, by the power balance of a motion that is known to its floor.
-
-    False, too, of a motion without kinetic energy, which shows nothing.
-    """
+    """Whether the energy is an invariant, by the power balance of a motion that is known to its floor. False, too, of a
+    motion without kinetic energy, which shows nothing."""
     times = np.concatenate([[0.0], instants])
     q, v = motion.states(times)
     energy = np.asarray(problem.energy(times, q, v))
@@ -118,11 +111,8 @@ def keeps_energy(problem: Problem, motion: ReferenceMotion, instants: Array) -> 
 
 
 class Scale:
-    """What one motion tells of a mechanism's size: by what "lost" and "out of phase" are judged.
-
-    `kinetic`: largest kinetic energy, J; None where the problem has no energy that is conserved. `ranges`: range of
-    each coordinate.
-    """
+    """What one motion tells of a mechanism's size: by what "lost" and "out of phase" are judged. `kinetic`: largest
+    kinetic energy, J; None where the problem has no energy that is conserved. `ranges`: range of each coordinate."""
 
     def __init__(self, problem: Problem, motion: ReferenceMotion, instants: Array, conserved: bool):
         times = np.concatenate([[0.0], instants])

@@ -1,8 +1,7 @@
-"""How figures, tables and sentences call a solver: the one mapping from the names of rows, which CSV files keep.
-
-Of `method="auto"` there are three ways, "the default", "compiled=True" and "compiled=False"; other methods of ours have
-the value of `method`, with `compiled` where it is not what `solve_dae` does by itself. Other solvers have their names.
-"""
+"""How figures, tables and sentences call a solver: the one mapping from the names of rows, which CSV files keep. Of
+`method="auto"` there are three ways, "the default", "compiled=True" and "compiled=False"; other methods of ours have
+the value of `method`, with `compiled` where it is not what `solve_dae` does by itself. Other solvers have their
+names."""
 
 from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, OWN_EXPLICIT
 from twoloop.methods.presets import PRESETS
@@ -26,10 +25,8 @@ def _option(method: str, word: str, coded: bool | None) -> bool | None:
 
 
 def label(solver: str, coded: bool | None = None) -> str:
-    """A solver in figures and tables.
-
-    `coded`: whether `solve_dae` by itself makes code for the mechanism; None: for some of those that are meant.
-    """
+    """A solver in figures and tables. `coded`: whether `solve_dae` by itself makes code for the mechanism; None: for
+    some of those that are meant."""
     parts = _parts(solver)
     if parts is None:
         name = solver.removesuffix(SUFFIX)

@@ -1,8 +1,6 @@
-"""Solvers from files: `simulate(problem, times, tolerance)` of `twoloop.testing`, each in a process of its own.
-
-The process is a fork of that of the study, which calls the solver whenever it is asked, and times each call: what the
-solver prints, imports or breaks stays there.
-"""
+"""Solvers from files: `simulate(problem, times, tolerance)` of `twoloop.testing`, each in a process of its own. The
+process is a fork of that of the study, which calls the solver whenever it is asked, and times each call: what the
+solver prints, imports or breaks stays there."""
 
 import faulthandler
 import hashlib
@@ -127,14 +125,9 @@ START = 300.0  # s that the process may take to load twoloop, the mechanism and 
 
 class Outsider:
     """A solver of a file on one mechanism, in a process that is started when it is asked, and again when it has died.
-
     `where`: FILE.py:FUNCTION, or a file of `references.as_shown` by its name. `mechanism`: as `problem_from` takes it.
-
     `name`: in rows. `digest`: of the file. `calibrated`: s of the calibration beside the last call
-    (`twoloop.rows.row_format`).
-
-    Raises StudyError if there is no such file.
-    """
+    (`twoloop.rows.row_format`). Raises StudyError if there is no such file."""
 
     def __init__(self, where: str, mechanism: str):
         shown = SHOWN / f"{where}.py"
@@ -199,10 +192,8 @@ class Outsider:
         return Result(times, q, v, none, lam, np.empty(0), Status.REACHED_END, f"{self.name} returned.", stats)
 
     def _asked(self, ask: dict[str, Any], limit: float) -> dict[str, Any] | None:
-        """The answer of the process; None where it does not come in time.
-
-        Raises RuntimeError if the process ends instead.
-        """
+        """The answer of the process; None where it does not come in time. Raises RuntimeError if the process ends
+        instead."""
         if self._pipe is None:
             self.start()
         assert self._pipe is not None and self._process is not None

@@ -1,13 +1,13 @@
-"""Everyday forces that are sharp: drags, frictions, gusts, stops, brakes, switches, noise; compiled once for all.
-
-A force acts along one coordinate x of a mechanism with the velocity v. What it is stands in the last places of the
-parameters of the mechanism, so that one set of compiled callbacks serves all.
-"""
+"""Everyday forces that are sharp: drags, frictions, gusts, stops, brakes, switches, noise; compiled once for all. A
+force acts along one coordinate x of a mechanism with the velocity v. What it is stands in the last places of the
+parameters of the mechanism, so that one set of compiled callbacks serves all."""
 
 import math
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -28,60 +28,38 @@ def shape(p, first, t, x, v):  # type: ignore[no-untyped-def]
     """The force in its unit at x and v in theirs; `first`: where its parameters begin."""
     kind = int(p[first + KIND])
     a, b, c, d = p[first + A], p[first + B], p[first + C], p[first + D]
-    if kind == 1:
-        return -a * math.sqrt(v * v) * v
-    if kind == 2:
-        return -a * math.tanh(v / b)
-    if kind == 3:
-        return a * math.exp(-(((t - c) / b) ** 2))
-    if kind == 4:
-        return -a * b * math.log(1.0 + math.exp((x - c) / b))
-    if kind == 5:
-        return a * math.sin(b * t * t)
-    if kind == 6:
-        return a * math.tanh(c * math.sin(b * t))
-    if kind == 7:
-        return a if math.sin(b * t) > 0.0 else -a
     if kind == 8:
         place = min(max(t / b, 0.0), 62.0)
         i = int(place)
         low, high = p[first + TABLE + i], p[first + TABLE + 1 + i]
         return a * (low + (place - i) * (high - low))
-    if kind == 9:
-        return -a * max(0.0, x - c) ** 1.5
-    if kind == 10:
-        return -a * math.tanh(v / d) * 0.5 * (math.tanh((t - c) / b) - math.tanh((t - c - 0.6) / b))
-    if kind == 11:
-        return a if t > c else 0.0
-    if kind == 12:
-        return a * max(0.0, t - c)
-    if kind == 13:
-        return a if c < t < c + b else 0.0
-    if kind == 14:
-        return a / (1.0 + ((t - c) / b) ** 2)
-    if kind == 15:
-        return a * math.exp(-t / b)
-    if kind == 16:
-        return a * math.tanh((t - c) / b)
-    if kind == 17:
-        return a * math.sqrt(t)
-    if kind == 18:
-        return -a * x ** int(b)
-    if kind == 19:
-        return -(a + d * math.exp(-((v / c) ** 2))) * math.tanh(v / b)
-    if kind == 20:
-        return a * math.exp(-(((x - c) / b) ** 2))
-    if kind == 21:
-        return -a * v * math.exp(-(((v - c) / b) ** 2))
-    if kind == 22:
-        return a * math.cos(d * t) * math.exp(-(((t - c) / b) ** 2))
-    if kind == 23:
-        return a * math.exp(c * (math.cos(b * t) - 1.0))
-    if kind == 24:
-        return -a * (x - min(max(x, -b), b))
-    if kind == 25:
-        return a * abs(math.sin(b * t))
-    return 0.0
+    value = 0.0
+    value = -a * math.sqrt(v * v) * v if kind == 1 else value
+    value = -a * math.tanh(v / b) if kind == 2 else value
+    value = a * math.exp(-(((t - c) / b) ** 2)) if kind == 3 else value
+    value = -a * b * math.log(1.0 + math.exp((x - c) / b)) if kind == 4 else value
+    value = a * math.sin(b * t * t) if kind == 5 else value
+    value = a * math.tanh(c * math.sin(b * t)) if kind == 6 else value
+    value = (a if math.sin(b * t) > 0.0 else -a) if kind == 7 else value
+    value = -a * max(0.0, x - c) ** 1.5 if kind == 9 else value
+    on = math.tanh((t - c) / b) - math.tanh((t - c - 0.6) / b) if kind == 10 else 0.0
+    value = -a * math.tanh(v / d) * 0.5 * on if kind == 10 else value
+    value = (a if t > c else 0.0) if kind == 11 else value
+    value = a * max(0.0, t - c) if kind == 12 else value
+    value = (a if c < t < c + b else 0.0) if kind == 13 else value
+    value = a / (1.0 + ((t - c) / b) ** 2) if kind == 14 else value
+    value = a * math.exp(-t / b) if kind == 15 else value
+    value = a * math.tanh((t - c) / b) if kind == 16 else value
+    value = a * math.sqrt(t) if kind == 17 else value
+    value = -a * x ** int(b) if kind == 18 else value
+    value = -(a + d * math.exp(-((v / c) ** 2))) * math.tanh(v / b) if kind == 19 else value
+    value = a * math.exp(-(((x - c) / b) ** 2)) if kind == 20 else value
+    value = -a * v * math.exp(-(((v - c) / b) ** 2)) if kind == 21 else value
+    value = a * math.cos(d * t) * math.exp(-(((t - c) / b) ** 2)) if kind == 22 else value
+    value = a * math.exp(c * (math.cos(b * t) - 1.0)) if kind == 23 else value
+    value = -a * (x - min(max(x, -b), b)) if kind == 24 else value
+    value = a * abs(math.sin(b * t)) if kind == 25 else value
+    return value
 
 
 @numba.njit(cache=True)
@@ -144,120 +122,69 @@ def made(family: str, kind: int, numbers: tuple[float, ...], drives: bool = Fals
 
 
 Draw = Callable[[np.random.Generator], Sharp]
-Number = Callable[[np.random.Generator], float]
-Where = Callable[[float, float], dict[str, Any]]  # of b and c: breaks and windows
 GUSTS = (3e-3, 1e-2, 3e-2, 0.1, 0.3)  # s
 FRICTIONS = (0.1, 0.01, 0.001)  # of the unit of v
+FAMILIES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 
 
-def between(low: float, high: float) -> Number:
-    """An even number."""
-    return lambda g: float(g.uniform(low, high))
-
-
-def log_uniform(low: float, high: float, factor: float = 1.0) -> Number:
-    """A number whose logarithm is even, times a factor."""
-    return lambda g: factor * float(np.exp(g.uniform(np.log(low), np.log(high))))
-
-
-def family(kind: int, where: Where = lambda b, c: {}, drives: bool = False, **numbers: Number) -> Callable[..., Sharp]:
-    """draw(name, generator) of a force (or a drive), whose numbers, from a to d, are drawn in this order."""
-
-    def draw(name: str, g: np.random.Generator) -> Sharp:
-        drawn = dict.fromkeys("abc" if drives else "abcd", 0.0) | {each: number(g) for each, number in numbers.items()}
-        return made(name, kind, tuple(drawn.values()), drives, **where(drawn["b"], drawn["c"]))
-
-    return draw
-
-
-def about(reach: float = 7.0, later: float = 0.0) -> Where:
+def about(reach: float, later: float = 0.0) -> Callable[[float, float], dict[str, Any]]:
     """Of what happens within so many widths b about a time c, and about a later one."""
     return lambda b, c: {"windows": tuple((at - reach * b, at + reach * b) for at in dict.fromkeys((c, c + later)))}
 
 
-def at_zeros(b: float, c: float) -> dict[str, Any]:
-    """Breaks at the zeros of sin(b t)."""
-    return {"breaks": tuple(np.arange(1, int(T_END * b / np.pi) + 1) * np.pi / b)}
+WHEN: dict[str, Callable[[float, float], dict[str, Any]]] = {  # breaks and windows, by b and c
+    "": lambda b, c: {},
+    "about": about(7.0),
+    "well about": about(12.0),
+    "far about": about(20.0),
+    "twice": about(9.0, 0.6),
+    "jump": lambda b, c: {"breaks": (c,)},
+    "lasting": lambda b, c: {"breaks": (c, c + b)},
+    "zeros": lambda b, c: {"breaks": tuple(np.arange(1, int(T_END * b / np.pi) + 1) * np.pi / b)},  # of sin(b t)
+    "whole": lambda b, c: {"windows": ((0.0, T_END),)},
+    "decay": lambda b, c: {"windows": ((0.0, 30.0 * b),)},
+    "root": lambda b, c: {"windows": ((0.0, 1e-4), (1e-4, 1e-2))},
+    "in x": lambda b, c: {"follows_x": True},
+}
 
 
-def noise(name: str, g: np.random.Generator) -> Sharp:
-    """Random values, and lines between them."""
-    b = 0.05
-    force = made(name, 8, (log_uniform(3.0, 20.0)(g), b), breaks=tuple(b * np.arange(1, N_TABLE - 4)))
-    force.parameters[TABLE:] = g.standard_normal(N_TABLE)
-    return force
+def number(spec: Any, g: np.random.Generator) -> float:
+    """Draw a number of a family."""
+    if isinstance(spec, dict):
+        return float(g.uniform(*spec["even"])) if "even" in spec else 2.0 * g.integers(*spec["odd"]) + 1.0
+    if not isinstance(spec, list):
+        return float(spec)
+    low, high, factor = [*spec, 1.0][:3]
+    return factor * float(np.exp(g.uniform(np.log(low), np.log(high))))
 
 
-def gust(width: float) -> Callable[..., Sharp]:
+def drawn(name: str, family: Mapping[str, Any], g: np.random.Generator) -> Sharp:
+    """Draw a force (or a drive)."""
+    if "gust" in family:
+        return gust(family["gust"])(name, g)
+    if "noise" in family:  # random values, and lines between them
+        b = family["noise"]
+        force = made(name, 8, (number([3.0, 20.0], g), b), breaks=tuple(b * np.arange(1, N_TABLE - 4)))
+        force.parameters[TABLE:] = g.standard_normal(N_TABLE)
+        return force
+    drives = "drive" in family
+    numbers = dict.fromkeys("abc" if drives else "abcd", 0.0)
+    numbers |= {each: number(spec, g) for each, spec in family.items() if each in numbers}
+    when = WHEN[family.get("when", "")](numbers["b"], numbers["c"])
+    return made(name, family["drive" if drives else "kind"], tuple(numbers.values()), drives, **when)
+
+
+def gust(width: float, kind: int = 3, when: str = "about") -> Callable[[str, np.random.Generator], Sharp]:
     """draw(name, generator) of a gust of about this width (s) at a random time."""
-    size = log_uniform(5.0, 50.0, (0.03 / width) ** 0.5)
-    return family(3, about(), c=between(0.3, 2.3), b=log_uniform(0.7, 1.4, width), a=size)
+    numbers = {"c": {"even": [0.3, 2.3]}, "b": [0.7, 1.4, width], "a": [5.0, 50.0, (0.03 / width) ** 0.5]}
+    return lambda name, g: drawn(name, {"kind": kind, "when": when, **numbers}, g)
 
 
-def pulse(duration: float) -> Callable[..., Sharp]:
+def pulse(duration: float) -> Callable[[str, np.random.Generator], Sharp]:
     """draw(name, generator) of a force that is constant for about this time (s), from a random time on."""
-    size = log_uniform(5.0, 50.0, (0.03 / duration) ** 0.5)
-    return family(
-        13, lambda b, c: {"breaks": (c, c + b)}, c=between(0.3, 2.3), b=log_uniform(0.7, 1.4, duration), a=size
-    )
+    return gust(duration, 13, "lasting")
 
 
 def families() -> dict[str, Draw]:
     """Name to draw(generator), which returns a force of that family with random numbers."""
-    when, size = between(0.3, 2.3), log_uniform(5.0, 50.0)
-
-    def jumps(b: float, c: float) -> dict[str, Any]:
-        return {"breaks": (c,)}
-
-    def whole(b: float, c: float) -> dict[str, Any]:
-        return {"windows": ((0.0, T_END),)}
-
-    def in_x(b: float, c: float) -> dict[str, Any]:
-        return {"follows_x": True}
-
-    found = {
-        "drag": family(1, a=log_uniform(0.05, 1.0)),
-        **{
-            f"tanh friction, width {b:g}": family(2, a=log_uniform(0.5, 5.0), b=log_uniform(0.7, 1.4, b))
-            for b in FRICTIONS
-        },
-        **{f"gust of {1e3 * b:g} ms": gust(b) for b in GUSTS},
-        "softplus stop": family(
-            4, in_x, a=log_uniform(200.0, 5000.0), b=log_uniform(0.002, 0.05), c=between(-0.3, 0.4)
-        ),
-        "chirp": family(5, whole, a=log_uniform(3.0, 30.0), b=log_uniform(3.0, 60.0)),
-        "switching drive": family(
-            6, whole, a=log_uniform(2.0, 20.0), b=log_uniform(5.0, 40.0), c=log_uniform(10.0, 200.0)
-        ),
-        "square wave": family(7, at_zeros, b=log_uniform(2.0, 30.0), a=log_uniform(2.0, 20.0)),
-        "noise by interpolation": noise,
-        "brake": family(
-            10, about(9.0, 0.6), b=log_uniform(0.003, 0.1), c=when, a=log_uniform(1.0, 10.0), d=lambda g: 0.02
-        ),
-        "Stribeck friction": family(
-            19, a=log_uniform(0.5, 3.0), b=log_uniform(0.002, 0.05), c=log_uniform(0.02, 0.3), d=log_uniform(0.5, 3.0)
-        ),
-        "stop of power 3/2": family(9, in_x, a=log_uniform(500.0, 2e4), b=log_uniform(1.0, 2.0), c=between(-0.2, 0.4)),
-        "jump of the force": family(11, jumps, c=when, a=log_uniform(3.0, 30.0)),
-        "kinked force": family(12, jumps, c=when, a=log_uniform(3.0, 30.0)),
-        "square pulse": family(13, lambda b, c: {"breaks": (c, c + b)}, b=log_uniform(0.02, 0.5), c=when, a=size),
-        "fast decay": family(
-            15, lambda b, c: {"windows": ((0.0, 30.0 * b),)}, b=log_uniform(3e-4, 0.03), a=log_uniform(10.0, 500.0)
-        ),
-        "square root of t": family(17, lambda b, c: {"windows": ((0.0, 1e-4), (1e-4, 1e-2))}, a=log_uniform(3.0, 30.0)),
-        "wave packet": family(
-            22, about(), c=when, b=log_uniform(0.01, 0.1), a=log_uniform(10.0, 100.0), d=log_uniform(30.0, 300.0)
-        ),
-        "Lorentz pulse": family(14, about(20.0), c=when, b=log_uniform(0.005, 0.1), a=size),
-        "tanh step": family(16, about(12.0), c=when, b=log_uniform(5e-4, 0.1), a=size),
-        "high power of x": family(18, in_x, a=log_uniform(10.0, 100.0), b=lambda g: 2.0 * g.integers(5, 33) + 1.0),
-        "magnet": family(20, in_x, a=log_uniform(10.0, 100.0), b=log_uniform(0.03, 0.2), c=between(-0.4, 0.5)),
-        "backlash": family(24, in_x, a=log_uniform(50.0, 2000.0), b=log_uniform(0.03, 0.3)),
-        "resonance in v": family(21, a=log_uniform(3.0, 60.0), b=log_uniform(0.1, 0.5), c=between(-1.5, 1.5)),
-        "spikes": family(23, whole, a=log_uniform(5.0, 60.0), b=log_uniform(3.0, 10.0), c=log_uniform(20.0, 200.0)),
-        "rectified sine": family(25, at_zeros, b=log_uniform(2.0, 30.0), a=log_uniform(2.0, 20.0)),
-        "drive with a kink": family(1, jumps, True, a=between(0.05, 0.5), b=log_uniform(1.0, 2.0), c=when),
-        "drive with a gust": family(2, about(12.0), True, a=between(0.05, 0.5), b=log_uniform(0.01, 0.3), c=when),
-        "drive with a step": family(3, about(12.0), True, a=between(0.05, 0.5), b=log_uniform(0.01, 0.2), c=when),
-    }
-    return {name: partial(draw, name) for name, draw in found.items()}
+    return {name: partial(drawn, name, family) for name, family in FAMILIES.items()}

@@ -1,8 +1,13 @@
-"""A study, from its command line to the index: rows, then findings, figures, tables and the report."""
+"""A study, from its command line to the index: rows, then findings, figures, tables and the report. The index is
+reports/README.md: one line a report, with its question, its answer, date and processor."""
 
+import importlib
+import json
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -12,9 +17,8 @@ from matplotlib.figure import Figure
 from studies.bench import cli, figures, tables
 from studies.bench.cli import Call, StudyError
 from studies.bench.collector import Measure, Run, collect
-from studies.bench.index import write_index
-from studies.bench.render import render, table
-from studies.bench.store import Output, command_of
+from studies.bench.render import listed, render, table
+from studies.bench.store import PARTS, Output, command_of, read_rows
 
 Make = Callable[[Output], pd.DataFrame]
 NAMED = ("group", "case", "family", "solver", "way")  # columns by whose names rows are measured again
@@ -29,10 +33,8 @@ def run_rows(
     curves: bool = False,
     parts: bool = False,
 ) -> None:
-    """Make rows, or with --redraw read those that were saved; `report(output, rows, stamp)` writes all else.
-
-    `parts`: `make` leaves out what `Call.wants` does not want.
-    """
+    """Make rows, or with --redraw read those that were saved; `report(output, rows, stamp)` writes all else. `parts`:
+    `make` leaves out what `Call.wants` does not want."""
 
     def work(words: Sequence[str] | None) -> None:
         with Output(cli.parse(name, about, words, parts)) as output:
@@ -54,21 +56,17 @@ def saved(output: Output, make: Make, curves: bool = False) -> tuple[pd.DataFram
 
 
 def renewed(old: pd.DataFrame, line: str, make: Callable[[], pd.DataFrame], call: Call) -> tuple[pd.DataFrame, str]:
-    """Put new rows of some names in the place of the old ones, with commit and processor; tell the stamp.
-
-    Raises StudyError if the old rows, or the new ones, have no group, case, family or solver of a name.
-    """
+    """Put new rows of some names in the place of the old ones, with commit and processor; tell the stamp. Raises
+    StudyError if the new rows have no group, case, family or solver of a name."""
     columns = [column for column in NAMED if column in old]
     replaced = old[columns].isin(call.only).any(axis=1)
-    if unknown := set(call.only) - set(old[columns].to_numpy().ravel()):
-        known = "; ".join(f"{column}: {', '.join(map(str, old[column].dropna().unique()))}" for column in columns)
-        raise StudyError(f"no rows are of {', '.join(sorted(unknown))}; there are {known}")
     commit, (_, _, _, machine, *_) = re.search(r"commit (\w+)", line), line.split("; ")
     for column, value in (("commit", commit[1] if commit else "unknown"), ("processor", machine.split(",")[0])):
         old = old.assign(**{column: old[column].fillna(value) if column in old else value})
     new = make().assign(commit=cli.commit(), processor=cli.processor())
     if missing := set(call.only) - set(new.reindex(columns=columns).to_numpy().ravel()):
-        raise StudyError(f"no rows of {', '.join(sorted(missing))} were made; nothing is changed")
+        known = "; ".join(f"{column}: {', '.join(map(str, old[column].dropna().unique()))}" for column in columns)
+        raise StudyError(f"no rows of {', '.join(sorted(missing))} were made, nothing is changed; there are {known}")
     rows = pd.concat([old[~replaced], new], ignore_index=True)
     keys = [name for name in (*NAMED, "trap", "mechanism") if name in old]
     # a name that is missing is NaN in rows that were read, and may be None in new ones
@@ -140,3 +138,76 @@ class Study:
         ready |= self.tables(rows, found)
         text = render(self.name, found, ready, stamp=line, quick=output.call.quick, rows=rows)
         output.write(f"{self.name}.md", text)
+
+
+REPORTS = {  # and their questions, in the order of the index
+    "engines": "On closed loops, is twoloop faster than physics engines?",
+    "validation": "Do the methods reproduce published mechanisms?",
+    "honesty": "How often is a solver wrong without saying so?",
+    "table3": "Does the paper's Table 3 come out again?",
+    "claims": "Which of the paper's claims hold?",
+    "energy": "Which methods keep the energy over long times?",
+    "ensembles": "What do thousands of runs cost in one call?",
+    "models": "Which model files are read, and are the models right?",
+    "scale": "How do costs grow with the number of bodies?",
+    "work_precision": "What does an accuracy cost, beside all other solvers?",
+    "reproduction": "Do the paper's figures come out again?",
+}
+# claims reads the rows of the others
+STUDIES = (
+    *("work_precision", "table3", "energy", "validation", "honesty", "planted_errors", "ensembles", "scale", "engines"),
+    *("models", "reproduction", "claims"),
+)
+
+
+def module_of(name: str) -> ModuleType:
+    """Import the module of a study, a file or `study` in a folder."""
+    found = importlib.import_module(f"studies.{name}")
+    return importlib.import_module(f"studies.{name}.study") if hasattr(found, "__path__") else found
+
+
+def run_study(name: str, words: Sequence[str]) -> None:
+    """Run a study for a command line: the `STUDY` of its module, or its `main`."""
+    module = module_of(name)
+    getattr(module, "STUDY", module).main(words)
+
+
+def line_of(folder: Path, name: str) -> dict[str, Any] | None:
+    """Read what the index says of a report; None where it has not been written, or its findings give no answer. Raises
+    StudyError if a file is damaged."""
+    path = folder / f"{name}.json"
+    if not (path.is_file() and (folder / f"{name}.md").is_file()):
+        return None
+    try:
+        answer = json.loads(path.read_text()).get("answer")
+    except ValueError as error:
+        raise StudyError(f"{path} cannot be read ({error}); run python -m studies.{name} again") from None
+    parts = PARTS if name == "reproduction" else (name,)
+    files = [file for rows in parts if (file := folder / f"{rows}.csv").is_file()]
+    if not answer or not files:
+        return None
+    made = [made_on(*read_rows(file)) for file in files]
+    dates, processors = sorted({date for date, _ in made}), list(dict.fromkeys(each for _, own in made for each in own))
+    told = {"name": name, "question": REPORTS[name], "answer": answer}
+    return told | {"date": " to ".join(dict.fromkeys((dates[0], dates[-1]))), "processor": listed(processors)}
+
+
+def made_on(rows: pd.DataFrame, stamp: str) -> tuple[str, list[str]]:
+    """Tell the date of a stamp, and the processors on which the rows were measured: those of their column if any."""
+    day, parts = re.search(r"\d{4}-\d{2}-\d{2}( to \d{4}-\d{2}-\d{2})?", stamp), stamp.split("; ")
+    known = rows["processor"].dropna().unique().tolist() if "processor" in rows else []
+    known = known or [part.split(",")[0] for part in parts if re.search(r", \d+ cores", part)]
+    return day[0] if day else "unknown", list(dict.fromkeys(map(short, known)))
+
+
+def short(processor: str) -> str:
+    """Name a processor in a table: without family and model, and what makers add."""
+    return re.sub(r"\(R\)| \(family [\w ]+\)| Processor", "", processor).strip()
+
+
+def write_index(output: Output) -> None:
+    """Write README.md of the folder anew."""
+    lines = [line for name in REPORTS if (line := line_of(output.path, name))]
+    more: dict[str, Any] = {"quick": output.call.quick, "lines": lines}
+    more["there"] = {path.name for path in output.path.iterdir()}
+    output.write("README.md", render("index", {}, {}, **more))

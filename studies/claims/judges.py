@@ -1,7 +1,5 @@
-"""What a claim is, and its judges: from the rows of the other studies to a verdict and the numbers that decide.
-
-All that depends on how another study writes its rows stands here.
-"""
+"""What a claim is, and its judges: from the rows of the other studies to a verdict and the numbers that decide. All
+that depends on how another study writes its rows stands here."""
 
 import itertools
 import tomllib
@@ -70,10 +68,8 @@ class Rows:
         return float(self.experiments[key])
 
     def pick(self, study: str, least: float = 0.0, named: str = "", **equal: Any) -> pd.DataFrame:
-        """Select the rows in which each column named has that value, or one of a tuple of values.
-
-        Of solvers whose name contains `named`; not run if none covers `least` seconds.
-        """
+        """Select the rows in which each column named has that value, or one of a tuple of values. Of solvers whose name
+        contains `named`; not run if none covers `least` seconds."""
         if study not in self.tables:
             raise NotRun(f"there is no {study}.csv")
         found = self.tables[study]
@@ -528,11 +524,9 @@ def _along(rows: Rows, solver: str, problem: str) -> pd.DataFrame:
 
 
 def _newmark_over_irk(rows: Rows) -> dict[str, list[float]]:
-    """Divide times of Newmark, both beta, by Runge-Kutta's: at equal errors on linkages, of runs as good on beams.
-
-    On the beams Runge-Kutta has no run as bad as the errors, so that the errors compared are not equal: of each the
-    cheapest run counts that is at least as good.
-    """
+    """Divide times of Newmark, both beta, by Runge-Kutta's: at equal errors on linkages, of runs as good on beams. On
+    the beams Runge-Kutta has no run as bad as the errors, so that the errors compared are not equal: of each the
+    cheapest run counts that is at least as good."""
     ratios: dict[str, list[float]] = {"linkage": [], "soft": [], "stiff": []}
     for name in (NEWMARK, QUARTER):
         for problem in dict.fromkeys(rows.long("table3_full")["problem"]):

@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 from unittest.mock import patch
@@ -14,8 +15,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from references.cyrk.ode import solve_cyrk
+from references.heyoka.taylor import solve_heyoka
+from references.scipy.index1 import solve_index1
+from references.sundials.cvode_c import solve_cvode_c
+from references.sundials.ida import solve_ida, solve_ida_c
 from studies.bench import figures
-from studies.bench.apart import apart, heard
+from studies.bench.apart import SEPARATOR, apart, heard
 from studies.bench.cli import StudyError
 from studies.bench.end_states import EXACT, JUDGED
 from studies.bench.render import number, power
@@ -23,13 +29,123 @@ from studies.bench.sharp_forces import T_END
 from studies.bench.solvers import GIVEN
 from studies.bench.store import Array, Output, Row, read_rows
 from studies.bench.study import Study
-from studies.honesty import solvers as catalogue
 from studies.honesty import traps
-from studies.honesty.solvers import DEFAULT, KINDS, LIMITED, LOOK, OWN_SUFFIX, kind_of
 from studies.honesty.traps import Trap
-from twoloop import ConstrainedSystem, solve_dae
+from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.__main__ import compile_all
 from twoloop.kernels.compile import callbacks
+from twoloop.kernels.control.discontinuities import N_SAMPLES
+from twoloop.kernels.data.indices import LONGEST_UNSEEN
+
+OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
+PROJECTED = "CVODE from C, BDF, projected"
+CYRK, CYRK_RADAU = "CyRK, DOP853", "CyRK, Radau"
+OTHERS: dict[str, Callable[..., Result]] = {  # but for SciPy's
+    **{IDA: partial(solve_ida, form="stabilised"), IDA_C: solve_ida_c, CVODE_C: partial(solve_cvode_c, method="Adams")},
+    **{HEYOKA: solve_heyoka, PROJECTED: partial(solve_cvode_c, method="BDF", projected=True)},
+    **{CYRK: solve_cyrk, CYRK_RADAU: partial(solve_cyrk, method="Radau")},
+}
+SUNDIALS = (IDA, IDA_C, CVODE_C, PROJECTED)
+COMPILED_ONLY = (IDA_C, CVODE_C, PROJECTED, HEYOKA, CYRK, CYRK_RADAU)
+SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
+OF_FORCES = (  # run under sharp forces, too: all presets but the paper's, which follow it to the letter
+    *("auto, compiled", "auto, not compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14"),
+    *("Gauss16", "SunRadau5", "RadauIIA9", "RadauIIA13", "TRBDF2", "ESDIRK4", "Newmark"),
+)
+OWN_SUFFIX = " (twoloop)"
+DEFAULT = f"{GIVEN}{OWN_SUFFIX}"
+WITH_CODE: dict[str, dict[str, Any]] = {"": {}, "compiled": {"compiled": True}, "not compiled": {"compiled": False}}
+QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
+OWN_OF = {  # groups of many runs, which fewer methods make
+    **dict.fromkeys((traps.SINGULAR, traps.FOLD), (GIVEN, "auto, not compiled", "DOP853")),
+    **dict.fromkeys((traps.STOPS, traps.SIGNAL, traps.SHORT), (GIVEN, "DOP853", "RadauIIA5")),
+    traps.INERTIA: (GIVEN, "auto, compiled", "DOP853", "Taylor", "RadauIIA5"),
+    traps.CERTIFICATE: (GIVEN, "DOP853", "RadauIIA5", "BDF", "TRBDF2", "ESDIRK4", "Newmark"),
+    traps.LINKAGE: (GIVEN, "DOP853"),
+    traps.FORCE: (*OWN, *OF_FORCES),
+}
+LOOK = LONGEST_UNSEEN / N_SAMPLES  # of a run: longest time between two evaluations of a force that changes with time
+LIMITED = ", max_step"  # of other solvers whose largest step is that time
+
+KINDS = {  # kinds of solvers, in words
+    "default": "the default",
+    "own": "twoloop's other methods",
+    "heyoka": "heyoka",
+    "cyrk": "CyRK",
+    "sundials": "SUNDIALS (IDA, CVODE)",
+    "scipy": "SciPy",
+    "limited": "other solvers with `max_step`",
+}
+
+Call = Callable[[Trap], Result]
+
+
+def kind_of(name: str) -> str:
+    """Which of KINDS a solver is; other solvers with a largest step are "limited", whosever they are."""
+    if name.endswith(OWN_SUFFIX):
+        return "default" if name == DEFAULT else "own"
+    if name.endswith(LIMITED):
+        return "limited"
+    named = {HEYOKA: "heyoka", CYRK: "cyrk", CYRK_RADAU: "cyrk"} | dict.fromkeys(SUNDIALS, "sundials")
+    return named.get(name, "scipy")
+
+
+def own(method: str, trap: Trap) -> Result:
+    """Run a method of twoloop, as a user calls it."""
+    name, _, code = method.partition(", ")
+    options: dict[str, Any] = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
+    options |= WITH_CODE[code] | ({} if name == GIVEN else {"method": name}) | dict(trap.steps)
+    return trap.solve(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, **options)  # type: ignore[no-any-return]
+
+
+def largest_step(limited: bool, trap: Trap) -> float | None:
+    """Return `max_step` of another solver (s): the trap's own, else LOOK if it is `limited`, else none."""
+    return trap.steps.get("max_step", LOOK * trap.t_end if limited else None)
+
+
+def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
+    """Run another solver, without a largest step, or with one."""
+    options = {"time_limit": trap.time_limit, "max_step": largest_step(limited, trap)}
+    tolerances = {"tol": trap.tolerance} if solve is solve_heyoka else {"rtol": trap.tolerance, "atol": trap.tolerance}
+    return solve(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, **tolerances, **options)
+
+
+def solvers_of(quick: bool, group: str = traps.MISTAKE) -> dict[str, Call]:
+    """Return the solvers of a group of traps by name: twoloop's, then others without `max_step` and with it."""
+    left_out = OTHERS if quick else (IDA, PROJECTED, CYRK_RADAU) if group in (traps.SHORT, traps.LINKAGE) else ()
+    others = {name: solve for name, solve in OTHERS.items() if name not in left_out}
+    scipy = QUICK_SCIPY if quick or group in (traps.SHORT, traps.LINKAGE) else SCIPY
+    others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in scipy}
+    if group in (traps.SINGULAR, traps.FOLD):  # where accelerations are undefined
+        others = {name: solve for name, solve in others.items() if name in (IDA, IDA_C)}
+    methods = QUICK_OWN if quick else OWN_OF.get(group, OWN)
+    made: dict[str, Call] = {f"{name}{OWN_SUFFIX}": partial(own, name) for name in methods}
+    if group in (traps.STOPS, traps.INERTIA, traps.CERTIFICATE, traps.SIGNAL):  # of twoloop alone
+        return made
+    made |= {name: partial(other, solve, False) for name, solve in others.items()}
+    if group not in (traps.INPUT, traps.LINKAGE, traps.SINGULAR, traps.FOLD):  # which a largest step does not help
+        made |= {name + LIMITED: partial(other, solve, True) for name, solve in others.items()}
+    return made
+
+
+def why_not(name: str, trap: Trap) -> str:
+    """Say why a solver is not run on a trap; "" where it is run."""
+    solver, theirs = name.removesuffix(LIMITED), not name.endswith(OWN_SUFFIX)
+    if theirs and set(trap.steps) - {"max_step"}:
+        return "its adapter takes neither first nor constant steps"
+    if name.endswith(LIMITED) and trap.steps:
+        return "the trap sets max_step itself"
+    if theirs and not solver.startswith("IDA"):  # it is given accelerations, which twoloop derives
+        if trap.group == traps.INPUT:
+            return "it is given accelerations: it has no constraints to check"
+        if trap.impulse or trap.singular:
+            return "the accelerations are not defined throughout: of an impulse, or where C_q loses rank"
+    package = {HEYOKA: "heyoka", CYRK: "CyRK", CYRK_RADAU: "CyRK"}.get(solver)
+    if package is not None and find_spec(package) is None:
+        return f"{package} is not installed"
+    return "it takes compiled functions only" if solver in COMPILED_ONLY and trap.system.called_in_python else ""
+
 
 RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "reported failure", "silently wrong", "hangs", "not run"
 BAD = (SILENT, HANG)
@@ -59,6 +175,11 @@ TABLE: dict[str, tuple[str, Callable[[pd.DataFrame], pd.Series]]] = {  # kinds o
     "pulse_long": ("pulses of 3 and 10 ms", _brief("pulse", False)),
     "pulse_short": ("pulses of 0.1 to 1 ms", _brief("pulse", True)),
     "singular": ("singular positions", _of(traps.SINGULAR)),
+    "folds": ("linkages that fold", _of(traps.FOLD)),
+    "stops": ("impacts at several stops", _of(traps.STOPS)),
+    "inertia": ("accelerations at little inertia", _of(traps.INERTIA)),
+    "certificates": ("certificates", _of(traps.CERTIFICATE)),
+    "signals": ("exceptions of signal handlers", _of(traps.SIGNAL)),
     "linkages": ("random four-bar linkages", _of(traps.LINKAGE)),
     "mistakes": ("mistakes and hard motions", _of(traps.MISTAKE)),
     "input": ("inconsistent start, wrong derivative", _of(traps.INPUT)),
@@ -143,6 +264,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["n_forces"] = int(forces["trap"].nunique())
     found["singular"] = {"tolerances": [max(traps.TOLERANCES), min(traps.TOLERANCES)]}
     found["singular"]["plain"] = graded(singular[singular["solver"] == PLAIN])["failed"]
+    passed = ran[(ran["group"] == traps.CERTIFICATE) & (ran["trap"] == traps.SOUND)]["outcome"] == RIGHT
+    found["passed"] = {"n": len(passed), "right": int(passed.sum())}  # certificates of right results
     found |= {"look": LOOK, "brief": BRIEF, "t_end": T_END, "exact": EXACT, "usual": USUAL, "looseness": LOOSENESS}
     found["least"] = LOOSENESS * LEAST
     return found | {"seed": traps.SEED, "answer": answer_of(found["table"])}
@@ -157,7 +280,7 @@ def answer_of(table: Mapping[str, Any]) -> str:
 
     brief = f"forces shorter than 1/{number(round(1.0 / LOOK))} of the run"
     words = {("sharp",): "runs under sharp forces", ("gust_short", "pulse_short"): f"under {brief}"}
-    words |= {("singular",): "at singular positions"}
+    words |= {("singular", "folds"): "at singular positions"}
     places = [f"{counts(*keys)} {where}" for keys, where in words.items() if keys[0] in table]
     return f"{GIVEN[0].upper()}{GIVEN[1:]} is silently wrong in {', '.join(places)}."
 
@@ -190,19 +313,18 @@ TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that give the right 
 TRUTH_LIMIT = 10.0  # s that one of them may take
 AGREE = 1e-7  # how far the two may differ
 UNCONTROLLED = "no error was estimated"  # in the message of a successful run with steps of a given size
+REDUNDANT = "the constraints of"  # begins the warning of redundant rows, which says nothing of errors
 REFUSALS = (  # in messages of an adapter, or of twoloop, that does not take the equations or the setting: no run
     *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
     *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
 )
 # are built for each system, which takes longer than a run
-BUILT = (catalogue.HEYOKA, catalogue.CVODE_C, catalogue.PROJECTED, catalogue.CYRK, catalogue.CYRK_RADAU)
+BUILT = (HEYOKA, CVODE_C, PROJECTED, CYRK, CYRK_RADAU)
 
 
 def right_answer(trap: Trap) -> Array | None:
     """Compute the positions at the end by two unlike methods, from one break of the forces to the next, if there are.
-
-    Raises StudyError if the two agree at no tolerance.
-    """
+    Raises StudyError if the two agree at no tolerance."""
     if trap.positions is not None:
         return trap.positions(trap.t_end)
     if trap.sane is None:
@@ -230,12 +352,15 @@ def _end(system: ConstrainedSystem, trap: Trap, method: str, tolerance: float) -
     return q
 
 
-def cell(call: catalogue.Call, trap: Trap, truth: Array | None) -> Row:
+def cell(call: Call, trap: Trap, truth: Array | None) -> Row:
     """Make a run and describe what came of it."""
     result, made = heard(partial(call, trap))
     made |= {"error": None, "evaluated": True}
-    if result is not None and result.success and truth is not None:
-        made["error"] = float(np.nanmax(np.abs(result.q[:, -1] - truth)))
+    if result is not None and result.success:
+        if trap.error is not None:
+            made["error"] = trap.error(result)
+        elif truth is not None:
+            made["error"] = float(np.nanmax(np.abs(result.q[:, -1] - truth)))
     if result is not None and result.success and trap.unnoticed is not None:
         without, _ = heard(partial(call, replace(trap, system=trap.unnoticed)))
         made["evaluated"] = without is None or not np.array_equal(result.q, without.q)
@@ -249,9 +374,10 @@ def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
     if row["status"] != "REACHED_END":
         return HANG if row["status"] == HANG else SAID
     limit = LOOSENESS * max(trap.tolerance, LEAST) * trap.sensitivity
-    if has_answer and row["error"] is not None and row["error"] <= limit:
+    if (has_answer or trap.error is not None) and row["error"] is not None and row["error"] <= limit:
         return RIGHT
-    return SAID if row["warned"] or UNCONTROLLED in row["message"] else SILENT
+    warned = any(not words.startswith(REDUNDANT) for words in row["warned"].split(SEPARATOR) if words)
+    return SAID if warned or UNCONTROLLED in row["message"] else SILENT
 
 
 def about(name: str, trap: Trap) -> dict[str, str]:
@@ -259,12 +385,12 @@ def about(name: str, trap: Trap) -> dict[str, str]:
     return {"group": trap.group, "trap": trap.name, "mechanism": trap.mechanism, "solver": name}
 
 
-def run(name: str, call: catalogue.Call, trap: Trap, truth: Array | None) -> Row:
+def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
     """Make one cell in a process of its own, which is ended when it does not come back."""
     row: Row = {**about(name, trap), "tol": trap.tolerance, "n_drawn": trap.n_drawn}
-    row["seed"] = traps.SEED if trap.group in (traps.FORCE, traps.SHORT, traps.LINKAGE) else None
-    limited = name.endswith(catalogue.LIMITED)
-    row["max_step"] = None if name.endswith(catalogue.OWN_SUFFIX) else catalogue.largest_step(limited, trap)
+    row["seed"] = None if trap.group in (traps.INPUT, traps.MISTAKE, traps.SINGULAR) else traps.SEED
+    limited = name.endswith(LIMITED)
+    row["max_step"] = None if name.endswith(OWN_SUFFIX) else largest_step(limited, trap)
     began, no_answer = time.monotonic(), {"message": "", "error": None, "warned": ""}
     try:
         row |= apart(partial(cell, call, trap, truth), trap.time_limit + GRACE)
@@ -284,15 +410,15 @@ def make(output: Output) -> pd.DataFrame:
     compiled: set[tuple[Any, ...]] = set()
     compile_all()  # what a child of a slow machine compiles may exceed its time limit, and is lost with it
 
-    def made(name: str, call: catalogue.Call, trap: Trap, truth: Array | None) -> Row:
-        if why := catalogue.why_not(name, trap):
+    def made(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
+        if why := why_not(name, trap):
             return about(name, trap) | {"outcome": NOT_RUN, "status": "", "message": why}
         warm_up(name, call, trap, compiled)
         return run(name, call, trap, truth)
 
     with output.kept() as kept, patch("references.driver.check_start"):
         for trap in traps.traps(quick, groups):
-            known = catalogue.solvers(quick, trap.group)
+            known = solvers_of(quick, trap.group)
             known = {name: call for name, call in known.items() if output.call.wants(name, trap.group)}
             keys = {name: " | ".join(about(name, trap).values()) for name in known}
             truth = None if all(key in kept for key in keys.values()) else right_answer(trap)
@@ -300,9 +426,9 @@ def make(output: Output) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def warm_up(name: str, call: catalogue.Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
+def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
     """Compile in this process what the children call, on a harmless motion."""
-    shared = name.removesuffix(catalogue.LIMITED)
+    shared = name.removesuffix(LIMITED)
     sane, tolerance = trap.sane or trap.system, 1e-4
     functions = (getattr(sane.functions, kind) for kind in callbacks.KINDS)
     made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *functions)

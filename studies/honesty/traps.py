@@ -1,36 +1,48 @@
-"""Traps: systems and starts on which a solver goes wrong unless it notices.
-
-All traps on chains of point masses share the compiled callbacks of `sharp_callbacks`, with a force of its own: the
-parameters say what the trap is.
-"""
+"""Traps: systems and starts on which a solver goes wrong unless it notices. All traps on chains of point masses share
+the compiled callbacks of `sharp_mechanisms`, with a force of its own: the parameters say what the trap is."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal, localcontext
 from functools import partial
-from itertools import chain, product
+from itertools import chain, pairwise, product
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from studies.bench.random_linkages import KINDS as LINKAGES
-from studies.bench.random_linkages import draw, end_of
-from studies.bench.sharp_callbacks import CHAIN, chain_force, chain_jacobian
+from studies.bench.linkages import FOLDS, REGULAR, draw, end_of, moved
+from studies.bench.linkages import KINDS as LINKAGES
 from studies.bench.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families, gust, made, pulse
-from studies.bench.sharp_mechanisms import Mechanism, bars, row, slider_in_space
+from studies.bench.sharp_mechanisms import (
+    CHAIN,
+    Mechanism,
+    Motion,
+    bars,
+    chain_force,
+    chain_jacobian,
+    motion,
+    row,
+    slider_in_space,
+)
 from studies.bench.sharp_mechanisms import chain as chain_of
-from studies.bench.sharp_motion import Motion, motion
 from studies.bench.store import Array
 from studies.planted_errors.faults import python_copy
-from twoloop import ConstrainedSystem
+from twoloop import ConstrainedSystem, Result, Status, ensemble, solve_dae, solve_with_stops, sweep
+from twoloop.bodies import PlanarModel
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar, n_four_bar
 
 NEVER = 1e30  # s
 # groups of traps: a start or a derivative that checks of the input find; a mistake in a model or a setting, or a hard
-# motion; a sharp force; a force so short that a solver may step over it; a random linkage; singular positions
-GROUPS = ("input", "mistake", "force", "short", "linkage", "singular")
-INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR = GROUPS
+# motion; a sharp force; a force so short that a solver may step over it; a random linkage; singular positions of A02,
+# and of linkages that fold; impacts at several stops; little inertia; certificates; exceptions of signal handlers
+GROUPS = INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR, FOLD, STOPS, INERTIA, CERTIFICATE, SIGNAL = (
+    *("input", "mistake", "force", "short", "linkage", "singular", "fold", "stops", "inertia", "certificate", "signal"),
+)
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
 SEED = 20261126  # of all draws: the day. Draw by a new seed when the methods have been changed to pass these
 GROWN = 100.0  # how much errors may grow in a motion under a force, up to which two methods can agree on it
@@ -43,12 +55,25 @@ FORCES = (  # families of `sharp_forces`
 UNKNOWN_IN_SPACE = FORCES[-4:]  # two methods do not agree to AGREE there
 KINK = "drive with a kink"
 QUICK_FORCES = ("drag", "gust of 30 ms", KINK)
-SHAPES = {"gust": gust, "pulse": pulse}  # a gust exp(-(t / b)^2) has tails; a pulse is zero before and behind
+SHAPES: dict[str, Callable[[float], Any]] = {
+    "gust": gust,
+    "pulse": pulse,
+}  # a gust exp(-(t / b)^2) has tails; a pulse is zero before and behind
 WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s: b of a gust, duration of a pulse
 N_DRAWS, N_QUICK, QUICK_WIDTHS = 8, 2, (1e-3,)  # of each width on each mechanism
 N_LINKAGES, LINKAGE_END = 100, 5.0  # of each kind; s
 SIZES, ENDS = tuple(range(1, 7)), (5.0, 10.0, 20.0)  # of A02 in both sets of coordinates; s
 TOLERANCES = tuple(10.0 ** (-0.5 * k) for k in range(12, 23))  # of A02: 1e-6 to 1e-11
+N_STARTS, FOLD_TOLERANCES = 1, tuple(10.0**-k for k in range(4, 12))  # of each linkage that folds
+N_BALLS, N_LONG, N_SIGNALS, LASTING = 4, 2, 4, 3.0  # draws of each kind; s
+STOP_TOLERANCES, INERTIA_TOLERANCES, CERTIFICATE_TOLERANCES = (1e-5, 1e-8, 1e-11), (1e-6, 1e-9), (1e-4, 1e-6, 1e-8)
+LEAST_IMPACTS, NUDGE = 15, 1e-9  # of balls; m/s, by which velocities are changed to see how errors grow
+LONG_BARS = ("parallelogram", "deltoid", *list(REGULAR)[:2])
+DECADES = (1.0, -7.0), (2.0, -3.0)  # least and largest, of lengths and moments of inertia
+DIGITS = 40  # of impacts
+WAIT, LATEST = 2.0, 0.08  # s: how long an exception of a signal handler is waited for; the latest time of a signal
+ANGLES = [{"theta3": 0.02 * k} for k in range(20)]  # of the runs of a sweep
+INSTANTS = np.linspace(0.0, LASTING, 500)  # of a dense output
 # places in the parameters behind lengths and masses: a spring that holds the last point, and where it is at rest;
 # begin, end and size of a force along x; when the force becomes NaN, when it raises; a wrong entry of C_q
 SPRING, REST, BEGIN, END, PUSH, NAN, RAISES, WRONG = range(8)
@@ -110,6 +135,9 @@ class Trap:
     singular: bool = False
     sensitivity: float = 1.0  # growth of an error at the start; where it is above 1, so much more error is allowed
     n_drawn: int = 1  # how many were drawn until the motion of one was known
+    solve: Callable[..., Any] = solve_dae
+    # error(result), where the positions at the end do not tell it
+    error: Callable[[Any], float] | None = None
 
 
 def start(n: int) -> tuple[Array, Array]:
@@ -127,6 +155,11 @@ def traps(quick: bool, groups: Sequence[str] | None = None) -> Iterator[Trap]:
         MISTAKE: lambda: chain((trap for n in sizes for trap in of_chain(n)), () if quick else of_linkages()),
         LINKAGE: lambda: random_linkages(0 if quick else N_LINKAGES),
         SINGULAR: lambda: iter(()) if quick else singular_positions(),
+        FOLD: lambda: iter(()) if quick else folds(),
+        STOPS: lambda: several_stops(1 if quick else N_BALLS),
+        INERTIA: lambda: little_inertia(0 if quick else N_LONG),
+        CERTIFICATE: lambda: iter(()) if quick else certificates(),
+        SIGNAL: lambda: signals(1 if quick else N_SIGNALS),
         FORCE: lambda: under_forces(quick),
         SHORT: lambda: short_forces(quick),
     }
@@ -163,6 +196,146 @@ def singular_positions() -> Iterator[Trap]:
         trap = of_motion(SINGULAR, problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
         name = f"{problem.name}, {t_end:g} s, {tolerance:.2g}"
         yield replace(trap, t_end=t_end, tolerance=tolerance, mechanism=name, singular=True, group=SINGULAR)
+
+
+def folds() -> Iterator[Trap]:
+    """Yield linkages that fold on the way, from random starts, at FOLD_TOLERANCES."""
+    for (place, name), k, tolerance in product(enumerate(FOLDS), range(N_STARTS), FOLD_TOLERANCES):
+        known = moved(name, (SEED, place, k)) | {"mechanism": f"{name}, start {k}, {tolerance:g}", "error": None}
+        yield Trap("linkage that folds", **known, tolerance=tolerance, singular=True, group=FOLD)
+
+
+def several_stops(n: int) -> Iterator[Trap]:
+    """Yield n draws of balls on a rail, one of them light, that collide often, with a wall and without."""
+    for (in_line, wall), k in product(((2, True), (3, False), (3, True), (4, False)), range(n)):
+        g, n_drawn, growth = np.random.default_rng([SEED, in_line, wall, k]), 0, np.inf
+        while growth > GROWN:
+            masses, x = g.uniform(0.4, 2.0, in_line), np.cumsum(g.uniform(0.2, 1.0, in_line))
+            masses[g.integers(1 - wall, in_line - 1)] *= 10.0 ** g.uniform(-3.0, -1.0)
+            v, restitutions, n_drawn = g.uniform(-1.5, 1.5, in_line), g.uniform(0.3, 0.9, in_line), n_drawn + 1
+            ends = [collided(masses, restitutions, x, v + d, wall) for d in NUDGE * np.eye(in_line + 1, in_line, -1)]
+            if ends[0][1] >= LEAST_IMPACTS:
+                growth = max(float(np.abs(end - ends[0][0]).max()) for end, _ in ends) / NUDGE
+        model = PlanarModel((0.0, 0.0), name=f"{in_line} balls{' and a wall' * wall}")
+        for j, mass in enumerate(masses):
+            model.body(f"ball {j}", mass=mass, inertia=1.0, position=(x[j], 0.0), velocity=(v[j], 0.0))
+            model.prismatic("ground", f"ball {j}", at=(x[j], 0.0), axis=(1.0, 0.0))
+            if j or wall:
+                foot, on = (x[j - 1], f"ball {j - 1}") if j else (0.0, "ground")
+                given = {"normal": (1.0, 0.0), "restitution": restitutions[j]}
+                model.stop(f"ball {j}", (x[j], 0.0), on, (foot, 0.0), **given)
+        problem, end = model.problem((0.0, LASTING)), np.kron(ends[0][0], [1.0, 0.0, 0.0])
+        about: dict[str, Any] = {"positions": lambda t, end=end: end, "sensitivity": max(1.0, growth)}
+        about |= {"solve": partial(solve_with_stops, stops=model.stops), "n_drawn": n_drawn, "group": STOPS}
+        yield from of_problem("impacts at several stops", k, problem, STOP_TOLERANCES, **about)
+
+
+def of_problem(name: str, k: int, problem: Any, tolerances: Iterable[float], **about: Any) -> Iterator[Trap]:
+    """Yield the k-th draw of a trap at some tolerances."""
+    for tolerance in tolerances:
+        place, start = f"{problem.name}, draw {k}, {tolerance:g}", (problem.q0, problem.v0, problem.t_span[1])
+        yield Trap(name, place, problem.system, *start, **about, tolerance=tolerance)
+
+
+def collided(masses: Array, restitutions: Array, x0: Array, v0: Array, wall: bool) -> tuple[Array, int]:
+    """Return the places of balls at the end, impact by impact, to so many DIGITS, and the number of impacts."""
+    with localcontext(prec=DIGITS):
+        least, left, n, none = Decimal(10) ** (5 - DIGITS), Decimal(LASTING), 0, [Decimal(0)] * wall
+        x, v, e, inertia = (list(map(Decimal, given.tolist())) for given in (x0, v0, restitutions[not wall :], masses))
+        x, v, inverse = none + x, none + v, none + [1 / mass for mass in inertia]
+        while True:
+            rates = [b - a for a, b in pairwise(v)]
+            closing = [((x[k + 1] - x[k]) / -rate, k) for k, rate in enumerate(rates) if rate < -least]
+            wait, k = min(closing, default=(left, 0))
+            if wait >= left:
+                return np.array([float(a + left * w) for a, w in zip(x, v, strict=True)])[wall:], n
+            x, left, n = [a + wait * w for a, w in zip(x, v, strict=True)], left - wait, n + 1
+            impulse = -(1 + e[k]) * rates[k] / (inverse[k] + inverse[k + 1])
+            v[k], v[k + 1] = v[k] - impulse * inverse[k], v[k + 1] + impulse * inverse[k + 1]
+
+
+def little_inertia(n: int) -> Iterator[Trap]:
+    """Yield n draws of each linkage with long bars that have almost all of their mass in the middle."""
+    for (place, name), k in product(enumerate(LONG_BARS), range(n)):
+        size, inertia = 10.0 ** np.random.default_rng([SEED, place, k]).uniform(*DECADES)
+        for tolerance in INERTIA_TOLERANCES:
+            known = moved(name, (SEED, place, k), float(size), float(inertia))
+            known |= {"mechanism": f"{name}, draw {k}, {tolerance:g}", "tolerance": tolerance}
+            yield Trap("little inertia", **known, group=INERTIA)
+
+
+COLUMNS, SOUND = ("t", "q", "v", "a", "lam"), "right result"
+FAULTS: dict[str, Callable[[Result], dict[str, Any]]] = {  # what they change of a result
+    SOUND: lambda result: {},
+    "gravity 1 % off": lambda result: {},
+    "multipliers doubled": lambda result: {"lam": 2.0 * result.lam},
+    "accelerations 2 % off": lambda result: {"a": 1.02 * result.a},
+    "second half missing": lambda result: {x: getattr(result, x)[..., : len(result.t) // 2] for x in COLUMNS},
+}
+
+
+def certificates() -> Iterator[Trap]:
+    """Yield results of linkages that do not fold: certificates have to refuse the faulty and to pass the right ones."""
+
+    def solve(system: Any, *start: Any, fault: str, ran: Any, **options: Any) -> Result:
+        result = solve_dae(ran if "gravity" in fault else system, *start, **options)
+        if result.success:
+            result = replace(result, system=system, **FAULTS[fault](result))
+            if not (certificate := result.certify()):
+                raise RuntimeError(certificate.message)
+        return result
+
+    for (place, name), fault, tolerance in product(enumerate(REGULAR), FAULTS, CERTIFICATE_TOLERANCES):
+        known, ran = moved(name, (SEED, place)), moved(name, (SEED, place), heavier=1.01)["system"]
+        known |= {"error": None if fault == SOUND else lambda result: np.inf, "tolerance": tolerance}
+        known |= {
+            "mechanism": f"{name}, {tolerance:g}",
+            "solve": partial(solve, fault=fault, ran=ran),
+            "time_limit": 60.0,
+        }
+        yield Trap(fault, **known, group=CERTIFICATE)
+
+
+class Rung(ArithmeticError):
+    """Raised by the handler of a signal."""
+
+
+WORK: dict[str, Callable[..., Any]] = {  # during which a signal comes
+    "solve_dae": solve_dae,
+    "dense output": lambda *run, **more: solve_dae(*run, **more, dense_output=True).sol(INSTANTS),  # type: ignore[misc]
+    "ensemble": lambda system, span, *x, **more: ensemble(system, span, *np.tile(x, 20).reshape(2, 20, -1), **more),
+    "sweep": lambda system, span, *start, **more: sweep(
+        lambda theta3: replace(four_bar(theta3=theta3), system=system), ANGLES, t_span=span, parallel="threads", **more
+    ),
+}
+
+
+def rung(work: Callable[..., Any], after: float, *run: Any, **options: Any) -> Any:
+    """Work until the exception of a signal arrives, and say whether it does."""
+
+    def ring(number: int, frame: Any) -> None:
+        raise Rung
+
+    before, late, error = signal.signal(signal.SIGALRM, ring), time.monotonic() + WAIT, np.inf
+    try:
+        signal.setitimer(signal.ITIMER_REAL, after)
+        while time.monotonic() < late:
+            work(*run, **options)
+    except Rung:
+        error = 0.0
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    return SimpleNamespace(status=Status.REACHED_END, message="", success=True, error=error)
+
+
+def signals(n: int) -> Iterator[Trap]:
+    """Yield n exceptions of a signal handler, at random times, during each kind of WORK."""
+    problem, g = four_bar(), np.random.default_rng(SEED)
+    for (name, work), plain, k in product(WORK.items(), (False, True), range(n)):
+        about: dict[str, Any] = {"solve": partial(rung, work, g.uniform(1e-4, LATEST)), "group": SIGNAL}
+        given = python_copy(problem.system) if plain else problem.system, problem.q0, problem.v0, LASTING
+        place = f"four-bar{' of Python functions' * plain}, draw {k}"
+        yield Trap(f"signal during {name}", place, *given, **about, error=lambda result: result.error)
 
 
 def of_motion(name: str, problem: Problem, positions: Callable[[float], Array]) -> Trap:

@@ -131,10 +131,8 @@ def row_of(fault: Fault) -> Row:
 
 
 def check_sound(faults: Sequence[Fault]) -> int:
-    """Run every check without a fault, and count them.
-
-    Raises StudyError if one of them fails: it would catch anything.
-    """
+    """Run every check without a fault, and count them. Raises StudyError if one of them fails: it would catch
+    anything."""
     foreign = Run(case_of(mechanisms.double_pendulum()), CATALOGUE[SCIPY], TOLERANCE, repeats=1)
     warm_up(foreign, 0, set())  # here, so that the processes of the checks need not compile
     seen = set()

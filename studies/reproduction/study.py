@@ -10,10 +10,9 @@ import pandas as pd
 
 from studies.bench import cli, figures, tables
 from studies.bench.cli import Call, StudyError
-from studies.bench.index import short, write_index
 from studies.bench.render import listed, number, render
 from studies.bench.store import Output
-from studies.bench.study import rows_of
+from studies.bench.study import rows_of, short, write_index
 from studies.reproduction import ablation, beam, motion, step_size, violation
 
 NAME = "reproduction"

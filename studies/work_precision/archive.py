@@ -1,7 +1,5 @@
-"""The rows of work_precision.csv in the wheel: one a run, in the format of `twoloop.rows`.
-
-`python -m studies.work_precision.archive` makes `twoloop/rows/archive.jsonl.gz` of reports/work_precision.csv.
-"""
+"""The rows of work_precision.csv in the wheel: one a run, in the format of `twoloop.rows`. `python -m
+studies.work_precision.archive` makes `twoloop/rows/archive.jsonl.gz` of reports/work_precision.csv."""
 
 import gzip
 import json

@@ -1,10 +1,7 @@
-"""Run every mechanism whose end is verified with every solver, and find which is the fastest at which error.
-
-Errors are those at the end of the reference, which is known there to more digits than by any motion between: the
-largest of a coordinate, over the largest coordinate where that exceeds 1. A part of `studies.work_precision`.
-
-heyoka, CyRK and CVODE in minimal coordinates are a group of rows of their own, which no ranking of DAE solvers sees.
-"""
+"""Run every mechanism whose end is verified with every solver, and find which is the fastest at which error. Errors are
+those at the end of the reference, which is known there to more digits than by any motion between: the largest of a
+coordinate, over the largest coordinate where that exceeds 1. A part of `studies.work_precision`. heyoka, CyRK and CVODE
+in minimal coordinates are a group of rows of their own, which no ranking of DAE solvers sees."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -77,11 +74,8 @@ def singular() -> frozenset[str]:
 
 
 def _end_of_second(problem: Problem) -> Reference:
-    """Compute its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits.
-
-    Raises StudyError if a run fails, or the equation in one coordinate, which shares nothing with them, does not agree
-    to FAR.
-    """
+    """Compute its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits. Raises StudyError
+    if a run fails, or the equation in one coordinate, which shares nothing with them, does not agree to FAR."""
     t_end, ends = 10.0, []
     for method in ("Gauss14", "DOP853"):
         span = (0.0, t_end)
@@ -210,10 +204,8 @@ def reached(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def drift(made: Standings, rows: pd.DataFrame) -> dict[str, float] | None:
-    """Measure how far the fastest other solvers leave the constraints where they are faster than the default.
-
-    |C| of the cheapest run that is accurate enough over the error compared; None: all of them keep the constraints.
-    """
+    """Measure how far the fastest other solvers leave the constraints where they are faster than the default. |C| of
+    the cheapest run that is accurate enough over the error compared; None: all of them keep the constraints."""
     known = rows.reindex(columns=list(dict.fromkeys([*rows.columns, "violation_q", "keeps_constraints"])))
     leaves = known[known[["error_q", "violation_q"]].notna().all(axis=1) & known["keeps_constraints"].eq(False)]
     ratios = []
@@ -258,10 +250,8 @@ def collect_minimal(kept: KeptRows, call: Call) -> pd.DataFrame:
 
 
 def minimal_findings(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:
-    """Compare the ODE in minimal coordinates with the best of twoloop with constraints, by kind of mechanism.
-
-    `rows` and `everywhere` (of all solvers): medians.
-    """
+    """Compare the ODE in minimal coordinates with the best of twoloop with constraints, by kind of mechanism. `rows`
+    and `everywhere` (of all solvers): medians."""
     if not len(rows):
         return []
     cases = rows["case"].astype(str)

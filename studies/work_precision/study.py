@@ -10,10 +10,10 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from studies.bench import figures, headline, study, tables
-from studies.bench.index import short
 from studies.bench.render import number, power, render
 from studies.bench.row_files import versions
 from studies.bench.store import Output
+from studies.bench.study import short
 from studies.work_precision import first_calls, mechanisms, processors
 from studies.work_precision.mechanisms import HEADLINE, REPEATS, RESOLVED
 from twoloop.rows.row_format import CALIBRATION, calibration_s
@@ -78,9 +78,7 @@ def versions_of(output: Output) -> dict[str, str]:
 
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
     """Count the commits and processors of the rows, and the sessions in which a mechanism was measured, at most.
-
-    `speeds`: the largest time of the calibration over the least between the sessions of a mechanism, at most.
-    """
+    `speeds`: the largest time of the calibration over the least between the sessions of a mechanism, at most."""
     made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
     told: dict[str, Any] = {"commits": made["commit"].nunique(), "sessions": 1, "speeds": None}
     told["processors"] = sorted(map(short, made["processor"].unique()))

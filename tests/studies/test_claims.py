@@ -8,8 +8,9 @@ import pandas as pd
 import pytest
 
 from studies.bench.cli import StudyError
-from studies.claims import experiments, judges
+from studies.claims import judges
 from studies.claims import study as claims
+from studies.claims import study as experiments
 from studies.claims.judges import BEAMS, Claim, Judgement, Rows, Verdict, kind_of, load, read
 from studies.claims.study import JUDGES, judged
 from studies.reproduction import beam

@@ -10,35 +10,15 @@ import pandas as pd
 import pytest
 
 from studies.bench.sharp_forces import families
-from studies.bench.sharp_motion import Motion
-from studies.honesty import solvers as honesty_solvers
+from studies.bench.sharp_mechanisms import Motion
 from studies.honesty import study as honesty
-from studies.honesty.solvers import DEFAULT, IDA, IDA_C, KINDS, LIMITED, LOOK, kind_of, own, solvers, why_not
-from studies.honesty.study import HANG, NOT_RUN, RIGHT, SAID, SILENT
-from studies.honesty.traps import (
-    AGREE,
-    FORCE,
-    INPUT,
-    KINK,
-    LINKAGE,
-    MISTAKE,
-    SHORT,
-    SINGULAR,
-    forces,
-    of_force,
-    of_linkages,
-    pendulum,
-    random_linkages,
-    short_forces,
-    singular_positions,
-    traps,
-    under_forces,
-)
+from studies.honesty import traps as catalogue
+from studies.honesty.study import DEFAULT, LIMITED, NOT_RUN, RIGHT, SAID, SILENT, own
 from tests.studies.of_study import found_of, said
 from twoloop import solve_dae
 from twoloop.methods.presets import PRESETS
 
-TRAPS = {trap.name: trap for trap in traps(quick=True, groups=(MISTAKE, INPUT, FORCE))}
+TRAPS = {trap.name: trap for trap in catalogue.traps(quick=True, groups=catalogue.GROUPS[:3])}
 SOUND = TRAPS["redundant row"]
 DOP853 = partial(own, "DOP853")
 
@@ -79,7 +59,7 @@ def test_an_error_may_be_larger_where_errors_at_the_start_grow():
 def test_a_call_that_does_not_come_back_hangs(monkeypatch):
     monkeypatch.setattr(honesty, "GRACE", 0.1)
     short = replace(SOUND, time_limit=0.2)
-    assert honesty.run("x", lambda trap: time.sleep(60.0), short, None)["outcome"] == HANG
+    assert honesty.run("x", lambda trap: time.sleep(60.0), short, None)["outcome"] == honesty.HANG
 
 
 def test_a_pulse_that_was_never_evaluated():
@@ -125,67 +105,68 @@ def test_a_refusal_is_no_run(message):
 
 
 def test_refusals_have_these_messages():
-    mechanism = pendulum(families()["square wave"](np.random.default_rng(1)))
-    trap = of_force(FORCE, mechanism, Motion(np.zeros((1, 2)), 0.0, 1.0), 1)
+    mechanism = catalogue.pendulum(families()["square wave"](np.random.default_rng(1)))
+    trap = catalogue.of_force(catalogue.FORCE, mechanism, Motion(np.zeros((1, 2)), 0.0, 1.0), 1)
     for method in ("auto, compiled", "Taylor"):
         assert honesty.run("x", partial(own, method), trap, None)["outcome"] == NOT_RUN
 
 
 @pytest.mark.slow
 def test_motions_and_forces_have_known_ends():
-    known = {trap.name: trap for trap in of_linkages()}
-    for trap in (known["dead point"], known["assemblies nearly meet"], *islice(singular_positions(), 1)):
+    known = {trap.name: trap for trap in catalogue.of_linkages()}
+    for trap in (known["dead point"], known["assemblies nearly meet"], *islice(catalogue.singular_positions(), 1)):
         row = row_of(trap, partial(own, "auto"))
         assert row["outcome"] == RIGHT, row
-    for trap in random_linkages(1):
+    for trap in catalogue.random_linkages(1):
         assert row_of(trap)["outcome"] == RIGHT
         assert row_of(replace(trap, q0=trap.q0[::-1].copy()))["outcome"] == SAID
-    force = next(under_forces(quick=True))
+    force = next(catalogue.under_forces(quick=True))
     assert row_of(force)["outcome"] == RIGHT
     assert row_of(replace(force, system=TRAPS["gust of 30 ms"].system))["outcome"] == SILENT
 
 
 def test_singular_positions_are_run_at_every_size_and_tolerance():
-    made = list(singular_positions())
+    made = list(catalogue.singular_positions())
     assert len({trap.mechanism for trap in made}) == len(made) == 396 and all(trap.singular for trap in made)
-    others = [name for name in solvers(False, SINGULAR) if "twoloop" not in name]
-    assert others == [IDA, IDA_C] and not any(why_not(name, made[0]) for name in others)
+    others = [name for name in honesty.solvers_of(False, catalogue.SINGULAR) if "twoloop" not in name]
+    assert others == [honesty.IDA, honesty.IDA_C] and not any(honesty.why_not(name, made[0]) for name in others)
 
 
 def test_who_is_run_on_what():
-    python, first = TRAPS["exception in a Python callback after 1 s"], TRAPS["first step of 1 s"]
-    assert why_not(IDA_C, python) and not why_not("BDF (twoloop)", python) and why_not("LSODA, index 1", first)
-    kink = next(trap for trap in under_forces(quick=True) if trap.name == KINK)
+    python, first, why = TRAPS["exception in a Python callback after 1 s"], TRAPS["first step of 1 s"], honesty.why_not
+    assert why(honesty.IDA_C, python) and not why("BDF (twoloop)", python) and why("LSODA, index 1", first)
+    kink = next(trap for trap in catalogue.under_forces(quick=True) if trap.name == catalogue.KINK)
     assert kink.impulse and not TRAPS["drag"].impulse
-    named = {name: kind_of(name) for name in solvers(False, FORCE)}
-    assert set(named.values()) == set(KINDS)
+    named = {name: honesty.kind_of(name) for name in honesty.solvers_of(False, catalogue.FORCE)}
+    assert set(named.values()) == set(honesty.KINDS)
     for name, kind in named.items():  # an impulse has no accelerations
-        assert bool(why_not(name, kink)) == (kind not in ("default", "own") and not name.startswith("IDA"))
-    assert {name.split(",")[0] for name, kind in named.items() if kind == "scipy"} == {*honesty_solvers.SCIPY}
+        assert bool(honesty.why_not(name, kink)) == (kind not in ("default", "own") and not name.startswith("IDA"))
+    assert {name.split(",")[0] for name, kind in named.items() if kind == "scipy"} == {*honesty.SCIPY}
     asked = {name.removesuffix(" (twoloop)").split(",")[0] for name in named}
     # Lobatto16 is what "auto, compiled" takes wherever it can
     assert set(PRESETS) - asked == {"Lobatto16", "PaperIRK", "PaperNewmark"}
-    assert {bodies.__name__ for name, bodies in forces(quick=False) if name == "gust of 3 ms"} == {
+    assert {bodies.__name__ for name, bodies in catalogue.forces(quick=False) if name == "gust of 3 ms"} == {
         *("pendulum", "bars", "slider_in_space")
     }
 
 
 def test_other_solvers_are_run_with_a_largest_step_too(monkeypatch):
     asked = []
-    monkeypatch.setattr(honesty_solvers, "solve_index1", lambda *arguments, **options: asked.append(options))
-    every, pulse, half = solvers(False, FORCE), TRAPS["pulse of 1 ms"], TRAPS["pulse of 1 ms, max_step half of it"]
+    monkeypatch.setattr(honesty, "solve_index1", lambda *arguments, **options: asked.append(options))
+    every, pulse = honesty.solvers_of(False, catalogue.FORCE), TRAPS["pulse of 1 ms"]
+    half = TRAPS["pulse of 1 ms, max_step half of it"]
     every["LSODA, index 1"](pulse)
     every["LSODA, index 1" + LIMITED](pulse)
     every["LSODA, index 1"](half)
-    assert [options["max_step"] for options in asked] == [None, pytest.approx(pulse.t_end * LOOK), 5e-4]
-    assert why_not("LSODA, index 1" + LIMITED, half)
+    assert [options["max_step"] for options in asked] == [None, pytest.approx(pulse.t_end * honesty.LOOK), 5e-4]
+    assert honesty.why_not("LSODA, index 1" + LIMITED, half)
 
 
 def test_short_forces_come_at_random_times():
-    made = list(short_forces(quick=True))
+    made = list(catalogue.short_forces(quick=True))
     assert {trap.name for trap in made} == {"gust of 1 ms", "pulse of 1 ms"} and len(made) == 4
     assert len({tuple(trap.system.parameters) for trap in made}) == 4
-    assert row_of(made[0], lambda trap: own("auto", trap))["error"] < 1e3 * AGREE
+    assert row_of(made[0], lambda trap: own("auto", trap))["error"] < 1e3 * catalogue.AGREE
 
 
 OTHER, THEIRS = "BDF (twoloop)", "LSODA, index 1"
@@ -200,12 +181,24 @@ def made_up(*lines):
 
 
 def test_silent_failures_are_counted_by_trap_and_solver():
-    lines = [(FORCE, "drag", solver, RIGHT, 1e-9) for solver in (DEFAULT, OTHER, THEIRS, THEIRS + LIMITED)]
-    lines += [(FORCE, "gust", DEFAULT, SILENT, SLIGHT), (FORCE, "gust", THEIRS, HANG, np.nan)]
-    lines += [(FORCE, "gust", OTHER, SAID, np.nan), (FORCE, "gust", OTHER, NOT_RUN, np.nan)]
-    lines += [(SHORT, "gust of 1 ms", DEFAULT, SILENT, WRONG), (SHORT, "gust of 3 ms", DEFAULT, RIGHT, 0.0)]
-    lines += [(SHORT, "pulse of 0.1 ms", DEFAULT, SILENT, WRONG), (SINGULAR, SINGULAR, DEFAULT, RIGHT, 0.0)]
-    lines += [(MISTAKE, "dead point", THEIRS, SILENT, WRONG), (LINKAGE, "a bar", DEFAULT, RIGHT, 0.0)]
+    lines = [(catalogue.FORCE, "drag", solver, RIGHT, 1e-9) for solver in (DEFAULT, OTHER, THEIRS, THEIRS + LIMITED)]
+    lines += [
+        (catalogue.FORCE, "gust", DEFAULT, SILENT, SLIGHT),
+        (catalogue.FORCE, "gust", THEIRS, honesty.HANG, np.nan),
+    ]
+    lines += [(catalogue.FORCE, "gust", OTHER, SAID, np.nan), (catalogue.FORCE, "gust", OTHER, NOT_RUN, np.nan)]
+    lines += [
+        (catalogue.SHORT, "gust of 1 ms", DEFAULT, SILENT, WRONG),
+        (catalogue.SHORT, "gust of 3 ms", DEFAULT, RIGHT, 0.0),
+    ]
+    lines += [
+        (catalogue.SHORT, "pulse of 0.1 ms", DEFAULT, SILENT, WRONG),
+        (catalogue.SINGULAR, catalogue.SINGULAR, DEFAULT, RIGHT, 0.0),
+    ]
+    lines += [
+        (catalogue.MISTAKE, "dead point", THEIRS, SILENT, WRONG),
+        (catalogue.LINKAGE, "a bar", DEFAULT, RIGHT, 0.0),
+    ]
     found, text = said(honesty, made_up(*lines))
     counted = {key: (line["default"]["n"], line["default"]["wrong"]) for key, line in found["table"].items()}
     assert counted == {
@@ -232,7 +225,7 @@ def test_published_mechanisms_and_the_authors_conditions_stand_in_the_table(tmp_
     lines += [about | {"solver": "BDF (twoloop)", "outcome": NOT_RUN}, about | {"family": "SciPy", "solver": THEIRS}]
     pd.DataFrame(lines).to_csv(tmp_path / "x.csv", index=False)
     (tmp_path / "validation.csv").write_text("# full validation; stamp\n" + (tmp_path / "x.csv").read_text())
-    table = found_of(honesty, tmp_path, made_up((FORCE, "drag", DEFAULT, RIGHT, 1e-9)))["table"]
+    table = found_of(honesty, tmp_path, made_up((catalogue.FORCE, "drag", DEFAULT, RIGHT, 1e-9)))["table"]
     got = {key: [line["default"][what] for what in ("n", "ended", "wrong", "gross")] for key, line in table.items()}
     assert got == {"sharp": [1, 1, 0, 0], "published": [3, 2, 1, 0], "authors": [3, 2, 1, 1]}
     assert [table["published"][who]["n"] for who in ("own", "others")] == [0, 1]

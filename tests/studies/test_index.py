@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from studies import __main__ as command
-from studies.bench import index
+from studies.bench import study as index
 from studies.bench.cli import REPORTS, Call, StudyError
 from studies.bench.store import Output
 

@@ -8,9 +8,9 @@ from functools import cache
 import pytest
 
 from studies.bench.cli import REPORTS, ROOT
-from studies.bench.index import REPORTS as INDEX
-from studies.bench.index import run_study
 from studies.bench.render import number
+from studies.bench.study import REPORTS as INDEX
+from studies.bench.study import run_study
 
 README = (ROOT / "README.md").read_text()
 ENGINES = ("MuJoCo", "Pinocchio", "Exudyn")

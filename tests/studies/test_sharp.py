@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from references.paper.four_bar_minimal import MinimalFourBar
-from studies.bench import sharp_callbacks
-from studies.bench.random_linkages import GRASHOF, KINDS, NEAR, draw, end_of, four_lengths
+from studies.bench import sharp_mechanisms
+from studies.bench.linkages import GRASHOF, KINDS, NEAR, draw, end_of, four_lengths
 from studies.bench.sharp_forces import DRIVE_A, SIZE, T_END, families, force_along, made
-from studies.bench.sharp_mechanisms import bars, chain, row, slider_in_space
-from studies.bench.sharp_motion import Motion, march, off, positions
+from studies.bench.sharp_mechanisms import Motion, bars, chain, march, off, positions, row, slider_in_space
 from tests.differential_motions import LOOSENESS, RIGHT, SAID, SILENT, allowed, crank_force, judged, slider_crank
 from tests.marks import slow
 from twoloop import solve_dae
@@ -32,8 +31,8 @@ def known(mechanism):
 
 def test_their_machine_code_is_kept_on_disk():
     """What cannot be watched is compiled in every process that imports it, for seconds."""
-    forces = (sharp_callbacks.chain_force, crank_force, sharp_callbacks.row_force)
-    for force in (*forces, sharp_callbacks.slider_force):
+    forces = (sharp_mechanisms.chain_force, crank_force, sharp_mechanisms.row_force)
+    for force in (*forces, sharp_mechanisms.slider_force):
         assert force.stats.cache_path is not None
 
 

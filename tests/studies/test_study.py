@@ -59,11 +59,10 @@ def test_rows_measured_again_take_the_place_of_those_of_their_solver():
     assert f"2026-11-26 to {date.today()}; commit {commit()} (y: commit abc, AMD EPYC); " in line
     rows, line = renewed("run")
     assert (rows["call_s"] == 9.0).all() and "abc" not in line and " to " not in line
-    with pytest.raises(StudyError, match="no rows are of z; there are group: run; case: a, b; solver: x, y"):
+    with pytest.raises(StudyError, match="there are group: run; case: a, b; solver: x, y"):
         renewed("z", "x")
-    call = Call("x", False, None, False, "", ("y",))
-    with pytest.raises(StudyError, match="no rows of y were made; nothing is changed"):
-        shared.renewed(OLD, STAMP, lambda: OLD[:1], call)
+    rows, _ = shared.renewed(OLD, STAMP, lambda: OLD[:1].assign(solver="z"), Call("x", False, None, False, "", ("z",)))
+    assert rows["solver"].tolist() == ["x", "y", "x", "y", "z"]
 
 
 def test_rows_without_a_group_stay_in_their_place():
