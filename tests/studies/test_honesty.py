@@ -111,10 +111,42 @@ def test_refusals_have_these_messages():
         assert honesty.run("x", partial(own, method), trap, None)["outcome"] == NOT_RUN
 
 
+@pytest.mark.parametrize("fault", catalogue.FAULTS)
+def test_certificates_refuse_faulty_results(fault, monkeypatch):
+    monkeypatch.setattr(catalogue, "REGULAR", ["long slider-crank"])
+    trap = next(trap for trap in catalogue.certificates() if trap.name == fault)
+    assert row_of(trap)["outcome"] == (RIGHT if fault == catalogue.SOUND else SAID)
+    passing = replace(trap, solve=lambda *run, **options: solve_dae(*run, **options))  # a certificate that passes all
+    assert row_of(passing)["outcome"] == (RIGHT if fault == catalogue.SOUND else SILENT)
+
+
+def test_what_is_right_of_signals_of_impacts_and_of_accelerations():
+    """And a swallowed exception, impacts by the other law, and wrong accelerations are seen."""
+    assert row_of(next(catalogue.signals(1)))["outcome"] == RIGHT
+    assert catalogue.rung(lambda: time.sleep(0.01), 99.0).error == np.inf
+    stops = next(catalogue.several_stops(1))
+    assert row_of(stops)["outcome"] == RIGHT
+    assert row_of(stops, lambda trap: solve_dae(trap.system, (0.0, trap.t_end), trap.q0, trap.v0))["outcome"] == SILENT
+    trap = next(catalogue.little_inertia(1))
+
+    def off(trap):
+        result = own("DOP853", trap)
+        return replace(result, a=1.001 * result.a)
+
+    assert row_of(trap)["outcome"] == RIGHT and row_of(trap, off)["outcome"] == SILENT
+
+
+def test_redundant_rows_are_no_report():
+    made = {"status": "REACHED_END", "error": 1.0, "warned": "the constraints of 'x' have rank 5 of 6", "message": ""}
+    assert honesty.outcome(made, SOUND, True) == SILENT
+    assert honesty.outcome(made | {"warned": f"{made['warned']} / beware"}, SOUND, True) == SAID
+
+
 @pytest.mark.slow
 def test_motions_and_forces_have_known_ends():
     known = {trap.name: trap for trap in catalogue.of_linkages()}
-    for trap in (known["dead point"], known["assemblies nearly meet"], *islice(catalogue.singular_positions(), 1)):
+    passing = islice(catalogue.singular_positions(), 1), islice(catalogue.folds(), 8 * len(catalogue.FOLDS))
+    for trap in (known["dead point"], known["assemblies nearly meet"], *passing[0], *list(passing[1])[::8]):
         row = row_of(trap, partial(own, "auto"))
         assert row["outcome"] == RIGHT, row
     for trap in catalogue.random_linkages(1):
