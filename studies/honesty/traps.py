@@ -66,7 +66,7 @@ SIZES, ENDS = tuple(range(1, 7)), (5.0, 10.0, 20.0)  # of A02 in both sets of co
 TOLERANCES = tuple(10.0 ** (-0.5 * k) for k in range(12, 23))  # of A02: 1e-6 to 1e-11
 N_STARTS, FOLD_TOLERANCES = 1, tuple(10.0**-k for k in range(4, 12))  # of each linkage that folds
 N_BALLS, N_LONG, N_SIGNALS, LASTING = 4, 2, 4, 3.0  # draws of each kind; s
-STOP_TOLERANCES, INERTIA_TOLERANCES, CERTIFICATE_TOLERANCES = (1e-5, 1e-8, 1e-11), (1e-6, 1e-9), (1e-4, 1e-6, 1e-8)
+STOP_TOLERANCES, INERTIA_TOLERANCES, CERTIFICATE_TOLERANCES = (1e-5, 1e-8, 1e-11), (1e-8, 1e-10), (1e-4, 1e-6, 1e-8)
 LEAST_IMPACTS, NUDGE = 15, 1e-9  # of balls; m/s, by which velocities are changed to see how errors grow
 LONG_BARS = ("parallelogram", "deltoid", *list(REGULAR)[:2])
 DECADES = (1.0, -7.0), (2.0, -3.0)  # least and largest, of lengths and moments of inertia
@@ -260,7 +260,7 @@ def little_inertia(n: int) -> Iterator[Trap]:
         size, inertia = 10.0 ** np.random.default_rng([SEED, place, k]).uniform(*DECADES)
         for tolerance in INERTIA_TOLERANCES:
             known = moved(name, (SEED, place, k), float(size), float(inertia))
-            known |= {"mechanism": f"{name}, draw {k}, {tolerance:g}", "tolerance": tolerance}
+            known |= {"mechanism": f"{name}, draw {k}, {tolerance:g}", "tolerance": tolerance, "sensitivity": 1.0}
             yield Trap("little inertia", **known, group=INERTIA)
 
 
