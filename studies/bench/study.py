@@ -21,6 +21,7 @@ from studies.bench.render import listed, render, table
 from studies.bench.store import PARTS, Output, command_of, read_rows
 
 Make = Callable[[Output], pd.DataFrame]
+MOST_NAMED = 3  # commits and processors of rows that a stamp names one by one
 NAMED = ("group", "case", "family", "solver", "way")  # columns by whose names rows are measured again
 
 
@@ -90,6 +91,8 @@ def stamp_of(rows: pd.DataFrame, line: str, commit: str) -> str:
     for (other, processor), own in rows[rows["commit"] != commit].groupby(["commit", "processor"], sort=False):
         names = list(dict.fromkeys(own[column].dropna()))
         apart.append(f"{', '.join(names) if 0 < len(names) < 5 else 'other rows'}: commit {other}, {processor}")
+    if len(apart) > MOST_NAMED:  # whoever wants to know looks into the rows
+        apart = [f"rows of {len(apart)} other commits or processors are named in their columns"]
     return line.replace(f"commit {commit}", f"commit {commit} ({'; '.join(apart)})", 1) if apart else line
 
 
