@@ -81,10 +81,7 @@ PLAIN = {
 
 def pendulum(*, compile=False, gamma=True, constant_mass=False, **changed):
     """The pendulum, with other functions in place of its own; gamma=False: by differences."""
-
-    def right_side(t, q, v):
-        return np.array([-(v[0] * v[0] + v[1] * v[1])])
-
+    right_side = lambda t, q, v: np.array([-(v[0] * v[0] + v[1] * v[1])])  # noqa: E731
     functions = PLAIN | ({"mass": np.eye(2)} if constant_mass else {})
     functions |= {"gamma": gamma if callable(gamma) else right_side if gamma else None, "name": "pendulum"}
     return ConstrainedSystem.from_python(compile=compile, **functions | changed)
@@ -166,8 +163,7 @@ def moving_pivot(*, compile=False, gamma=True):
         d = q - pivot(t)[0]
         return np.array([0.5 * (d[0] * d[0] + d[1] * d[1] - 1.0)])
 
-    def jacobian(t, q):
-        return (q - pivot(t)[0]).reshape((1, 2))
+    jacobian = lambda t, q: (q - pivot(t)[0]).reshape((1, 2))  # noqa: E731
 
     def constraint_rate(t, q):
         p, rate, _ = pivot(t)

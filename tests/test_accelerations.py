@@ -1,6 +1,7 @@
 """Accelerations by dependent coordinates: those of the callbacks, in fewer operations, also where a pivot vanishes."""
 
 import ctypes
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -191,15 +192,11 @@ def test_pivots_are_one_for_each_row_and_not_small(m, freedom, seed):
     assert not (kinds == NUMBER).all(axis=None) or all(numbers_first)
 
 
-def blocks_along(system, known):
-    return [PivotChoice.for_position(system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
-
-
 def test_neighbouring_starts_have_the_same_code_and_any_start_its_own():
     """A call gets the code of its start, whatever ran before it."""
     problem = mechanisms.four_bar()
     known = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, t_eval=np.linspace(0.0, 5.0, 201))
-    blocks = blocks_along(problem.system, known)
+    blocks = [PivotChoice.for_position(problem.system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
     assert 1 < len(set(blocks)) <= 3  # pairs of three bars
     assert sum(one != other for one, other in pairwise(blocks)) < 20
     first = next(k for k, each in enumerate(blocks) if each != blocks[0])
@@ -272,6 +269,16 @@ def test_little_inertia_on_long_bars(inertia):
     problem = model.problem((0.0, 5.0))
     result = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, compiled=True, rtol=1e-9, atol=1e-9)
     assert result.success and np.abs(result.a[5]).max() < 1e-9 and result.stats.n_rejected_error < 10
+
+
+def test_digits_that_a_projection_loses_are_found(monkeypatch):
+    """Accelerations alone are right there: they take other pivots."""
+    problem = mechanisms.spatial_slider_crank()
+    choice = PivotChoice.for_position(problem.system, 0.0, problem.q0)
+    changed = replace(choice, scales=tuple(2.0**45 * scale for scale in choice.scales), is_refined=None)
+    monkeypatch.setattr(PivotChoice, "for_position", lambda *position: changed)
+    with pytest.raises(ValueError, match="loses the digits of little inertia"):
+        generated_code(problem.system, 0.0, problem.q0)
 
 
 @pytest.mark.parametrize("position", [(3.0, 1.5, -1.0), (0.0, 0.0, 0.0)])

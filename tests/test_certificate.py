@@ -12,7 +12,7 @@ import pytest
 
 from tests.compiled import PENDULUM
 from tests.problems import at_one, quick, run
-from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, mechanisms, solve_dae
+from twoloop import CertificateWarning, ConstrainedSystem, Newmark, Statistics, callback, mechanisms, solve_dae
 
 END, COLUMNS = 3.0, ("t", "q", "v", "a", "lam")
 
@@ -108,6 +108,7 @@ def test_constant_steps_are_measured_by_the_tolerance_that_is_asked_for(default_
     refused(result)  # of 1e-8, which no step was held to
     assert silently(result, rtol=1e-3, atol=1e-3)
     assert silently(run(default_four_bar, 1.0, method="Gauss8", step_size=0.01))
+    assert silently(run(default_four_bar, 1.0, method=Newmark(beta=0.5, error_tol=3e-8)))  # its error is that^(2/3)
 
 
 def test_a_run_that_an_event_ended(default_four_bar):

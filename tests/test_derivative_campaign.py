@@ -327,10 +327,7 @@ def test_a_late_start_leaves_room_for_differences_on_one_side(t0):
         jacobian=lambda t, q: np.array([[q[0] - place(t), q[1]]]),
         constraint_rate=lambda t, q: np.array([-(q[0] - place(t)) * size * rate * np.cos(rate * (t - t0))]),
     )
-
-    def place(t):
-        return size * np.sin(rate * (t - t0)) if t > -1.0 else 0.0
-
+    place = lambda t: size * np.sin(rate * (t - t0)) if t > -1.0 else 0.0  # noqa: E731
     start = [np.sin(0.5), -np.cos(0.5)], [size * rate, 0.0]
     result = solve_dae(system, (t0, t0 + end), *start, "RadauIIA5", rtol=1e-5, atol=1e-5)
     exact = lambda t, a, _: size * rate**2 * np.sin(rate * t) * np.cos(a) - 9.81 * np.sin(a)  # noqa: E731

@@ -55,10 +55,7 @@ def test_a_loop_follows_its_crank_over_turns(crank):
     start, (*_, rocker) = angles_of_pins(0.4), -angles_of_pins(0.4)
     ends = [0.3 * np.exp(0.4j), 0.9 + 0.8 * np.exp(1j * rocker)]
     model = loop((0.0, 0.0), *((z.real, z.imag) for z in ends), (0.9, 0.0))
-
-    def angles(crank):
-        return angles_of_pins(0.4 + crank) - start
-
+    angles = lambda crank: angles_of_pins(0.4 + crank) - start  # noqa: E731
     problem = model.problem(positions={"A": crank}, rates={model.joints[0]: 2.0})
     found = [problem.joint_coordinate(joint) for joint in model.joints]
     away = np.array([each.position(problem.q0) for each in found]) - angles(crank)

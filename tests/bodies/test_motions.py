@@ -81,9 +81,7 @@ def test_functions_that_branch_are_called_in_python_and_do_the_same():
     def smooth(t):
         return 3.0 * np.cos(2.0 * t)
 
-    def branching(t):
-        return 3.0 * float(np.cos(2.0 * t)) if t < 1e9 else 0.0
-
+    branching = lambda t: 3.0 * float(np.cos(2.0 * t)) if t < 1e9 else 0.0  # noqa: E731
     traced, called = (run_of(cart(PlanarModel(), f, 0.4), "DOP853") for f in (smooth, branching))
     assert called[0].system.called_in_python and not traced[0].system.called_in_python
     assert "called in Python" in called[0].note and "converts to a number" in called[0].note

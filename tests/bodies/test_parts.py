@@ -66,10 +66,7 @@ def test_a_door_in_space_rebounds_from_its_limits():
 @pytest.mark.parametrize("model", [PlanarModel(), SpatialModel()], ids=["plane", "space"])
 def test_ropes_of_an_atwood_machine_a_tackle_and_a_winch(model):
     """All in one model, beside each other: masses of 1 and 2 kg; 3 and 1 kg; 3 kg on a drum."""
-
-    def at(x, y):
-        return (x, y) if model.dimension == 2 else (x, 0.0, y)
-
+    at = lambda x, y: (x, y) if model.dimension == 2 else (x, 0.0, y)  # noqa: E731
     masses = {"left": (1.0, -0.1), "right": (2.0, 0.1), "load": (3.0, 5.0), "weight": (1.0, 6.0), "pail": (3.0, 9.3)}
     for name, (mass, x) in masses.items():
         model.particle(name, mass=mass, position=at(x, -1.0))

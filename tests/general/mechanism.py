@@ -54,10 +54,7 @@ def known(motion, end):
     """The state by equations of `tests.mechanisms.motions`, as a function of t."""
     rate, start, to_state = motion
     solution = integrate(lambda t, y: np.array(rate(t, y), dtype=float), np.array(start, dtype=float), end)
-
-    def state(t):
-        return tuple(np.array(each, dtype=float) for each in to_state(t, solution(t)))
-
+    state = lambda t: tuple(np.array(each, dtype=float) for each in to_state(t, solution(t)))  # noqa: E731
     return state
 
 

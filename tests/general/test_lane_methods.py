@@ -176,10 +176,7 @@ def test_stiff_motion_takes_the_implicit_method_that_auto_takes_singly():
 
 def test_auto_goes_on_with_dop853_where_series_are_not_finite():
     """Drag from rest: its series has no coefficients there."""
-
-    def force(t, q, v, p):
-        return -5.0 * v * np.sqrt(v @ v) - np.array([0.0, p[2]])
-
+    force = lambda t, q, v, p: -5.0 * v * np.sqrt(v @ v) - np.array([0.0, p[2]])  # noqa: E731
     _, q, v, parameters = pendulums(9)
     system = system_of(parameters, mass=np.eye(2), force=force)
     runs = ensemble(system, SPAN, q, v, parameters=parameters)
@@ -227,10 +224,7 @@ def test_a_stiff_run_among_others_does_not_go_on_for_ever():
 def test_drives_whose_speed_jumps_are_left_to_single_runs(method):
     """Accelerations see nothing of the impulse, and a projection alone would hide it."""
     parameters = np.array([[0.31], [0.52], [0.43]])
-
-    def away(t, p):
-        return np.sqrt((t - p[0]) * (t - p[0]))
-
+    away = lambda t, p: np.sqrt((t - p[0]) * (t - p[0]))  # noqa: E731
     system = unconstrained(
         lambda t, q, v, p: np.array([0.0, 0.0, -9.81]),
         **{"n_q": 3, "n_c": 2, "parameters": parameters[0]},
@@ -330,10 +324,7 @@ def test_one_run_of_many_that_is_unlike_the_others_is_found(compiled):
     q, v, parameters = drawn(n_runs)
     parameters[:, 0], parameters[:, 2] = 1.0, 9.0
     parameters[one] = 2.0, parameters[one, 1], 20.0
-
-    def force(t, q, v, p):
-        return np.array([p[0] - 3.0, -p[2] if p[2] < 15.0 else -3.0])
-
+    force = lambda t, q, v, p: np.array([p[0] - 3.0, -p[2] if p[2] < 15.0 else -3.0])  # noqa: E731
     # and no jacobian: it is derived
     system = system_of(parameters, mass=np.eye(2), force=force, jacobian=None, compile=compiled)
     runs = ensemble(system, (0.0, 0.5), q, v, parameters=parameters)
@@ -395,10 +386,7 @@ def test_ctrl_c_ends_all_runs_and_not_one(interruptible):
 @pytest.mark.parametrize("branches", [False, True])
 def test_a_run_that_does_not_end_takes_no_time_of_others(branches):
     """Some springs are so stiff that their runs take hours; in lanes, and one at a time."""
-
-    def force(t, q, v, p):
-        return -p * q if not branches or q[0] < 10.0 else q
-
+    force = lambda t, q, v, p: -p * q if not branches or q[0] < 10.0 else q  # noqa: E731
     stiff = np.full((30, 1), 2.0)
     stiff[[4, 11]] = 7e9
     system = unconstrained(force, parameters=[2.0])
@@ -406,3 +394,16 @@ def test_a_run_that_does_not_end_takes_no_time_of_others(branches):
     assert set(np.flatnonzero(runs.status == Status.TIME_LIMIT)) >= {4, 11} and runs.success.sum() > 20
     np.testing.assert_allclose(runs.q[runs.success, 0, -1], np.cos(9.0 * np.sqrt(2.0)), atol=1e-6)
     assert (runs.q[:, 0, 0] == 1.0).all() and "time_limit" in runs.messages[4]
+
+
+def test_a_first_run_that_does_not_end_is_begun_once(monkeypatch):
+    begun, system = [], unconstrained(lambda t, q, v: -1e13 * q)
+
+    def solve(system, span, q, *rest, **options):
+        return begun.append(q[0]) or solve_dae(system, span, q, *rest, **options)
+
+    monkeypatch.setattr("twoloop.ensembles.ensemble.solve_dae", solve)
+    for starts in ([[5.0]], [[5.0], [7.0]]):
+        runs = ensemble(system, (0.0, 9.0), starts, [0.0], method="Gauss8", time_limit=0.3)
+        assert (runs.status == Status.TIME_LIMIT).all() and (runs.q[:, 0, 0] == np.ravel(starts)).all()
+    assert begun.count(5.0) == 2

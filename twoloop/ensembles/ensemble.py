@@ -362,13 +362,15 @@ def _integrate(runs: LaneEnsemble, method: str, threads: int, time_limit: float)
     # the first run checks the system and its derivatives; lanes are compared with it, so it gets smaller tolerances
     is_tight = min(runs.rtol, float(runs.atol.min())) <= TIGHT_TOLERANCE
     factor = FIRST_RUN_FACTOR if may_use_lanes and not is_tight else 1.0
-    first = runs.solve_singly(0, time_limit if n_runs == 1 else MAX_FIRST_SHARE * time_limit, factor)
-    runs.deadline = time.monotonic() + time_limit - min(first.stats.cpu_time, MAX_FIRST_SHARE * min(time_limit, 1e9))
+    first_limit = time_limit if n_runs == 1 else MAX_FIRST_SHARE * time_limit
+    first = runs.solve_singly(0, first_limit, factor)
+    used = first_limit if first.status is Status.TIME_LIMIT else min(first.stats.cpu_time, first_limit)
+    runs.deadline = time.monotonic() + time_limit - used
     if may_use_lanes:
         runs.integrate_in_lanes(method, first, threads)
     singly = ~runs.in_lanes
     numbers = np.flatnonzero(singly).tolist()
-    _share_time(numbers, runs)
+    _share_time(numbers, first_limit, runs)
     reasons = {run: runs.reasons.get(run, runs.refusal) for run in numbers}
     if runs.methods or not runs.refusal:
         reasons[0] = FIRST_RUN_REASON
@@ -376,10 +378,13 @@ def _integrate(runs: LaneEnsemble, method: str, threads: int, time_limit: float)
     return Runs(runs.times, runs.q, runs.v, runs.status, *counts, singly, message, runs.messages, reasons)
 
 
-def _share_time(run_numbers: list[int], runs: LaneEnsemble) -> None:
-    """Integrate runs one at a time; each has a share of the time limit, and later rounds share the rest."""
+def _share_time(run_numbers: list[int], first_limit: float, runs: LaneEnsemble) -> None:
+    """Integrate runs one at a time; each has a share of the time limit, and later rounds share the rest.
+
+    `first_limit`: the time limit that the first run has had.
+    """
     queue = [run for run in run_numbers if run > 0 or runs.status[run] == Status.TIME_LIMIT]
-    limits, longest = dict.fromkeys(queue, 0.0), 0.0
+    limits, longest = dict.fromkeys(queue, 0.0) | {0: first_limit}, 0.0
     for _ in range(N_ROUNDS):
         for position, run in enumerate(queue):
             began = time.monotonic()
@@ -391,7 +396,7 @@ def _share_time(run_numbers: list[int], runs: LaneEnsemble) -> None:
                 limits[run] = limit
                 if runs.solve_singly(run, limit).success:
                     longest = max(longest, time.monotonic() - began)
-            elif limits[run] == 0.0 and run > 0:
+            elif limits[run] == 0.0:
                 runs.status[run], runs.messages[run] = int(Status.TIME_LIMIT), TIME_LIMIT_MESSAGE
                 if runs.times[0] == runs.starts.t0:
                     runs.q[run, :, 0], runs.v[run, :, 0] = runs.starts.q[run], runs.starts.v[run]

@@ -101,7 +101,7 @@ class Result(Record):
         True if the run used machine code generated for the mechanism, see `solve_dae`. None for a foreign solver.
     rtol : float or None
     atol : ndarray (n_q,) or None
-        Tolerances of a step; not those of `Newmark(error_tol=...)`. None for a foreign solver.
+        Tolerances of a step; error_tol^(2/3) for `Newmark(error_tol=...)`. None for a foreign solver.
     untested : ndarray of bool (n_accepted,) or None
         Steps without an error test of the velocities: the Newton steps of "auto", the steps of methods with
         tested="positions", such as "TRBDF2", and all steps of `Newmark(error_tol=...)`. None: tested in all steps, or

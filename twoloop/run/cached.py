@@ -325,7 +325,8 @@ def fields_of(
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
     fields["t_end"] = t_end
     if (own := options.own_tolerance) is not None:  # Newmark has a tolerance of its own for positions
-        fields |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
+        error = own ** (2.0 / 3.0)  # of a run, if each step meets this tolerance
+        fields |= {"rtol": error, "atol": np.full(system.n_q, error), "untested": np.ones(len(record.h), dtype=bool)}
     return fields
 
 
