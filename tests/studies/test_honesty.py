@@ -206,7 +206,7 @@ def test_silent_failures_are_counted_by_trap_and_solver():
         **{"singular": (1, 0), "folds": (1, 1), "linkages": (1, 0), "mistakes": (0, 0), "certificates": (1, 0)},
         **dict.fromkeys(("stops", "inertia", "signals"), (1, 0)),
     }
-    assert found["passed"] == {"n": 1, "right": 0} and "0 of 1 right results pass" in text
+    assert found["passed"] == {"n": 1, "right": 0} and "0 of 1 right ones pass" in text
     sharp = found["table"]["sharp"]
     assert (sharp["default"]["gross"], sharp["default"]["slight"]) == (0, 1)
     assert (sharp["others"]["n"], sharp["others"]["gross"], sharp["own"]["failed"]) == (2, 1, 1)
