@@ -37,7 +37,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
 # largest relative error of accelerations at a start with which generated code is used: it grew up to 200 times in runs
-LARGEST_LOSS = 1e-9
+LARGEST_LOSS = 1e-8
 # this error is measured at the first of so many positions, at this distance of one another, with large enough pivots
 MAX_POSITIONS, DISTANCE = 4, 0.02
 
