@@ -51,18 +51,12 @@ N = 9  # number of nodes
 class Tables(NamedTuple):
     """Linear maps from values at the nodes c_0 = 0 < ... < c_8 = 1; row k of a map multiplies the value at node k.
 
-    Attributes
-    ----------
-    nodes, between : (8,)
-        Nodes 1 to 8, and the midpoints between neighbouring nodes.
-    velocities, positions : (9, 8)
-        Single and double integrals of the polynomial from 0 to each of the nodes 1 to 8.
-    values_between, velocities_between, positions_between : (9, 8)
-        Values of the polynomial at the midpoints, and its single and double integrals from 0 to the midpoints.
-    spectrum : (9, 8)
-        Coefficients of the Legendre polynomials of degree 1 to 8 on [0, 1], which are 1 at the end.
-    begin, end : (9, 8)
-        Coefficients of the powers 1 to 8 of the time from the beginning, and of the time from the end.
+    nodes, between : nodes 1 to 8, and the midpoints between neighbouring nodes.
+    velocities, positions : single and double integrals of the polynomial from 0 to each of the nodes 1 to 8.
+    values_between, velocities_between, positions_between : values of the polynomial at the midpoints, and its single
+        and double integrals from 0 to the midpoints.
+    spectrum : coefficients of the Legendre polynomials of degree 1 to 8 on [0, 1], which are 1 at the end.
+    begin, end : coefficients of the powers 1 to 8 of the time from the beginning, and of the time from the end.
     """
 
     nodes: Array
@@ -164,19 +158,12 @@ class CollocationCode:
     In the methods, `emit` writes operations on vectors of LANES numbers, `num` on single numbers, `vec2` on vectors of
     two numbers, and `wide` on vectors of coordinates.
 
-    Parameters
-    ----------
-    shared : SharedCode
-        Code of the equations, whose coefficients the functions use, too.
+    shared : code of the equations, whose coefficients the functions use, too.
 
-    Attributes
-    ----------
-    iterated_coordinates : list of int
-        Coordinates on whose positions or velocities the accelerations depend.
-    numbers : Coefficients
-        Coefficients that the functions read.
-    structure : str
-        Digest of everything that the functions depend on, except the values of `numbers`.
+    Fields:
+    iterated_coordinates : coordinates on whose positions or velocities the accelerations depend.
+    numbers : coefficients that the functions read.
+    structure : digest of everything that the functions depend on, except the values of `numbers`.
     """
 
     def __init__(self, shared: SharedCode):

@@ -74,12 +74,17 @@ def write_acceleration_function(
         lowering, emit.numbers = Lowering(emit, numbers), coefficients
         lowering.define_inputs(equations.graph, [t, q, v])
         a, is_valid = _accelerations(emit, equations, lowering, lambda: [t, q, v])
-        with emit.builder.if_then(is_valid):
-            for i, value in enumerate(a):
-                emit.store(value, out, i)
+        _store_if_valid(emit, is_valid, [out], [a])
         return is_valid
 
     llvm_code.write(module, name, kind, emit_all)
+
+
+def _store_if_valid(emit: Emitter, is_valid: Value, pointers: Sequence[Value], arrays: Sequence[list[Value]]) -> None:
+    with emit.builder.if_then(is_valid):
+        for pointer, array in zip(pointers, arrays, strict=True):
+            for i, value in enumerate(array):
+                emit.store(value, pointer, i)
 
 
 def call_accelerations(
@@ -105,7 +110,8 @@ def _accelerations(
     elimination begins with M. `state` may write code.
     """
     program, *alternatives = equations.accelerations
-    a, is_valid = _run_accelerations(emit, equations, lowering, program)
+    (a,) = program.run(lowering)
+    is_valid = lowering.is_valid(program, a)
     if not alternatives:
         return a, is_valid
     builder = emit.builder
@@ -131,13 +137,6 @@ def _accelerations(
     return a, is_valid
 
 
-def _run_accelerations(
-    emit: Emitter, equations: Elimination, lowering: Lowering, program: Program
-) -> tuple[list[Value], Value]:
-    (a,) = program.run(lowering)
-    return a, lowering.is_valid(program, a)
-
-
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
     """Return the name of the function for program `index` of `equations.accelerations`; write it if it is missing."""
     program, is_mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
@@ -154,11 +153,8 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
             builder.ret(equations.split_functions.accelerations(inner_emit, t, q, v, coefficients[0], out))
             return name
         lowering = Lowering(inner_emit, numbers)
-        lowering.define(0, t)
-        for first, array in ((1, q), (1 + n, v)):
-            for i in range(n):
-                lowering.define(first + i, inner_emit.load(array, i))
-        a, is_valid = _run_accelerations(inner_emit, equations, lowering, program)
+        (a,) = program.run(lowering, [t, *(inner_emit.load(array, i) for array in (q, v) for i in range(n))])
+        is_valid = lowering.is_valid(program, a)
         for i, value in enumerate(a):
             inner_emit.store(value, out, i)
         builder.ret(is_valid)
@@ -183,17 +179,9 @@ SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 class SplitFunctions:
     """Generator that splits long equations into parts: functions of the module that other functions call.
 
-    Parameters
-    ----------
-    equations : Elimination
-    numbers : Coefficients
-
-    Attributes
-    ----------
-    solution : Solution
-        Solution of the linear equations; its `stored_indices` are those of the quantities that the parts share.
-    position_programs, solution_programs : dict
-        Programs by names of parts. Their inputs are t, q, v (position_programs), or r, c and the stored factors.
+    solution : solution of the linear equations; its `stored_indices` are those of the quantities that the parts share.
+    position_programs, solution_programs : programs by names of parts. Their inputs are t, q, v (position_programs), or
+        r, c and the stored factors.
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -326,7 +314,7 @@ class SplitFunctions:
         and multipliers at the new v in `a` and `lam`.
         """
         stored, r, c, change = self._stack_arrays(emit)
-        projected_v, inputs = self._stack_array(emit, self.n), [t, q, v, numbers, stored]
+        projected_v, inputs = _stack_array(emit, self.n), [t, q, v, numbers, stored]
         _write_zeros(emit, self.n, r)
         corrections_valid = self._call(
             emit,
@@ -351,10 +339,7 @@ class SplitFunctions:
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
         """Return pointers to four arrays on the stack: stored quantities, r, c, and one for either v or multipliers."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
-        return [self._stack_array(emit, size) for size in sizes]
-
-    def _stack_array(self, emit: Emitter, size: int) -> Value:
-        return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
+        return [_stack_array(emit, size) for size in sizes]
 
 
 def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
@@ -392,10 +377,7 @@ def write_function(
         lowering.define_inputs(program.graph, inputs)
         results = program.run(lowering)
         is_valid = lowering.is_valid(program, results[0])
-        with emit.builder.if_then(is_valid):
-            for pointer, array in zip(pointers, results, strict=True):
-                for j, value in enumerate(array):
-                    emit.store(value, pointer, j)
+        _store_if_valid(emit, is_valid, pointers, results)
         return is_valid
 
     llvm_code.write(module, name, kind, emit_all)
@@ -404,18 +386,8 @@ def write_function(
 class SharedCode:
     """Compiled functions for the equations of one or more systems; they are read from the disk if they are cached.
 
-    Parameters
-    ----------
-    equations : Elimination
-    cache : TraceCache
-
-    Attributes
-    ----------
-    numbers : Coefficients
-        Coefficients that the functions read.
-    digest : str
-        Digest of everything that the functions depend on, except the values of coefficients.
-    functions : GeneratedFunctions
+    numbers : coefficients that the functions read.
+    digest : digest of everything that the functions depend on, except the values of coefficients.
     """
 
     def __init__(self, equations: Elimination, cache: TraceCache):
@@ -489,10 +461,7 @@ class GeneratedCode(NamedTuple):
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = accept_traces) -> GeneratedCode:
     """Return the cached code for a system and a start; `check` raises if calls of callbacks differ from their traces.
 
-    Raises
-    ------
-    ValueError
-        If code for the equations cannot be generated.
+    Raises ValueError if code for the equations cannot be generated.
     """
     try:
         choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: PivotChoice.for_position(system, t0, q0))

@@ -27,12 +27,9 @@ DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": 
 class DerivedPrograms:
     """Programs that replace missing callbacks, shared by the systems of a trace cache.
 
-    Parameters
-    ----------
-    programs : dict
-        By kind of callback: the program, and the flat indices, in the callback's array, of the results of the program.
-    traced : CallbackTraces
-        The traces from which the programs were derived.
+    programs : by kind of callback: the program, and the flat indices, in the callback's array, of the results of the
+        program.
+    traced : the traces from which the programs were derived.
     """
 
     def __init__(self, programs: dict[str, tuple[OperationTable, list[int]]], traced: CallbackTraces):
@@ -139,10 +136,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
 def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Return whether callbacks for C_q, C_t and Gamma agree with the exact derivatives at states near a start.
 
-    Raises
-    ------
-    ValueError
-        If there is no callback for C_t, although C depends on time by its trace (but not near the start).
+    Raises ValueError if there is no callback for C_t, although C depends on time by its trace (but not near the start).
     """
     direction = generic_factors(len(q)) * sizes(q)
     states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * direction) for displacement in DISPLACEMENTS]

@@ -74,20 +74,13 @@ PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 class PivotChoice:
     """Decisions of the elimination that depend on the numbers of M and G at a position.
 
-    Attributes
-    ----------
-    rows : tuple of int
-        Indices of the independent rows of G.
-    added_rows, scales : tuple of int, tuple of float
-        Indices of the rows g of G with which M plus the sum of scale g^T g is definite, and the scales: powers of two
-        with which the added terms are about as large as M.
-    min_pivot : float
-        Smallest allowed pivot of a row of G, relative to its pivot without the other rows; a power of ten.
-    blocks : tuple of (rows, columns)
-        Pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which these
-        rows are solved. Empty if expressing dependent coordinates saves no operations, or no pivots are suitable.
-    is_refined : bool or None
-        Whether solutions are improved by one step of refinement. None: no, because pivots are so large that no
+    rows : indices of the independent rows of G.
+    added_rows, scales : indices of the rows g of G with which M plus the sum of scale g^T g is definite, and the
+        scales: powers of two with which the added terms are about as large as M.
+    min_pivot : smallest allowed pivot of a row of G, relative to its pivot without the other rows; a power of ten.
+    blocks : pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which
+        these rows are solved. Empty if expressing dependent coordinates saves no operations, or no pivots are suitable.
+    is_refined : whether solutions are improved by one step of refinement. None: no, because pivots are so large that no
         digits are lost.
     """
 
@@ -102,10 +95,7 @@ class PivotChoice:
     def for_position(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
         """Return the PivotChoice for the values of M and G at time t and position q.
 
-        Raises
-        ------
-        Untraceable
-            If M is singular on velocities that the constraints allow.
+        Raises Untraceable if M is singular on velocities that the constraints allow.
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
@@ -119,17 +109,11 @@ class PivotChoice:
 class DependentColumns:
     """Kernel that chooses dependent coordinates at any position, and the pivot blocks that solve rows of G for them.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    rows : tuple of int
-        Indices of the independent rows of G.
+    rows : indices of the independent rows of G.
 
-    Attributes
-    ----------
-    choose : callable or None
-        Function of G and `arguments` that returns the number of blocks, see kernels/linalg/dependent_columns.py. None:
-        G has too few rows, or the kinds of its entries are unknown.
+    Fields:
+    choose : function of G and `arguments` that returns the number of blocks, see kernels/linalg/dependent_columns.py.
+        None: G has too few rows, or the kinds of its entries are unknown.
     """
 
     choose: Any = None
@@ -295,47 +279,29 @@ MAX_COST_RATIO = 0.75
 class Elimination:
     """Symbolic elimination of the equations of a system, with the rows G = [C_q; A].
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    choice : PivotChoice
-        The decisions that depend on numbers.
-    equations : Equations, optional
-        Traced equations of the system, whose graph is extended.
+    choice : the decisions that depend on numbers.
+    equations : traced equations of the system, whose graph is extended.
 
-    Attributes
-    ----------
-    graph : Graph
-        Graph of the operations; its first inputs are t, q and v.
-    mass_first_program : Program
-        Program for "a" (n_q,), the accelerations at a state, by an elimination that begins with M.
-    reduced_program : Program or None
-        Program for "a" that eliminates dependent coordinates, if it takes fewer operations; valid at fewer positions.
-    right_sides : Program
-        Program for "r" (n_q,), Q, and "c" (n_c + n_a,), the right-hand sides of the rows of G; 0 for unused rows.
-    position_projection : Program
-        Program for "q" (n_q,), the position after one Newton step towards the constraints, and "moved" (n_q,), the
-        change of the position, x, with A x = 0.
-    projection : Program
-        Program for "q", "moved", "v" (n_q,), the projected velocity, and "a" (n_q,) and "lam" (n_c + n_a,) at this
-        velocity. M, G and Q are evaluated at the position before the step.
-    basic_projection : Program
-        As `projection`, but "lam" is 0 for dependent rows (in `projection` it has the least norm).
-    position_errors, velocity_errors : Program
-        Programs for "c" (n_c + n_a,), the right-hand sides of the corrections of positions, and of velocities.
-    redundant_rows : Program
-        Program without arrays, whose conditions are that the redundant constraints are satisfied.
-    split_functions : SplitFunctions or None
-        Generator that splits long equations into several functions, set by compile_equations.py.
-    n_operations : int
-        Number of operations of callbacks and factorization, without the solution with these factors.
-    traced : CallbackTraces
-        Traces of the callbacks.
+    Fields:
+    graph : graph of the operations; its first inputs are t, q and v.
+    mass_first_program : program for "a" (n_q,), the accelerations at a state, by an elimination that begins with M.
+    reduced_program : program for "a" that eliminates dependent coordinates, if it takes fewer operations; valid at
+        fewer positions.
+    right_sides : program for "r" (n_q,), Q, and "c" (n_c + n_a,), the right-hand sides of the rows of G; 0 for unused
+        rows.
+    position_projection : program for "q" (n_q,), the position after one Newton step towards the constraints, and
+        "moved" (n_q,), the change of the position, x, with A x = 0.
+    projection : program for "q", "moved", "v" (n_q,), the projected velocity, and "a" (n_q,) and "lam" (n_c + n_a,) at
+        this velocity. M, G and Q are evaluated at the position before the step.
+    basic_projection : as `projection`, but "lam" is 0 for dependent rows (in `projection` it has the least norm).
+    position_errors, velocity_errors : programs for "c" (n_c + n_a,), the right-hand sides of the corrections of
+        positions, and of velocities.
+    redundant_rows : program without arrays, whose conditions are that the redundant constraints are satisfied.
+    split_functions : generator that splits long equations into several functions, set by compile_equations.py.
+    n_operations : number of operations of callbacks and factorization, without the solution with these factors.
+    traced : traces of the callbacks.
 
-    Raises
-    ------
-    Untraceable
-        If the equations cannot be generated; the message says why.
+    Raises Untraceable if the equations cannot be generated; the message says why.
     """
 
     split_functions: Any = None
@@ -551,24 +517,15 @@ def multipliers_of_least_norm(
 class Solution:
     """Programs that solve M a + G^T lam = r, G a = c in two steps: factors, stored in an array, and solution with them.
 
-    Parameters
-    ----------
-    equations : Elimination
-    other_programs : sequence of Program
-        Other programs at the same state; quantities that they share with the factors are stored, too.
+    other_programs : other programs at the same state; quantities that they share with the factors are stored, too.
 
-    Attributes
-    ----------
-    stored_indices : dict
-        For each stored quantity of the graph of `equations`: its index in the array. The factors come first.
-    factor_program : Program
-        Program that computes the stored quantities.
-    graph : Graph
-        Graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the stored factors.
-    solution_program : Program
-        Program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for dependent rows.
-    least_norm_program : Program
-        Program for "lam" (n_c + n_a,) of least norm; its input c is the "lam" of `solution_program`.
+    Fields:
+    stored_indices : for each stored quantity of the graph of `equations`: its index in the array. The factors come
+        first.
+    factor_program : program that computes the stored quantities.
+    graph : graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the stored factors.
+    solution_program : program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for dependent rows.
+    least_norm_program : program for "lam" (n_c + n_a,) of least norm; its input c is the "lam" of `solution_program`.
     """
 
     def __init__(self, equations: Elimination, other_programs: Sequence[Program] = ()):

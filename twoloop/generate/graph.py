@@ -45,15 +45,10 @@ CONVERSION_REASON = (
 class Graph(SymbolicObject):
     """Graph of quantities, numbered from 0.
 
-    Attributes
-    ----------
-    operations : list
-        For each quantity the kind of operation and two arguments, of which the second may be None; None for an input.
-        The second argument of a logarithm or an arctangent is the divisor of its derivative.
-    input_sizes : list of int
-        Number of inputs added by each call of `inputs`.
-    traced : dict
-        Results of traced callbacks: arrays of expressions by kind of callback.
+    operations : for each quantity the kind of operation and two arguments, of which the second may be None; None for an
+        input. The second argument of a logarithm or an arctangent is the divisor of its derivative.
+    input_sizes : number of inputs added by each call of `inputs`.
+    traced : results of traced callbacks: arrays of expressions by kind of callback.
     """
 
     def __init__(self) -> None:

@@ -472,20 +472,10 @@ MAX_SERIES_OPERATIONS = 1500  # largest number of operations of a series: this m
 class LaneCode(LaneSteps):
     """Generator of the code of one mechanism for SIMD lanes, including the step-size control.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    choice : PivotChoice
-    parameters : array of Parameter
-    series : bool
-        Whether to generate code for the Taylor series, too.
-    tableau : Tableau, optional
-        Tableau of an explicit method for whose stages code is generated.
+    series : whether to generate code for the Taylor series, too.
+    tableau : tableau of an explicit method for whose stages code is generated.
 
-    Raises
-    ------
-    Untraceable
-        If the equations, or their series, cannot be generated; the message says why.
+    Raises Untraceable if the equations, or their series, cannot be generated; the message says why.
     """
 
     def __init__(
@@ -512,18 +502,13 @@ class LaneCode(LaneSteps):
         rows = self.equations.rows
         self._row_entries = [(k, j) for k, row in enumerate(rows) for j in range(self.n) if not is_zero(row[j])]
         self._row_program = Program(equations.graph, {"G": [rows[k, j] for k, j in self._row_entries]})
-        self.structure = self._structure()
+        programs = [*equations.accelerations, equations.position_projection, equations.basic_projection]
+        programs += [equations.redundant_rows, *([self.solution.factor_program] if series else [])]
+        # coefficients of the program for G must get indices, also if the code is read from the disk
+        self.structure = self._structure(programs if series else [*programs, self._row_program])
         self.n_numbers = self.numbers.n_varying
-        programs = [
-            *equations.accelerations,
-            equations.position_projection,
-            equations.basic_projection,
-            equations.redundant_rows,
-        ]
-        programs += [self.solution.factor_program] if series else []
-        counts = [len(each.quantities()) for each in programs]
-        counts += [len(self.solution.solution_program.quantities())] if series else []
-        self.n_quantities = sum(counts)
+        programs += [self.solution.solution_program] if series else []
+        self.n_quantities = sum(len(each.quantities()) for each in programs)
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -538,21 +523,12 @@ class LaneCode(LaneSteps):
         assert self.recurrences is not None
         return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
-    def _structure(self) -> str:
-        equations, numbers = self.equations, self.numbers
-        description: list[Any] = [] if self.stage_generator is None else [*self.stage_generator.structure]
-        programs = [
-            *equations.accelerations,
-            equations.position_projection,
-            equations.basic_projection,
-            equations.redundant_rows,
-        ]
+    def _structure(self, programs: list[Program]) -> str:
+        numbers, description = self.numbers, list[Any]()
+        if self.stage_generator is not None:
+            description += self.stage_generator.structure
         if self.recurrences is not None:
-            description += list(self.recurrences.structure)
-            programs.append(self.solution.factor_program)
-        else:
-            # coefficients of this program must get indices, also if the code is read from the disk
-            programs.append(self._row_program)
+            description += self.recurrences.structure
         for outputs in programs:
             description += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
@@ -714,22 +690,13 @@ class LaneCode(LaneSteps):
 class LaneConstraints(LaneSteps):
     """Generator of the code for C, C_t and the entries of C_q in SIMD lanes.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-        Without nonholonomic rows.
-    parameters : array of Parameter
+    system : without nonholonomic rows.
 
-    Attributes
-    ----------
-    pattern : ndarray of int
-        Sparsity pattern of C_q: first, for each row, the index in `pattern` of its first column; then the length of
-        `pattern`; then the columns of the entries of all rows.
+    Fields:
+    pattern : sparsity pattern of C_q: first, for each row, the index in `pattern` of its first column; then the length
+        of `pattern`; then the columns of the entries of all rows.
 
-    Raises
-    ------
-    Untraceable
-        If the constraints cannot be generated; the message says why.
+    Raises Untraceable if the constraints cannot be generated; the message says why.
     """
 
     tasks = lanes.TASKS_OF_STARTS
@@ -771,11 +738,7 @@ FILE_PREFIX = "lanes"  # first part of the names of cached files
 class GeneratedLanes(Generic[Code]):
     """Compiled code of a mechanism for SIMD lanes, with a method that computes the code's coefficients from parameters.
 
-    Parameters
-    ----------
-    tape : ParameterTape
-        Tape of the parameters with which `code` was traced.
-    code : LaneCode or LaneConstraints
+    tape : tape of the parameters with which `code` was traced.
     """
 
     def __init__(self, tape: ParameterTape, code: Code):

@@ -211,11 +211,7 @@ class Quantities:
     Each part of a divided function loads its quantities again: otherwise the compiler would spill them to the stack. So
     the memory from which quantities are loaded must not change.
 
-    Parameters
-    ----------
-    emit : Emitter
-    load : callable
-        Function that writes the load of a quantity, for quantities that were not defined.
+    load : function that writes the load of a quantity, for quantities that were not defined.
     """
 
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
@@ -337,12 +333,7 @@ NO_LOCATIONS: Mapping[int, Location] = {}  # no memory locations
 class Lowering(Algebra[Value]):
     """Algebra that writes the operations of programs to an LLVM function; its values are values of this function.
 
-    Parameters
-    ----------
-    emit : Emitter
-    numbers : Coefficients
-    places : dict, optional
-        Memory locations of quantities that are stored already.
+    places : memory locations of quantities that are stored already.
     """
 
     def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Location] = NO_LOCATIONS):

@@ -39,15 +39,10 @@ class Block(NamedTuple):
 class Factors:
     """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; the pivots are its diagonal blocks.
 
-    Attributes
-    ----------
-    blocks : list of Block
-        Blocks in the order of elimination.
-    conditions : list of (Affine, Affine)
-        Pairs, for rows of G (index `n` and later), of a pivot and the pivot without the other rows of G. The first
-        expression must be larger than a fraction of the second.
-    mass_pivots : list of Affine
-        Pivots of M (index below `n`), which are positive if M is definite.
+    blocks : blocks in the order of elimination.
+    conditions : pairs, for rows of G (index `n` and later), of a pivot and the pivot without the other rows of G. The
+        first expression must be larger than a fraction of the second.
+    mass_pivots : pivots of M (index below `n`), which are positive if M is definite.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -206,31 +201,18 @@ class ReductionFailed(Exception):
 class DependentCoordinates:
     """Solution of G a = gamma for the dependent accelerations, a_d = g + B a_i.
 
-    Parameters
-    ----------
-    rows : sequence of sequence of Affine
-        The matrix G, of full rank.
-    gamma : sequence of Affine
-    blocks : sequence of (rows, columns)
-        Rows and columns of the pivots, in the order of elimination.
-    max_added_operations : int
-        Largest number of operations that may be added to the graph.
+    rows : the matrix G, of full rank.
+    blocks : rows and columns of the pivots, in the order of elimination.
+    max_added_operations : largest number of operations that may be added to the graph.
 
-    Attributes
-    ----------
-    independent : list of int
-        Independent coordinates.
-    T : list of dict
-        For each row of T, its nonzero entries by column, an independent coordinate.
-    g : list of Affine
-        The vector g of length n_q; 0 for independent coordinates.
-    conditions : list of (Affine, Affine)
-        Pairs of expressions. The first one is larger than the second one in each pair, unless a pivot is too small.
+    Fields:
+    independent : independent coordinates.
+    T : for each row of T, its nonzero entries by column, an independent coordinate.
+    g : the vector g of length n_q; 0 for independent coordinates.
+    conditions : pairs of expressions. The first one is larger than the second one in each pair, unless a pivot is too
+        small.
 
-    Raises
-    ------
-    ReductionFailed
-        If a pivot is always zero, or if the elimination takes more than `max_added` operations.
+    Raises ReductionFailed if a pivot is always zero, or if the elimination takes more than `max_added` operations.
     """
 
     def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: PivotBlocks, max_added: int):

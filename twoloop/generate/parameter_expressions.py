@@ -54,12 +54,9 @@ class Refusal(BaseException):
 class SymbolicObject:
     """Base of the objects that replace numbers while a callback is traced.
 
-    Attributes
-    ----------
-    is_tracing : bool
-        Whether a callback is being traced with this object.
-    refusal_reason : str
-        Reason why the callback cannot be traced, or "". It is stored because the callback may catch the exception.
+    is_tracing : whether a callback is being traced with this object.
+    refusal_reason : reason why the callback cannot be traced, or "". It is stored because the callback may catch the
+        exception.
     """
 
     is_tracing, refusal_reason = False, ""
@@ -89,12 +86,8 @@ class ParameterTape(SymbolicObject):
     Numbers are multiples of products of powers of atoms. An atom is a parameter, a sum of numbers, or a function of
     numbers. Callbacks must not branch on the current values of the numbers.
 
-    Parameters
-    ----------
-    values : sequence of float
-        Current values of all parameters; they must be generic for parameters that vary.
-    varying : sequence of int
-        Indices of the parameters that vary.
+    values : current values of all parameters; they must be generic for parameters that vary.
+    varying : indices of the parameters that vary.
     """
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):

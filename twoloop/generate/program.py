@@ -35,12 +35,8 @@ COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 class Algebra(Generic[T]):
     """Arithmetic in which a program runs; subclasses define the type of values T, and the operations on values.
 
-    Attributes
-    ----------
-    functions : mapping
-        For each kind of operation with one argument: the function that computes its value.
-    values : dict
-        Values of the quantities defined so far, by index of the quantity.
+    functions : for each kind of operation with one argument: the function that computes its value.
+    values : values of the quantities defined so far, by index of the quantity.
     """
 
     functions: Mapping[int, Callable[[T], T]]
@@ -85,13 +81,8 @@ class Algebra(Generic[T]):
 class Program:
     """Arrays to be computed from the inputs of a graph, and conditions under which they are valid.
 
-    Attributes
-    ----------
-    graph : Graph
-    arrays : dict
-        Names of the arrays, and their entries: affine expressions.
-    conditions : list of (Affine, Affine)
-        Pairs of expressions: the arrays are valid if the first one is larger than the second in each pair.
+    arrays : names of the arrays, and their entries: affine expressions.
+    conditions : pairs of expressions: the arrays are valid if the first one is larger than the second in each pair.
     """
 
     graph: Graph
@@ -132,11 +123,7 @@ class Program:
 class ArrayAlgebra(Algebra[Any]):
     """Algebra of NumPy arrays (n_runs,): a value is an array with one number for each run, or one number for all runs.
 
-    Parameters
-    ----------
-    tape : ParameterTape
-        Tape of the coefficients that are Parameters.
-    parameters : ndarray (n_runs, n_p)
+    tape : tape of the coefficients that are Parameters.
     """
 
     functions: Mapping[int, Callable[[Any], Any]] = MappingProxyType(

@@ -45,15 +45,11 @@ class Sums(NamedTuple):
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    Attributes
-    ----------
-    groups : ndarray (n, 7)
-        One row for each group of independent operations of one kind: the kind, then three ranges, each as first and
-        end index: of the operations, and of the further terms in `first` and in `second` (all terms after the first
+    groups : one row for each group of independent operations of one kind: the kind, then three ranges, each as first
+        and end index: of the operations, and of the further terms in `first` and in `second` (all terms after the first
         one of a sum, see `Sums`). A group of sines includes the cosines of the same angles. The last group contains the
         products whose second factors depend on the solution of the linear system.
-    first, second : Sums
-        Arguments of the operations.
+    first, second : arguments of the operations.
     """
 
     groups: Integers
@@ -65,20 +61,13 @@ class OperationGroups:
 class SeriesProgram:
     """Program of a series; its quantities are, in this order, t, q, v, a, lam, results of `early`, results of `late`.
 
-    Attributes
-    ----------
-    n_q, n_rows : int
-    early : OperationGroups
-        Early operations; the last ones are the products in G v.
-    late : OperationGroups
-        Late operations; the last ones are the products in G^T lam + M a.
-    rows, row_indices : Sums, ndarray
-        G v + G_t without terms that are a constant times v_i: the rows that are not zero, and their indices.
-    balance, balance_indices : Sums, ndarray
-        Q - G^T lam - M a without terms that are a constant times lam_i or a_i: the entries that are not zero, and their
+    early : early operations; the last ones are the products in G v.
+    late : late operations; the last ones are the products in G^T lam + M a.
+    rows, row_indices : G v + G_t without terms that are a constant times v_i: the rows that are not zero, and their
         indices.
-    traced : CallbackTraces or None
-        Traces of the callbacks.
+    balance, balance_indices : Q - G^T lam - M a without terms that are a constant times lam_i or a_i: the entries that
+        are not zero, and their indices.
+    traced : traces of the callbacks.
     """
 
     n_q: int
@@ -131,10 +120,7 @@ def is_quick_to_trace(system: ConstrainedSystem) -> bool:
 def series_for(system: ConstrainedSystem, check: Check = accept_traces) -> SeriesProgram:
     """Return the cached series program of a system; `check` raises if calls of callbacks differ from their traces.
 
-    Raises
-    ------
-    Untraceable
-        As `series_program`.
+    Raises Untraceable as `series_program`.
     """
 
     def make(cache: TraceCache) -> SeriesProgram:
@@ -151,10 +137,7 @@ def series_program(
 
     `equations`: traces to be extended; None: new ones. `independent`: rows of G in the program; None: all rows.
 
-    Raises
-    ------
-    Untraceable
-        If a callback cannot be traced; the message names it and the reason.
+    Raises Untraceable if a callback cannot be traced; the message names it and the reason.
     """
     equations = Equations(system) if equations is None else equations
     n, n_rows = system.n_q, system.n_c + system.n_a

@@ -62,10 +62,8 @@ ARRAY_CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
     """Run a callback in Python on symbols and return its result; compiled callbacks fill an array of `arguments`.
 
-    Raises
-    ------
-    Untraceable
-        If the callback does not run on symbols, or may treat them differently from numbers; the message says why.
+    Raises Untraceable if the callback does not run on symbols, or may treat them differently from numbers; the message
+    says why.
     """
     graph, value = t.graph, None
     with graph.running_callback():
@@ -273,18 +271,10 @@ GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma":
 class Equations:
     """Traced callbacks of a system; each is traced once, at its first use.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    parameters : array of float or Parameter, optional
-        Values that replace the system's own parameters.
+    parameters : values that replace the system's own parameters.
 
-    Attributes
-    ----------
-    graph : Graph
-        Graph of the traces; its first inputs are t, q and v.
-    t : Affine
-    q, v : list of Affine (n_q,)
+    Fields:
+    graph : graph of the traces; its first inputs are t, q and v.
     """
 
     def __init__(self, system: ConstrainedSystem, parameters: Any = None):
@@ -322,10 +312,7 @@ class Equations:
 
         `v`: expressions to be used as velocities, instead of the inputs `self.v`.
 
-        Raises
-        ------
-        Untraceable
-            If a callback does not run on symbols; the message names the callback and the reason.
+        Raises Untraceable if a callback does not run on symbols; the message names the callback and the reason.
         """
         if v is not None and "v" in KINDS[kind].state:
             return self._derive_or_trace(kind, v)
@@ -443,22 +430,15 @@ _TRACE_CACHES = BoundedCache()
 class TraceCache:
     """Cache of traces, and of results derived from traces, for all systems that share their callbacks.
 
-    Parameters
-    ----------
-    parameters : ndarray (n_p,)
-        Parameters of one of the systems.
-    classes : ndarray of int (n_p,)
-        Class of each parameter: 1, 2, ..., the same number for equal magnitudes, with the sign of the parameter.
+    parameters : parameters of one of the systems.
+    classes : class of each parameter: 1, 2, ..., the same number for equal magnitudes, with the sign of the parameter.
         0: the parameter is a constant in the traces.
 
-    Attributes
-    ----------
-    parameters : ndarray of float and Parameter (n_p,)
-        Parameters with which callbacks are traced.
-    traced_kinds : set of str
-        Kinds of callbacks that were traced; as they do not branch, they write to the same entries in all systems.
-    within_bounds : set of str
-        Kinds of traced callbacks for which `check_bounds` succeeded in one of the systems.
+    Fields:
+    parameters : parameters with which callbacks are traced.
+    traced_kinds : kinds of callbacks that were traced; as they do not branch, they write to the same entries in all
+        systems.
+    within_bounds : kinds of traced callbacks for which `check_bounds` succeeded in one of the systems.
     """
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
@@ -541,10 +521,7 @@ def derive_cached(
     raises Untraceable (a callback may treat variable parameters differently from numbers), it is a cache for this
     system alone. Results are cached by `key`.
 
-    Raises
-    ------
-    Untraceable
-        If the result cannot be derived from either cache, or `check` raises for it.
+    Raises Untraceable if the result cannot be derived from either cache, or `check` raises for it.
     """
     for find_cache in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("family", find_cache), partial(find_cache, system))

@@ -47,13 +47,8 @@ MARGIN_AT_REST = 1e-9  # margin added for coordinates at rest, whose range is 0,
 class CallbackTraces:
     """Traces of callbacks as an operation table, to be compared with calls of the callbacks.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    graph : Graph
-        The graph of the trace, whose first inputs are t, q and v.
-    exprs : mapping or None
-        Arrays of expressions by kind of callback. None: `graph.traced`, for the callbacks that the system has.
+    graph : the graph of the trace, whose first inputs are t, q and v.
+    exprs : arrays of expressions by kind of callback. None: `graph.traced`, for the callbacks that the system has.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, exprs: Mapping[str, Any] | None = None):
@@ -205,10 +200,7 @@ def refuse_wrong_traces(
 ) -> None:
     """Compare traces that are not trusted yet with calls at states near the start, at times spread over the run.
 
-    Raises
-    ------
-    Untraceable
-        If a trace is wrong; the message names the callback and the entry.
+    Raises Untraceable if a trace is wrong; the message names the callback and the entry.
     """
     untrusted = [trace for trace in traced if not trace.is_trusted]
     if not untrusted:
@@ -255,10 +247,7 @@ def extreme_states(t: Array, rows: Array) -> Array:
 class CheckedRegion:
     """Region in which callbacks agreed with their traces: ranges of the states [t, q, v], and of the parameters.
 
-    Attributes
-    ----------
-    bounds : ndarray (2, 1 + 2 n_q) or (2, 0)
-        Smallest and largest t, q and v, with a margin: no comparison is needed at states within them.
+    bounds : smallest and largest t, q and v, with a margin: no comparison is needed at states within them.
     """
 
     def __init__(self) -> None:

@@ -11,10 +11,7 @@ MIN_VERSION, END_VERSION = (0, 61), (0, 69)
 def check_version(installed: str) -> None:
     """Raise an error if this version of numba is not supported; twoloop replaces private parts of numba.
 
-    Raises
-    ------
-    ImportError
-        If the version is not supported; the message gives the supported versions.
+    Raises ImportError if the version is not supported; the message gives the supported versions.
     """
     if not MIN_VERSION <= tuple(int(number) for number in re.findall(r"\d+", installed)[:2]) < END_VERSION:
         least, below = (".".join(map(str, version)) for version in (MIN_VERSION, END_VERSION))

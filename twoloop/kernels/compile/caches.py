@@ -52,12 +52,8 @@ class UntrustedFile(OSError):
 def read_trusted(path: Path) -> bytes:
     """Return the content of a file in a folder that `trusted_folder` has returned.
 
-    Raises
-    ------
-    OSError
-        If there is no such file.
-    UntrustedFile
-        If another user could have written the file; a warning is printed on stderr.
+    Raises OSError if there is no such file. Raises UntrustedFile if another user could have written the file; a warning
+    is printed on stderr.
     """
     with path.open("rb") as file:
         if reason := _reason_of_mode(os.fstat(file.fileno())):
@@ -256,20 +252,11 @@ def compile_cached(
 ) -> Dispatcher:
     """Compile a function for one signature, or read its machine code from the disk; return numba's dispatcher.
 
-    Parameters
-    ----------
-    function : callable
-        Function to compile.
-    signature : numba signature
-        Its only signature.
-    digests : (str, str) or None
-        Digests of everything on which the machine code depends, see `digests_of`. A file with another first digest is
-        out of date. The second digest is part of the key of a file, because functions with the same source may have
-        different closure variables. None: the machine code is not stored on disk.
-    announcement : str
-        Text printed on stderr before the first compilation of this process.
-    **options
-        Options of numba.njit.
+    digests : digests of everything on which the machine code depends, see `digests_of`. A file with another first
+        digest is out of date. The second digest is part of the key of a file, because functions with the same source
+        may have different closure variables. None: the machine code is not stored on disk.
+    announcement : text printed on stderr before the first compilation of this process.
+    **options : options of numba.njit.
     """
     dispatcher = njit(**options)(with_unique_name(function, digests))
     function = dispatcher.py_func

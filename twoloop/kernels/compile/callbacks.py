@@ -124,26 +124,16 @@ STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 class CallbackKind:
     """Describe one kind of callback.
 
-    Attributes
-    ----------
-    state : tuple of str
-        Arguments between t and p, keys of `STATE_SIZES`.
-    output : str
-        Name of the array that the callback fills.
-    shape : tuple of str
-        Sizes of this array, as names of attributes of a system, such as "n_q".
-    meaning : str
-        Meaning of the output in a few words, for messages.
-    note : str
-        Remarks for the documentation.
-    absent : str
-        Replacement if the callback is not given. "": no replacement, because the callback must be given; "zeros": a
-        callback that changes nothing; "differences": a callback that computes differences of C, see `jacobian.py`;
+    state : arguments between t and p, keys of `STATE_SIZES`.
+    output : name of the array that the callback fills.
+    shape : sizes of this array, as names of attributes of a system, such as "n_q".
+    meaning : meaning of the output in a few words, for messages.
+    note : remarks for the documentation.
+    absent : replacement if the callback is not given. "": no replacement, because the callback must be given; "zeros":
+        a callback that changes nothing; "differences": a callback that computes differences of C, see `jacobian.py`;
         "kernels": no replacement, because the kernels compute differences themselves.
-    needed_by : str
-        Name of a size of the system, "n_c" or "n_a"; the callback must be given if this size is above zero.
-    more : tuple
-        Names and shapes of further arrays that the callback fills. Such a callback must be compiled.
+    needed_by : name of a size of the system, "n_c" or "n_a"; the callback must be given if this size is above zero.
+    more : names and shapes of further arrays that the callback fills. Such a callback must be compiled.
     """
 
     state: tuple[str, ...]

@@ -190,17 +190,10 @@ NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that d
 class FrozenValue(NamedTuple):
     """Describe a value that a function uses, and where it is stored.
 
-    Attributes
-    ----------
-    holder : cell, dict or None
-        Cell or dict that contains the value, which may be replaced later. None: the value is a default or an item of a
-        tuple, which cannot be replaced.
-    key : str
-        Key of the value if the holder is a dict.
-    name : str
-        Name in messages, such as "package.module.K" or "TABLES[0]".
-    value : object
-        The value.
+    holder : cell or dict that contains the value, which may be replaced later. None: the value is a default or an item
+        of a tuple, which cannot be replaced.
+    key : key of the value if the holder is a dict.
+    name : name in messages, such as "package.module.K" or "TABLES[0]".
     """
 
     holder: CellType | dict[str, Any] | None

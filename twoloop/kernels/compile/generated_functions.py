@@ -22,17 +22,10 @@ HAS_SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 class GeneratedFunctions:
     """Machine code of generated functions in memory, which is freed together with this object.
 
-    Parameters
-    ----------
-    names : list of str
-        Names of the functions.
-    content : bytes
-        Result of `object_code`.
+    content : result of `object_code`.
 
-    Attributes
-    ----------
-    addresses : dict
-        Addresses of the functions by name.
+    Fields:
+    addresses : addresses of the functions by name.
     """
 
     def __init__(self, names: list[str], content: bytes):
@@ -68,16 +61,11 @@ def generated_functions(
 ) -> GeneratedFunctions:
     """Return the functions of a module from memory or from the disk, or compile the text that `write` returns.
 
-    Parameters
-    ----------
-    kind : str
-        Name of the cache, which contains the newest MAX_ON_DISK modules on disk.
-    stamp, key : str
-        Digest of the Python code that generates the functions, and digest of the expressions that they compute.
-    write : callable
-        Returns the names of the functions and the text of the LLVM module.
-    optimise : bool
-        Whether LLVM optimises the code.
+    kind : name of the cache, which contains the newest MAX_ON_DISK modules on disk.
+    stamp, key : digest of the Python code that generates the functions, and digest of the expressions that they
+        compute.
+    write : returns the names of the functions and the text of the LLVM module.
+    optimise : whether LLVM optimises the code.
     """
     if (functions := _FUNCTIONS_IN_MEMORY[kind].get(key)) is not None:
         return functions  # type: ignore[no-any-return]

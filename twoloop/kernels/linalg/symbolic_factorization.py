@@ -223,15 +223,9 @@ def factorization_program(
 ) -> NDArray[np.int32] | None:
     """Return the program that factors M and G; None if the program would have too many updates.
 
-    Parameters
-    ----------
-    n_q, n_rows : int
-    mass, jacobian : (rows, columns)
-        Entries of M, both triangles, and of G. If an entry occurs more than once, its numbers are added.
-    body_groups : iterable of sequence of int
-        Groups of coordinates that form one body each, even if M does not couple them.
-    stiff_rows : sequence of int
-        Rows g along which M is to be stiffened by a multiple of g g^T; M must have the entries of g g^T.
+    mass, jacobian : entries of M, both triangles, and of G. If an entry occurs more than once, its numbers are added.
+    body_groups : groups of coordinates that form one body each, even if M does not couple them.
+    stiff_rows : rows g along which M is to be stiffened by a multiple of g g^T; M must have the entries of g g^T.
     """
     order = elimination_order(n_q, n_rows, mass, jacobian, body_groups, stiff_rows)
     n = len(order)
