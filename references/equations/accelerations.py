@@ -15,7 +15,7 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import compiled_when_called
-from twoloop.kernels.data.indices import GAMMA_GIVEN
+from twoloop.kernels.data.indices import GIVEN
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
@@ -154,7 +154,7 @@ class Equations:
 def compiled_gamma(system: ConstrainedSystem) -> Callable[..., None]:
     """Return (t, q, v, p, Qd) -> None: the callback if there is one, otherwise differences; Qd is initially zero."""
     f = system.functions
-    return f.gamma if f.flags[GAMMA_GIVEN] else _gamma_by_differences(f.jacobian, f.constraint_rate)
+    return f.gamma if f.flags[GIVEN["gamma"]] else _gamma_by_differences(f.jacobian, f.constraint_rate)
 
 
 @lru_cache(maxsize=64)

@@ -17,7 +17,7 @@ from references.lines import CannotRun
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.trace import Equations, only_quantity
 from twoloop.generate.traced_values import CallbackTraces
-from twoloop.kernels.data.indices import GAMMA_GIVEN
+from twoloop.kernels.data.indices import GIVEN
 from twoloop.kernels.evaluation import operations
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem, check_system
@@ -56,7 +56,7 @@ class Expressions:
         check_system(system)
         if system.called_in_python:
             raise NotSymbolic(f"the callbacks of {system.name!r} are Python functions, not compiled ones")
-        if system.n_c and not system.functions.flags[GAMMA_GIVEN]:
+        if system.n_c and not system.functions.flags[GIVEN["gamma"]]:
             raise NotSymbolic(f"{system.name!r} does not give Q_d (gamma)")
         self.system, self.traced = system, Equations(system)
         jacobian = system.jacobian(t0, q0)

@@ -15,7 +15,7 @@ from references.equations.accelerations import cholesky, cholesky_solve, lu_fact
 from twoloop.checks.arguments import check_choice
 from twoloop.kernels.compile.caches import compiled_when_called
 from twoloop.kernels.data.common import Kit
-from twoloop.kernels.data.indices import CONSTANT_MASS, GAMMA_GIVEN
+from twoloop.kernels.data.indices import CONSTANT_MASS, GIVEN
 from twoloop.kernels.evaluation.partition import full_pivoting
 from twoloop.methods.tableaux import Tableau
 from twoloop.result.result import Result
@@ -450,7 +450,7 @@ def solve_variant(
     if (step is None) == (tol is None):
         raise ValueError(f"give either step, for fixed steps, or tol; given step={step!r}, tol={tol!r}")
     system, span, variant_index = task.system, task.t1 - task.t0, list(VARIANTS).index(variant)
-    if not system.functions.flags[GAMMA_GIVEN]:
+    if not system.functions.flags[GIVEN["gamma"]]:
         raise ValueError(f"system must have gamma; given {system.name!r} without it")
     if np.linalg.matrix_rank(tableau.A) < tableau.stages:
         raise ValueError(f"tableau must have an invertible A; that of {tableau.name} is singular")

@@ -36,27 +36,14 @@ from twoloop.kernels.control.step_size import (
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
 from twoloop.kernels.data.indices import (
-    DEFECT,
     DONE,
-    FAULT_KIND,
-    FORM,
-    GAMMA_GIVEN,
     GAP,
     INNER_DIVERGED,
-    KINK_AFTER,
-    KINK_BEFORE,
-    N_ACCEPTED,
-    N_REJECTED_CONVERGENCE,
-    N_REJECTED_ERROR,
     NEEDS_DENSE,
     NOT_FINITE,
     NOT_LOADED,
-    ORIENTATION,
-    ORIENTATION_NEW,
-    PIVOT,
     SINGULAR,
     STATIC,
-    TIME_IS_UP,
     UNSUITED,
 )
 from twoloop.kernels.evaluation.inner_loop import (
@@ -82,7 +69,7 @@ def start(f, w, t, state):
     """Factor M, choose the partition, and store a and lam in `state` [q, v, a, lam] at time t; return a code."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
-    w.notes[KINK_BEFORE] = t  # C_t or b of a drive may be discontinuous at the start
+    w.kink_before = t  # C_t or b of a drive may be discontinuous at the start
     code = prepare_mass(f, w, t, q)
     if code == DONE:
         code = renew_partition(f, w, t, q)
@@ -90,7 +77,7 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # repeat: the first evaluation sets the scale of Gamma's errors
+    if code == DONE and f.gamma_given == 0:  # repeat: the first evaluation sets the scale of Gamma's errors
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
@@ -115,14 +102,14 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 
     If the step crosses a jump of C_t or b (`crosses_jump`), the caller has already computed `new_state`.
     """
-    w.notes[ORIENTATION_NEW] = 0.0
+    w.orientation_new = 0.0
     if clock[at.FAILURE_CODE] == DONE:
-        w.notes[FAULT_KIND] = -1.0
+        w.fault_kind = -1.0
     if crosses_jump:
-        w.notes[DEFECT] = 0.0
-        w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
+        w.defect = 0.0
+        w.orientation_new = w.orientation
         return DONE, 0.0, 0.0
-    w.notes[DEFECT] = -1.0
+    w.defect = -1.0
     code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
     if code == DONE and np.isfinite(error) and control[at.SYMMETRIC] == 1.0:
         code = adopt_midpoint_partition(f, w, t + 0.5 * size, state, new_state)
@@ -144,7 +131,7 @@ def _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, st
     if kind == JUMP:
         clock[at.JUMP_FROM] = t if low - t <= EQUAL_SPACINGS * np.spacing(abs(t)) else low
         clock[at.JUMP_TO] = high
-        w.notes[KINK_AFTER] = clock[at.JUMP_FROM]
+        w.kink_after = clock[at.JUMP_FROM]
         return True
     if kind == RAMP and accepted and control[at.FIXED_STEP] == 0.0:
         clock[at.H_NEXT] = max(low - t, high - low)
@@ -163,7 +150,7 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
     if code == NEEDS_DENSE or is_too_short_near_singular(f, clock, size):
         return at.NEEDS_DENSE
-    w.counters[N_REJECTED_CONVERGENCE] += 1
+    w.n_rejected_convergence += 1
     if prepare_projected_repetition(f, w, control, clock, size):
         return at.CONTINUE
     clock[at.FAILURE_CODE] = code
@@ -180,7 +167,7 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
         clock[at.LIMIT_AGE] = 0.0
         clock[at.H_NEXT] = 0.5 * size
     if needs_partition and renew_partition(f, w, t, state[:n]) != DONE:
-        return at.NEEDS_DENSE if f.flags[FORM] == STATIC else at.RANK_LOST
+        return at.NEEDS_DENSE if f.form == STATIC else at.RANK_LOST
     return at.CONTINUE
 
 
@@ -191,7 +178,7 @@ def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
     Near a singular position, an end code is returned instead. `proposed_size`: size (s) that follows from the error.
     """
     n = w.Q.size
-    w.counters[N_REJECTED_ERROR] += 1
+    w.n_rejected_error += 1
     clock[at.FAILURE_CODE] = DONE
     if prepare_projected_repetition(f, w, control, clock, size):
         return at.CONTINUE
@@ -246,7 +233,7 @@ def advance(
     while True:
         if filled[0] == out_t.size or filled[1] == out_steps.shape[0] or n_attempts >= control[at.MAX_ATTEMPTS]:
             return at.PAUSED
-        if w.counters[N_ACCEPTED] >= control[at.MAX_STEPS]:
+        if w.n_accepted >= control[at.MAX_STEPS]:
             return at.MAX_STEPS_REACHED
         if _can_take_many(control, clock):
             first, target = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
@@ -301,7 +288,7 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        if w.notes[TIME_IS_UP] == 1.0:  # evaluations may be missing in this attempt: discard it
+        if w.time_is_up == 1.0:  # evaluations may be missing in this attempt: discard it
             f.settle(f, w, options, memory, tolerances, False)
             return at.PAUSED
         # where a force jumps, an error estimate may be small by chance: `error_factor` enlarges it until ROUGH_TO
@@ -309,19 +296,19 @@ def advance(
         accepted = code == DONE and error * error_factor <= 1.0
         if accepted and not reaches_goal and ends_near_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
-            w.counters[N_REJECTED_ERROR] += 1
+            w.n_rejected_error += 1
             if not prepare_projected_repetition(f, w, control, clock, size):
-                clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
+                clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.pivot
             continue
         if accepted and not jumps and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
-            w.counters[N_REJECTED_ERROR] += 1
+            w.n_rejected_error += 1
             clock[at.FAILURE_CODE] = SINGULAR
             return at.NEAR_SINGULAR
         checks_rates = control[at.DRIVEN] == 1.0 and not jumps
         if checks_rates and _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
-            w.counters[N_REJECTED_ERROR] += 1
+            w.n_rejected_error += 1
             clock[at.FAILURE_CODE] = DONE
             continue
         if not jumps:
@@ -380,10 +367,7 @@ def advance(
             return at.ALL_OUTPUT_DONE
         if fixed_size and not at_output:
             record_pivot_at_output(f, w, clock, state)
-        if (
-            FIRST_JUDGED_STEP <= w.counters[N_ACCEPTED] <= control[at.TRIAL_STEPS]
-            and clock[at.H_NEXT] <= tolerances[GAP]
-        ):
+        if FIRST_JUDGED_STEP <= w.n_accepted <= control[at.TRIAL_STEPS] and clock[at.H_NEXT] <= tolerances[GAP]:
             clock[at.H_FAILED] = clock[at.H_NEXT]
             return at.SWITCH_METHOD
         if jumps:

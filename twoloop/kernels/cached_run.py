@@ -32,7 +32,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import FORM, GAP, LONGEST_UNSEEN, LOOK, N_ACCEPTED, N_COUNTERS
+from twoloop.kernels.data.indices import GAP, LONGEST_UNSEEN, LOOK, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 
 ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate; a smaller correction is omitted
@@ -58,9 +58,9 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     rounding_error = 0.0
     for j in range(q.size):
         rounding_error = max(rounding_error, ROUNDING * abs(q[j]))
-    w.notes[indices.ROUNDED], w.notes[indices.REUSE] = rounding_error, max(reuse, rounding_error)
-    w.notes[indices.GAMMA_REQUIRED], w.notes[indices.GAMMA_STEP_RATIO] = accuracy, 1.0
-    w.notes[indices.KINK_BEFORE], w.notes[indices.KINK_AFTER] = -math.inf, math.inf
+    w.rounded, w.reuse = rounding_error, max(reuse, rounding_error)
+    w.gamma_required, w.gamma_step_ratio = accuracy, 1.0
+    w.kink_before, w.kink_after = -math.inf, math.inf
 
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
@@ -176,7 +176,7 @@ RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INT
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# indices in `constants`. ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w.notes. HAS_ALL_ENTRIES: 1 if `rows` is
+# indices in `constants`. ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w. HAS_ALL_ENTRIES: 1 if `rows` is
 # nonzero wherever `kinds` is not 0. RANK, WEAK: thresholds for `choose`. SCALE: factor s in M + s G^T G. CONTRADICTS:
 # relative tolerance of redundant rows. MASS_FLAG: flag of M (DEFINITE, INDEFINITE or 0). LEAST_PIVOT: smallest pivot of
 # an accepted start. EQUATION_FORM: value of FORM. FIRST: first step size that the user has chosen, s; 0: none. LEAST:
@@ -279,12 +279,12 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
     b.clock[at.T] = b.clock[at.T_START] = t
     prepare_work(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
     _copy_vector(b.lapack, w.lapack[: b.lapack.size])
-    w.notes[indices.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
+    w.nearly_singular = b.constants[NEARLY_SINGULAR]
     if b.start(f, w, t, b.state) != indices.DONE or not _has_consistent_rows(w, b, n):
         return REFUSED
-    if w.notes[indices.PIVOT] < b.constants[LEAST_PIVOT]:
+    if w.pivot < b.constants[LEAST_PIVOT]:
         return REFUSED
-    w.notes[indices.KINK_AFTER] = t1
+    w.kink_after = t1
     if b.control[at.FIXED_STEP] == 0.0:
         span, h, within = t1 - t, b.constants[FIRST], b.constants[EVALUATES_WITHIN] > 0.0
         _set_step_limits(b.control, b.tolerances, span, b.constants[LONGEST], within)
@@ -364,8 +364,8 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     report = b.report[begin:]
     report[N_STATES], report[N_STEPS], report[NOTHING_TO_CHECK] = 1 + n_rows, n_steps, nothing_to_check
     report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = has_jumped, is_inside, code, is_new
-    report[DEFECT_KNOWN] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
-    report[DEFECT], report[LONGEST_GAP] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
+    report[DEFECT_KNOWN] = w.n_accepted > 0 and w.unchecked == 0.0
+    report[DEFECT], report[LONGEST_GAP] = w.largest_defect, w.widest_gap
     for k in range(N_COUNTERS):
         report[N_REPORT + k] = w.counters[k]
     _copy_vector(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
@@ -383,7 +383,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consi
     If a start is repeated bit for bit, the second run still checks the start, and saves the data of the started run.
     From the third run on, these data are restored without a check. Arguments: see _start_run and _write_report.
     """
-    f.flags[FORM] = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
+    f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
     is_repeated, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
     if is_repeated and n_equal == IS_SAVED:
         _restore_start(b)

@@ -9,17 +9,7 @@ from numba import types
 
 from twoloop.kernels.data import indices as kinds
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, compiled, f8, i8, kernel, merged
-from twoloop.kernels.data.indices import (
-    ATOL,
-    DONE,
-    FORM,
-    GAMMA_INACCURATE,
-    GAMMA_REQUIRED,
-    NULL_SPACE,
-    REPORTED_ERROR,
-    RTOL,
-    SINGULAR,
-)
+from twoloop.kernels.data.indices import ATOL, DONE, GAMMA_INACCURATE, NULL_SPACE, REPORTED_ERROR, RTOL, SINGULAR
 from twoloop.kernels.evaluation.inner_loop import accelerations, find_tangents, renew_partition, restore_constraints
 from twoloop.kernels.evaluation.partition import min_pivot_ratio, partition_is_poor
 from twoloop.kernels.linalg.dense import copy, largest_of
@@ -152,7 +142,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], coefficients[:half], coefficients[half:]
     q_0, v_0 = coefficients[2 * half - 2], coefficients[2 * half - 1]  # the last two rows, which c_v does not use
-    has_D = f.flags[FORM] == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
+    has_D = f.form == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
     failures = 0
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
@@ -321,10 +311,10 @@ def fill_accelerations(f, w, times, states, out):
         if code == DONE:
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
         if code == GAMMA_INACCURATE:  # accept any accuracy of Gamma, because no step depends on these accelerations
-            required = w.notes[GAMMA_REQUIRED]
-            w.notes[GAMMA_REQUIRED] = np.inf
+            required = w.gamma_required
+            w.gamma_required = np.inf
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
-            w.notes[GAMMA_REQUIRED] = required
+            w.gamma_required = required
         if code != DONE:
             out[p] = np.nan
             failures += 1

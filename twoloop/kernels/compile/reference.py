@@ -13,7 +13,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.imputils import lower_getattr_generic
+from numba.core.imputils import lower_getattr_generic, lower_setattr_generic
 from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, Signature, infer_getattr
 from numba.extending import NativeValue, lower_builtin, models, register_model, unbox
 from numba.np.arrayobj import make_array
@@ -22,6 +22,7 @@ from numba.np.numpy_support import as_dtype
 from twoloop.kernels.compile.caches import BoundedCache
 from twoloop.kernels.compile.linking import machine_code_address
 
+NO_ELEMENTS: Mapping[str, Mapping[str, int]] = {}
 _REFERENCES: dict[str, Any] = {}  # all types `Reference`, by name
 
 
@@ -37,19 +38,20 @@ class Reference(types.Type):
     numba, or generated as LLVM code (see generated_functions.py). Arguments of generated functions that are arrays are
     passed as addresses, and generated functions report no errors.
 
-    Parameters
-    ----------
-    name : str
-        Unique name of the type.
-    arrays : dict
-        Types of the fields that are arrays: contiguous, with one or two dimensions.
+    name : unique name of the type.
+    arrays : types of the fields that are arrays: contiguous, with one or two dimensions.
+    elements : for some arrays: indices of elements, by the names under which kernels read and write them.
     """
 
-    def __init__(self, name: str, arrays: Mapping[str, types.Array]):
+    def __init__(
+        self, name: str, arrays: Mapping[str, types.Array], elements: Mapping[str, Mapping[str, int]] = NO_ELEMENTS
+    ):
         super().__init__(name)
         _REFERENCES[name] = self
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
+        # array and index of each element that has a name
+        self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # names of the generated functions among `functions`
         self.offsets: dict[str, int] = {}
@@ -65,6 +67,7 @@ class Reference(types.Type):
     def __repr__(self) -> str:
         """Return the name and a digest of the layout, which are part of the keys of machine code on disk."""
         fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
+        fields += self.elements.items()
         fields += [
             (field, str(self.functions[field])) if field in self.llvm_functions else field for field in self.functions
         ]
@@ -161,6 +164,8 @@ class _FieldTypes(AttributeTemplate):
     key = Reference
 
     def generic_resolve(self, typ: Any, field: str) -> Any:  # type: ignore[override]
+        if field in typ.elements:
+            return typ.arrays[typ.elements[field][0]].dtype
         if field not in typ.functions:
             return typ.arrays.get(field)
 
@@ -173,9 +178,26 @@ class _FieldTypes(AttributeTemplate):
         return types.BoundFunction(FieldCall, typ)
 
 
+def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
+    """Emit code for the address of an element that has a name."""
+    array, index = typ.elements[field]
+    item_type = context.get_data_type(typ.arrays[array].dtype)
+    data = _load_word(context, builder, pointer, typ.offsets[array], item_type.as_pointer())
+    return builder.gep(data, [ir.Constant(ir.IntType(64), index)])
+
+
+@lower_setattr_generic(Reference)
+def _store_element(context: Any, builder: Any, sig: Any, args: Any, field: str) -> None:
+    """Emit code that stores a number in an element that has a name."""
+    pointer, value = args
+    builder.store(value, _element_address(context, builder, sig.args[0], pointer, field))
+
+
 @lower_getattr_generic(Reference)
 def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
     """Emit code that returns the value of a field: numba's structure of an array or, for a function, the pointer."""
+    if field in typ.elements:
+        return builder.load(_element_address(context, builder, typ, pointer, field))
     if field in typ.functions:  # `lower_call` loads the address of the function from the table
         return pointer
     kind, offset = typ.arrays[field], typ.offsets[field]

@@ -26,7 +26,7 @@ import numpy as np
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.control.step_size import project_and_evaluate
 from twoloop.kernels.data.common import allowed_error, compiled, finite_vector
-from twoloop.kernels.data.indices import ATOL, DONE, FORM, GAP, RTOL, STATIC
+from twoloop.kernels.data.indices import ATOL, DONE, GAP, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
@@ -77,7 +77,7 @@ def _slope_and_size(w, row, length):
 def _allowed_error(f, w, tolerances, x, row):
     """Return the error in row `row` of G x that the tolerances of x (n_q coordinates or velocities) allow."""
     largest = 0.0
-    if f.flags[FORM] == STATIC:
+    if f.form == STATIC:
         rows, columns, _ = jacobian_entries_of(f.static_program)
         for k in range(rows.size):
             if rows[k] == row:

@@ -2,21 +2,7 @@
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.data.indices import (
-    AUGMENTED,
-    BY_GENERAL,
-    DONE,
-    FORM,
-    LEAST,
-    N_ACCEPTED,
-    NEAR_NOW,
-    NEARLY_SINGULAR,
-    NULL_SPACE,
-    PIVOT,
-    SENSITIVITY,
-    STATIC,
-    STRAIGHT,
-)
+from twoloop.kernels.data.indices import AUGMENTED, DONE, LEAST, NULL_SPACE, STATIC
 from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_ratio, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
@@ -58,10 +44,10 @@ def is_near_singular(f, w, control, clock, t, q):
     """
     if control[at.BRIDGE] != 1.0:
         return False
-    is_old = f.flags[STRAIGHT] == 1 and w.notes[NEARLY_SINGULAR] == 1.0
+    is_old = f.straight == 1 and w.nearly_singular == 1.0
     if is_old and renew_partition(f, w, t, q) != DONE:
         return True
-    return w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
+    return w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
 
 
 @merged
@@ -70,16 +56,16 @@ def ends_near_singular(f, w, control, clock):
 
     A singular position inside a step, away from both ends, does no harm.
     """
-    if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0:
+    if f.form != STATIC or control[at.FIXED_STEP] > 0.0:
         return False
-    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[at.LARGEST_PIVOT], MIN_END_RATIO * clock[at.PIVOT_HERE])
+    return w.pivot < min(STATIC_SINGULAR * clock[at.LARGEST_PIVOT], MIN_END_RATIO * clock[at.PIVOT_HERE])
 
 
 @merged
 def is_too_short_near_singular(f, clock, size):
     """Return whether a failed step of the static form, near a singular position, is too short to be repeated."""
     is_near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
-    return f.flags[FORM] == STATIC and is_near and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG]
+    return f.form == STATIC and is_near and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG]
 
 
 @merged
@@ -90,11 +76,11 @@ def prepare_projected_repetition(f, w, control, clock, size):
     beyond the position may succeed where shorter steps fail: the first repetition has at least the size H_LONG.
     """
     is_near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
-    if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not is_near:
+    if f.form != STATIC or control[at.FIXED_STEP] > 0.0 or w.nearly_singular == 1.0 or not is_near:
         return False
     clock[at.H_NEXT] = SHRINKAGE * size
-    if w.notes[NEARLY_SINGULAR] == 0.0:
-        w.notes[NEARLY_SINGULAR] = PROJECT_STAGES
+    if w.nearly_singular == 0.0:
+        w.nearly_singular = PROJECT_STAGES
         clock[at.H_NEXT] = max(size, clock[at.H_LONG])
     clock[at.H_LIMIT] = max(clock[at.H_LIMIT], clock[at.H_NEXT])
     return True
@@ -132,14 +118,14 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
     Rounding errors of its stages may then exceed the tolerances of the result, though its error estimate is small.
     """
     bridge = control[at.BRIDGE]
-    if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
+    if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.nearly_singular != 1.0 or control[at.FIXED_STEP] > 0.0:
         return False
-    if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
+    if f.form == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return False
     n, largest = w.Q.size, clock[at.LARGEST_PIVOT]
     before = smallest_pivot(f, w, t, state[:n])
     end = smallest_pivot(f, w, t + size, new_state[:n])
-    w.notes[PIVOT] = end
+    w.pivot = end
     if min(before, end) > MAX_UNCHECKED_PIVOT * largest:
         control[at.BRIDGE] = 1.0
         return False
@@ -149,7 +135,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
         clock[at.PIVOT_PASSED] = min_ratio if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], min_ratio)
         return False
     if least < max(near_pivot_ratio(tolerances) * largest, min(PASSED_PIVOT_RATIO * change, SINGULAR_PIVOT * largest)):
-        w.notes[PIVOT] = before
+        w.pivot = before
         return True
     return False
 
@@ -158,7 +144,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
 def record_pivot_at_output(f, w, clock, state):
     """Update clock[PIVOT_AT_OUTPUT], the smallest pivot at output times and grid times, by the pivot at `state`."""
     pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
-    if f.flags[FORM] == STATIC and pivot > 0.0:
+    if f.form == STATIC and pivot > 0.0:
         # pivots of the static form are sines of angles, all of them small in large mechanisms: only the ratio to the
         # largest pivot so far shows a singular position
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
@@ -173,42 +159,42 @@ def check_partition(f, w, control, clock, size, at_output, state):
     all coordinates, so that it need not be converted for a new partition.
     """
     short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
-    if f.flags[FORM] == STATIC:
-        clock[at.PIVOT_HERE] = w.notes[PIVOT]
-        clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
-        if w.notes[NEARLY_SINGULAR] == PROJECT_STAGES and w.notes[PIVOT] >= REPEAT_PIVOT * clock[at.LARGEST_PIVOT]:
-            w.notes[NEARLY_SINGULAR] = 0.0
+    if f.form == STATIC:
+        clock[at.PIVOT_HERE] = w.pivot
+        clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)
+        if w.nearly_singular == PROJECT_STAGES and w.pivot >= REPEAT_PIVOT * clock[at.LARGEST_PIVOT]:
+            w.nearly_singular = 0.0
         return at.CONTINUE
     n = w.Q.size
-    uses_generated_code = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
+    uses_generated_code = f.straight == 1 and w.by_general == 0.0
     interval = 1
-    if f.flags[FORM] == AUGMENTED:
+    if f.form == AUGMENTED:
         interval += w.independent_v.size // FREEDOMS_PER_CHECK
     if uses_generated_code:
         interval = CHECK_INTERVAL
-    is_checked = w.counters[N_ACCEPTED] % interval == 0
-    if is_checked and (uses_generated_code or f.flags[FORM] != NULL_SPACE):
+    is_checked = w.n_accepted % interval == 0
+    if is_checked and (uses_generated_code or f.form != NULL_SPACE):
         find_tangents(f, w, clock[at.T], state[:n])
     if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     # steps of generated code do not use the partition: only a new one shows whether a singular position is still near
-    if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
+    if f.straight == 1 and w.near_now == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
-    w.notes[NEAR_NOW] = 0.0
-    if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
-        w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
-    if size < COLLAPSED_STEP * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[at.BRIDGE] == 1.0:
+    clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)
+    w.near_now = 0.0
+    if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
+        w.nearly_singular = w.near_now = 1.0
+    if size < COLLAPSED_STEP * clock[at.H_LONG] and w.nearly_singular == 0.0 and control[at.BRIDGE] == 1.0:
         # the pivots of an old partition may not show that the motion approaches a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.notes[SENSITIVITY] = 1.0  # its value far from singular positions: the partition is renewed again soon
-        if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
-            w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
-    if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
+        w.sensitivity = 1.0  # its value far from singular positions: the partition is renewed again soon
+        if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
+            w.nearly_singular = w.near_now = 1.0
+    if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:
         # the partition may have been chosen at a distant state: with a new one an implicit method may still continue
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
+        if control[at.BRIDGE] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step can cross the singular position, where rounding would determine velocities
     return at.NEAR_SINGULAR if short and is_near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

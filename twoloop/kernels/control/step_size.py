@@ -31,28 +31,7 @@ from twoloop.kernels.control.loop_state import (
     SAFETY,
 )
 from twoloop.kernels.data.common import SETTLE, allowed_error, compiled, is_beyond_gap, kernel, merged
-from twoloop.kernels.data.indices import (
-    ATOL,
-    DEFECT,
-    DONE,
-    ESTIMATE,
-    EXPLICIT_STEP,
-    FORM,
-    LARGEST_DEFECT,
-    LOOK,
-    N_ACCEPTED,
-    N_JACOBIANS,
-    N_PARTITIONS,
-    N_REJECTED_CONVERGENCE,
-    N_REJECTED_ERROR,
-    ORIENTATION,
-    ORIENTATION_NEW,
-    RTOL,
-    STATIC,
-    STRAIGHT,
-    UNCHECKED,
-    WIDEST_GAP,
-)
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LOOK, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import representable_step
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
@@ -89,7 +68,7 @@ def record_accepted_step(rule, past, h, error):
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project (Q, V), a state near the constraints, in place, and store its accelerations in A; return a code."""
     # PROJECT is the cheapest task of generated code, and in the static form the task EVALUATE does not project
-    if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
+    if (f.straight == 1 and w.Rate.size == w.C.size) or f.form == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
 
@@ -142,25 +121,25 @@ H_LONG_DECAY = 0.98  # factor by which H_LONG, the longest of the last steps, de
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step; update largest defect and widest gap in w.notes; fill `out_step`, a row of out_steps."""
-    w.counters[N_ACCEPTED] += 1
-    if w.notes[DEFECT] >= 0.0:
-        w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
+    """Count an accepted step; update largest defect and widest gap in w; fill `out_step`, a row of out_steps."""
+    w.n_accepted += 1
+    if w.defect >= 0.0:
+        w.largest_defect = max(w.largest_defect, w.defect)
     else:
-        w.notes[UNCHECKED] += 1.0
+        w.unchecked += 1.0
     gap = size
-    if w.notes[DEFECT] >= 0.0:
+    if w.defect >= 0.0:
         gap = min(size, tolerances[LOOK])
     elif is_beyond_gap(tolerances, size):  # a step longer than GAP has closely spaced stages
         gap = control[at.MAX_EVALUATION_GAP] * size
-    w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
+    w.widest_gap = max(w.widest_gap, gap)
     clock[at.H_LONG] = max(size, H_LONG_DECAY * clock[at.H_LONG])
-    w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
+    w.orientation = w.orientation_new
     out_step[at.H] = size
-    out_step[at.ERRORS] = w.counters[N_REJECTED_ERROR]
-    out_step[at.FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
-    out_step[at.PARTITIONS] = w.counters[N_PARTITIONS]
-    out_step[at.JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
+    out_step[at.ERRORS] = w.n_rejected_error
+    out_step[at.FAILURES] = w.n_rejected_convergence
+    out_step[at.PARTITIONS] = w.n_partitions
+    out_step[at.JACOBIANS] = 0.0 if w.explicit_step == 1.0 else w.n_jacobians
 
 
 # allowed error of a predicted position, relative to the largest motion of a coordinate in the step
@@ -187,12 +166,12 @@ def departure(w, tolerances, h, q, v, q1):
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
-    w.notes[ORIENTATION_NEW] = determinant_sign(w.index, w.values)
+    w.orientation_new = determinant_sign(w.index, w.values)
     motion = 0.0
     for m in range(q.size):
         motion = max(motion, h * abs(v[m]), abs(q1[m] - q[m]))
     fraction, floor = FRACTION_OF_MOTION, FIXED_FRACTION
-    if w.notes[ORIENTATION] * w.notes[ORIENTATION_NEW] < 0.0:
+    if w.orientation * w.orientation_new < 0.0:
         fraction, floor = FRACTION_AT_SIGN_CHANGE, 0.0
     largest = 0.0
     for k in range(w.dependent.size):

@@ -47,23 +47,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import (
-    DONE,
-    ESTIMATE,
-    EXPLICIT_STEP,
-    FORCE_BY_Q_GIVEN,
-    FORM,
-    GAP,
-    LONGEST_UNSEEN,
-    N_EVALUATIONS,
-    N_JACOBIANS,
-    NOT_LOADED,
-    OUTER_DIVERGED,
-    REUSE,
-    ROUNDED,
-    STATIC,
-    STRAIGHT,
-)
+from twoloop.kernels.data.indices import DONE, ESTIMATE, GAP, LONGEST_UNSEEN, NOT_LOADED, OUTER_DIVERGED, STATIC
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
@@ -214,7 +198,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     growth_by_q = growth_by_v = 0.0
     # with generated code the partition may be an old one, whose independent coordinates hardly move
     is_explicit = memory[PHASE] == EXPLICIT
-    if is_explicit and f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
+    if is_explicit and f.straight == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
     for _ in range(N_POWER_ITERATIONS):
         growth_by_q = _power_iteration(f, w, t, state, by_q, False, Q, V, A)
@@ -267,7 +251,7 @@ def _has_small_vibrations(w, tolerances, state, rate):
 @compiled
 def _cost_of_run(w, options):
     """Return the cost of the run so far, in evaluations; a Jacobian counts as MATRIX_COST evaluations."""
-    return w.counters[N_EVALUATIONS] + options[MATRIX_COST] * w.counters[N_JACOBIANS]
+    return w.n_evaluations + options[MATRIX_COST] * w.n_jacobians
 
 
 @compiled
@@ -290,7 +274,7 @@ def _begin_phase(w, options, memory, phase, t):
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0
     memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
-    memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _evaluations_between_estimates(options, memory)
+    memory[NEXT_ESTIMATE] = w.n_evaluations + _evaluations_between_estimates(options, memory)
 
 
 @compiled
@@ -316,7 +300,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
-    memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _evaluations_between_estimates(options, memory)
+    memory[NEXT_ESTIMATE] = w.n_evaluations + _evaluations_between_estimates(options, memory)
     memory[ESTIMATES_TO_WAIT] -= 1.0
     h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]  # relative to LIMIT
     if h_rho > 1.0:
@@ -328,7 +312,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
     is_cheap = counted > min_cost and (
-        f.flags[FORCE_BY_Q_GIVEN] == 1 or counted > MIN_COST_PER_COORDINATE * w.independent.size
+        f.force_by_q_given == 1 or counted > MIN_COST_PER_COORDINATE * w.independent.size
     )
     is_hidden = False
     if memory[PHASE] == EXPLICIT and is_cheap and h_rho > MIN_HIDDEN_RATIO:
@@ -389,12 +373,12 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     first, second = _memory_views(memory, n)
     if np.isnan(memory[T_BEGIN]):  # this is the first step of a run, or the first after a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
-        memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + FIRST_ESTIMATE * options[COST_RATIO]
+        memory[NEXT_ESTIMATE] = w.n_evaluations + FIRST_ESTIMATE * options[COST_RATIO]
     if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:
         phase = -1  # phase that begins now; -1: the present phase continues
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
             phase = _judge_trial(w, options, memory, t)
-        elif w.counters[N_EVALUATIONS] >= memory[NEXT_ESTIMATE]:
+        elif w.n_evaluations >= memory[NEXT_ESTIMATE]:
             phase = _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state)
         if phase >= 0:
             was_explicit = _is_explicit(memory)
@@ -402,17 +386,17 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if was_explicit != _is_explicit(memory):
                 _clear_memory(second if was_explicit else first)
     is_explicit = _is_explicit(memory)
-    w.notes[EXPLICIT_STEP] = 1.0 if is_explicit else 0.0
+    w.explicit_step = 1.0 if is_explicit else 0.0
     begin = N_OPTIONS + int(options[SIZE_1])
     rule = options[N_PAIR : N_PAIR + N_OF_EACH] if is_explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
-    w.notes[REUSE] = max(rule[REUSE_OF], w.notes[ROUNDED])
+    w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
         # a step of fixed size that does not converge cannot be shortened: use the implicit method from now on
-        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC:
+        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != STATIC:
             _begin_phase(w, options, memory, IMPLICIT, t)
             _clear_memory(second)
-            w.notes[EXPLICIT_STEP] = 0.0
+            w.explicit_step = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
         # only the first method may take steps longer than GAP, because it also evaluates the equations within a step

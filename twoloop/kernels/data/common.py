@@ -22,7 +22,7 @@ from twoloop.kernels.compile.callbacks import KINDS, MATRIX, VECTOR, f8
 from twoloop.kernels.compile.generated_functions import DeferredFunctions, GeneratedFunctions
 from twoloop.kernels.compile.linking import Dispatcher, HelperCompiler, KernelCompiler, VectorizingCompiler
 from twoloop.kernels.compile.reference import Reference
-from twoloop.kernels.data.indices import ATOL, ESTIMATE, FAULT_KIND, FAULT_TIME, GAP, GIVEN, NOT_FINITE, RTOL
+from twoloop.kernels.data.indices import ATOL, COUNTERS, ESTIMATE, FLAGS, GAP, GIVEN, NOT_FINITE, NOTES, RTOL
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
@@ -116,6 +116,7 @@ _MATRIX_FIELDS = {
 WORK = Reference(
     "Work",
     {n: MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields[:-3]},
+    {"notes": NOTES, "counters": COUNTERS},
 )
 
 
@@ -157,6 +158,7 @@ KIT = Reference(
         **{"p": VECTOR, "flags": INTEGERS, "numbers": VECTOR, "own_numbers": VECTOR},
         **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, INTEGERS_32), strict=True)),
     },
+    {"flags": FLAGS},
 )
 for _name, _kind in KINDS.items():
     KIT.add_function(_name, _kind.signature)
@@ -372,10 +374,10 @@ def finite(A):
 
 
 @compiled
-def not_finite(notes, kind, t, q):
-    """Store t, and the kind of the callback whose value is not finite (-1 if q is not), in `notes`; return a code."""
-    notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
-    notes[FAULT_TIME] = t
+def not_finite(w, kind, t, q):
+    """Store t, and the kind of the callback whose value is not finite (-1 if q is not), in w; return a code."""
+    w.fault_kind = kind if finite_vector(q) else -1.0
+    w.fault_time = t
     return NOT_FINITE
 
 

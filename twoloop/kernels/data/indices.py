@@ -1,7 +1,8 @@
 """Indices into the arrays that kernels share, and the codes that they return.
 
 Kernels keep their state in arrays of numbers, because compiled code passes arrays by reference. Each group below names
-the indices of one array; control/loop_state.py has the indices that only the loop over steps uses.
+the indices of one array; control/loop_state.py has the indices that only the loop over steps uses. In kernels, elements
+of `Work.notes`, `Work.counters` and `Functions.flags` are attributes, such as w.pivot for w.notes[PIVOT].
 """
 
 from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
@@ -32,13 +33,9 @@ MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; for STA
 # indices of the flags of optional callbacks: 1 if the callback is given
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
-CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
-    GIVEN[name] for name in ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q", "kinematics")
+FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
+    GIVEN[name] for name in ("force_by_q", "force_by_v", "reaction_by_q", "mass_values")
 )
-NONHOLONOMIC_RATE_GIVEN, NONHOLONOMIC_GAMMA_GIVEN = (
-    GIVEN[name] for name in ("nonholonomic_rate", "nonholonomic_gamma")
-)
-MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_values", "jacobian_values"))
 
 # indices in Work.counters: numbers of steps, iterations, evaluations etc. since the start of the run
 (
@@ -90,6 +87,17 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
     N_NOTES,
 ) = range(33)
+
+
+def _group(first: str, end: str) -> dict[str, int]:
+    """Return the indices above from the name `first` to the one before `end`, by names in lower case."""
+    names = list(globals())
+    return {name.lower(): globals()[name] for name in names[names.index(first) : names.index(end)]}
+
+
+# names under which kernels read and write elements of these arrays, such as w.pivot, w.n_evaluations and f.form
+NOTES, COUNTERS = _group("SENSITIVITY", "N_NOTES"), _group("N_ACCEPTED", "N_COUNTERS")
+FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kind, index in GIVEN.items()}
 
 # indices in `tolerances`, the array that steps read; for the tolerances see eq. (26) of the paper
 (

@@ -13,15 +13,6 @@ import math
 from numba import types
 
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, exact, f8, finite, finite_vector, i8, kernel
-from twoloop.kernels.data.indices import (
-    CONSTANT_MASS,
-    FORCE_BY_Q_GIVEN,
-    FORCE_BY_V_GIVEN,
-    GAMMA_GIVEN,
-    KINEMATICS_GIVEN,
-    NONHOLONOMIC_GAMMA_GIVEN,
-    REACTION_BY_Q_GIVEN,
-)
 from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.operations import result_of_operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
@@ -297,7 +288,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
     - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
     - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results, and scratch
     """
-    n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
+    n, n_c, n_rows = q.size, lam.size, rows.shape[0]
     # ends of the force, of C, of the rates (C_t, b) and of Gamma in `results`
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows
     f.mass(t, q, f.p, mass)
@@ -307,11 +298,11 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
     f.nonholonomic(t, q, f.p, rows[n_c:])
     f.constraint_rate(t, q, f.p, results[C : C + n_c])
     f.nonholonomic_rate(t, q, f.p, results[C + n_c : rate])
-    if flags[GAMMA_GIVEN] == 1:
+    if f.gamma_given == 1:
         f.gamma(t, q, v, f.p, results[rate : rate + n_c])
-    if flags[NONHOLONOMIC_GAMMA_GIVEN] == 1:
+    if f.nonholonomic_gamma_given == 1:
         f.nonholonomic_gamma(t, q, v, f.p, results[rate + n_c : gamma])
-    if flags[KINEMATICS_GIVEN] == 1:
+    if f.kinematics_given == 1:
         fused_results = results[gamma : gamma + n_c * (n + 3)]
         fused_Cq = fused_results[3 * n_c :].reshape((n_c, n))
         f.kinematics(
@@ -321,16 +312,16 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
     if not (finite(mass) and finite(rows) and finite_vector(results[:end])):
         return 0
     scratch = results[end : end + n * n].reshape((n, n))
-    if flags[FORCE_BY_Q_GIVEN] == 1:
+    if f.force_by_q_given == 1:
         f.force_by_q(t, q, v, f.p, scratch)
         if not finite(scratch):
             return 0
-    if flags[FORCE_BY_V_GIVEN] == 1:
+    if f.force_by_v_given == 1:
         _set_to_zero(scratch)
         f.force_by_v(t, q, v, f.p, scratch)
         if not finite(scratch):
             return 0
-    if flags[REACTION_BY_Q_GIVEN] == 1:
+    if f.reaction_by_q_given == 1:
         _set_to_zero(scratch)
         f.reaction_by_q(t, q, lam, f.p, scratch)
         if not finite(scratch):
@@ -340,7 +331,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
         result_flags = WELL_FORMED
         if _is_consistent(results[force:C], results[C:rate], rows, q, v, records, roundings[0]):
             result_flags |= CONSISTENT
-    if flags[CONSTANT_MASS] == 0:  # neither DEFINITE nor INDEFINITE if the smallest eigenvalue is within the margin
+    if f.constant_mass == 0:  # neither DEFINITE nor INDEFINITE if the smallest eigenvalue is within the margin
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             result_flags |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):

@@ -9,20 +9,7 @@ and 2 e (s), give it to order 4. Their disagreement estimates the error, and the
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, exact, merged
-from twoloop.kernels.data.indices import (
-    AUGMENTED,
-    CONSTRAINT_RATE_GIVEN,
-    DONE,
-    FORM,
-    GAMMA_ACCURACY,
-    GAMMA_INACCURATE,
-    GAMMA_REQUIRED,
-    GAMMA_SCALE,
-    GAMMA_STEP_RATIO,
-    KINK_AFTER,
-    KINK_BEFORE,
-    NONHOLONOMIC_RATE_GIVEN,
-)
+from twoloop.kernels.data.indices import AUGMENTED, DONE, GAMMA_INACCURATE
 from twoloop.kernels.evaluation.operations import jacobian_by_program
 from twoloop.kernels.linalg.dense import copy, largest_of
 
@@ -47,7 +34,7 @@ def _clear_recorded_entries(w):
 @merged
 def clear_rows(f, w):
     """Set w.G to zero; in the augmented form only its recorded entries (the task VERIFY_PATTERN detects new ones)."""
-    if f.flags[FORM] == AUGMENTED:
+    if f.form == AUGMENTED:
         _clear_recorded_entries(w)
     else:
         w.entries[:] = 0.0
@@ -69,9 +56,9 @@ def constraint_rates(f, w, t, q, rate):
     """Store C_t and b at (t, q) in `rate`."""
     n_c, n_rows = w.C.size, w.Rate.size
     rate[:] = 0.0
-    if f.flags[CONSTRAINT_RATE_GIVEN] == 1:
+    if f.constraint_rate_given == 1:
         f.constraint_rate(t, q, f.p, rate[:n_c])
-    if n_rows > n_c and f.flags[NONHOLONOMIC_RATE_GIVEN] == 1:
+    if n_rows > n_c and f.nonholonomic_rate_given == 1:
         f.nonholonomic_rate(t, q, f.p, rate[n_c:])
 
 
@@ -86,7 +73,7 @@ def kinematics(f, w, t, q, v):
     f.kinematics(t, q, v, f.p, w.C, w.G[:n_c], w.Rate[:n_c], w.Gamma[:n_c])
     if n_rows > n_c:
         f.nonholonomic(t, q, f.p, w.G[n_c:n_rows])
-        if f.flags[NONHOLONOMIC_RATE_GIVEN] == 1:
+        if f.nonholonomic_rate_given == 1:
             f.nonholonomic_rate(t, q, f.p, w.Rate[n_c:])
 
 
@@ -135,9 +122,9 @@ def largest_difference_step(q, v):
 
 
 @merged
-def _difference_side(notes, t, e):
+def _difference_side(w, t, e):
     """Return the side of t for differences: 0 (both) or, if C_t or b jumps near t, the other: 1 (after t) or -1."""
-    since_jump, until_jump = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
+    since_jump, until_jump = t - w.kink_before, w.kink_after - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
     return 1.0 if until_jump >= since_jump else -1.0
@@ -151,7 +138,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
     the largest |term| in the sums G v.
     """
     Gamma_coarse = w.Gamma_tried[0]
-    side = _difference_side(w.notes, t, e)
+    side = _difference_side(w, t, e)
     one_sided_step = representable_step(t, ONE_SIDED_STEP_RATIO * e)
     if side != 0.0 and one_sided_step > 0.0:
         e = one_sided_step
@@ -189,9 +176,9 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 
 @merged
-def _max_disagreement(notes):
+def _max_disagreement(w):
     """Return the largest accepted difference between Gamma with the steps e and 2 e; the error of Gamma is smaller."""
-    return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
+    return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
 @compiled
@@ -211,19 +198,19 @@ def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
         largest, disagreement, _ = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest):
             return DONE
-        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
+        w.gamma_scale = max(w.gamma_scale, largest)
         change = 0.0
         for i in range(first, last):
             change = max(change, abs(w.Gamma[i] - w.Gamma_tried[1, i]))
-        if level > 0 and change < least_change and disagreement <= _max_disagreement(w.notes):
+        if level > 0 and change < least_change and disagreement <= _max_disagreement(w):
             least_change = change
-            w.notes[GAMMA_STEP_RATIO] = step_ratio
-            if change <= CONVERGED_CHANGE * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
+            w.gamma_step_ratio = step_ratio
+            if change <= CONVERGED_CHANGE * w.gamma_required * w.gamma_scale:
                 break
         step_ratio *= 0.25
-    w.notes[GAMMA_ACCURACY] = least_change / w.notes[GAMMA_SCALE]
-    _fill_gamma(f, w, t, q, v, representable_step(t, w.notes[GAMMA_STEP_RATIO] * largest_step), first, last)
-    return DONE if w.notes[GAMMA_ACCURACY] <= w.notes[GAMMA_REQUIRED] else GAMMA_INACCURATE
+    w.gamma_accuracy = least_change / w.gamma_scale
+    _fill_gamma(f, w, t, q, v, representable_step(t, w.gamma_step_ratio * largest_step), first, last)
+    return DONE if w.gamma_accuracy <= w.gamma_required else GAMMA_INACCURATE
 
 
 @compiled
@@ -237,15 +224,15 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     kilohertz.
     """
     largest_step = largest_difference_step(q, v)
-    e = representable_step(t, w.notes[GAMMA_STEP_RATIO] * largest_step)
+    e = representable_step(t, w.gamma_step_ratio * largest_step)
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
-        if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
+        if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
             return DONE  # the caller reports values that are not finite; without a scale, errors cannot be judged
         rounding = ROUNDING_OF_TERMS * terms / largest_step
-        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
-        if disagreement < NEGLIGIBLE_DISAGREEMENT * w.notes[GAMMA_SCALE]:
-            w.notes[GAMMA_STEP_RATIO] = min(1.0, 2.0 * w.notes[GAMMA_STEP_RATIO])
-        if disagreement <= _max_disagreement(w.notes):
+        w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
+        if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:
+            w.gamma_step_ratio = min(1.0, 2.0 * w.gamma_step_ratio)
+        if disagreement <= _max_disagreement(w):
             return DONE
     return _choose_difference_step(f, w, t, q, v, largest_step, first, last)

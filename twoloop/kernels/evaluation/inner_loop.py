@@ -22,30 +22,7 @@ from twoloop.kernels.data.common import (
     merged,
     not_finite,
 )
-from twoloop.kernels.data.indices import (
-    BY_GENERAL,
-    CONSTANT_MASS,
-    DONE,
-    FACTORED,
-    FORM,
-    GAMMA_GIVEN,
-    GAMMA_SCALE,
-    INNER_DIVERGED,
-    KINEMATICS_GIVEN,
-    KNOWN,
-    MULTIPLIERS,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_INNER,
-    NONHOLONOMIC_GAMMA_GIVEN,
-    NULL_SPACE,
-    PIVOT,
-    REUSE,
-    ROUNDED,
-    SINGULAR,
-    STOPPED,
-    TIME_IS_UP,
-)
+from twoloop.kernels.data.indices import DONE, INNER_DIVERGED, MULTIPLIERS, NULL_SPACE, SINGULAR, STOPPED
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates, gamma_by_differences, kinematics, row_residual
 from twoloop.kernels.evaluation.operations import gamma_by_program
@@ -77,9 +54,9 @@ from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm,
 def acceleration_constraint(f, w, t, q, v):
     """Store Gamma, the right-hand side of G a = Gamma, in w.Gamma; return DONE or the code of a failure."""
     n_c, n_rows = w.C.size, w.Rate.size
-    if w.notes[KNOWN] == 1.0 and n_rows == n_c:
+    if w.known == 1.0 and n_rows == n_c:
         return DONE
-    has_gamma, has_gamma_a = f.flags[GAMMA_GIVEN] == 1, f.flags[NONHOLONOMIC_GAMMA_GIVEN] == 1
+    has_gamma, has_gamma_a = f.gamma_given == 1, f.nonholonomic_gamma_given == 1
     first, last = 0, n_rows  # range of the rows of Gamma that no callback computes
     w.Gamma[:] = 0.0
     if has_gamma:
@@ -106,28 +83,28 @@ def mass_matrix(f, w, t, q):
 @merged
 def factor_mass_at(f, w, t, q):
     """Store M(t, q) in w.M, and the factors of M in w.L if the form of the equations uses them; return a code."""
-    w.notes[FACTORED] = 0.0
+    w.factored = 0.0
     mass_matrix(f, w, t, q)
-    code = factor_mass(f, w) if f.flags[FORM] == MULTIPLIERS or has_banded_mass(f) else DONE
-    return code if finite(w.M) else not_finite(w.notes, MASS, t, q)
+    code = factor_mass(f, w) if f.form == MULTIPLIERS or has_banded_mass(f) else DONE
+    return code if finite(w.M) else not_finite(w, MASS, t, q)
 
 
 @merged
 def factor_equations_at(f, w, t, q):
     """Factor the equations of the accelerations at (t, q), from the rows of G, their factors and w.D; return a code."""
-    if f.flags[CONSTANT_MASS] == 0:
-        w.notes[FACTORED] = 0.0
+    if f.constant_mass == 0:
+        w.factored = 0.0
         mass_matrix(f, w, t, q)
     code = factor(f, w)
     if code != DONE and not finite(w.M):
-        return not_finite(w.notes, MASS, t, q)
+        return not_finite(w, MASS, t, q)
     return code
 
 
 @merged
 def compute_accelerations(f, w, t, q, v, a):
     """Store the accelerations at (q, v) in `a`, from the rows of G, their factors and w.D; return a code."""
-    w.counters[N_EVALUATIONS] += 1
+    w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:
         code = acceleration_constraint(f, w, t, q, v)
@@ -139,8 +116,8 @@ def compute_accelerations(f, w, t, q, v, a):
     for j in range(a.size):
         if not np.isfinite(a[j]):
             callback = faulty_callback(w)
-            return not_finite(w.notes, callback if callback >= 0 or finite(w.M) else MASS, t, q)
-    if f.flags[GAMMA_GIVEN] == 0 or w.Rate.size > w.C.size:
+            return not_finite(w, callback if callback >= 0 or finite(w.M) else MASS, t, q)
+    if f.gamma_given == 0 or w.Rate.size > w.C.size:
         _record_gamma_scale(w, a)
     return DONE
 
@@ -152,7 +129,7 @@ def _record_gamma_scale(w, a):
         total = 0.0
         for p in range(w.places[i], w.places[i + 1]):
             total += abs(w.G[i, w.places[p]] * a[w.places[p]])
-        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], total)
+        w.gamma_scale = max(w.gamma_scale, total)
 
 
 @merged
@@ -170,13 +147,13 @@ def _factor_rows_at(f, w, t, q, v):
 
     The fused callback also computes Gamma, which depends on v. The state (q, v) may be off the constraints.
     """
-    if f.flags[KINEMATICS_GIVEN] == 1:
+    if f.kinematics_given == 1:
         kinematics(f, w, t, q, v)
-        w.notes[KNOWN] = 1.0
+        w.known = 1.0
         code = factor_dependent_columns(w, t, q)
     else:
         code = evaluate_and_factor_columns(f, w, t, q)
-    if code == DONE and f.flags[FORM] == NULL_SPACE:
+    if code == DONE and f.form == NULL_SPACE:
         find_null_space(f, w, t, q)
     return code
 
@@ -226,27 +203,27 @@ def project_state(f, w, t, q, v, theta, a, lam):
     bounds how fast tangents turn, so that velocities are accurate, too.
     """
     last_correction = np.inf
-    theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
+    theta = max(theta, MIN_CORRECTION * w.rounded)
     for _ in range(MAX_ITERATIONS):
         code = _factor_rows_at(f, w, t, q, v)
         if code == DONE:
             code = factor_equations_at(f, w, t, q)
         if code != DONE:
             return code
-        if f.flags[KINEMATICS_GIVEN] == 0:
+        if f.kinematics_given == 0:
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
-        w.counters[N_INNER] += 1
+        w.n_inner += 1
         # with NULL_SPACE, find_null_space has already evaluated the rates
-        if f.flags[KINEMATICS_GIVEN] == 0 and f.flags[FORM] != NULL_SPACE:
+        if f.kinematics_given == 0 and f.form != NULL_SPACE:
             constraint_rates(f, w, t, q, w.Rate)
         correction_q, correction_v = _correct_state(f, w, q, v)
         if not np.isfinite(correction_q):
-            return not_finite(w.notes, CONSTRAINT, t, q)
+            return not_finite(w, CONSTRAINT, t, q)
         if correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v)):
             break
-        if correction_q <= w.notes[PIVOT] * theta:
-            w.notes[KNOWN] = 0.0  # Gamma was computed at the old velocities: compute it again
+        if correction_q <= w.pivot * theta:
+            w.known = 0.0  # Gamma was computed at the old velocities: compute it again
             break
         if correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
@@ -297,7 +274,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """Do `task`, one of the numbers in tasks.py, at (t, q, v); return a code. Functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
         return _do_other_task(f, w, task, t, q, v)
-    if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION) and w.notes[TIME_IS_UP] == 1.0:
+    if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION) and w.time_is_up == 1.0:
         return STOPPED
     # methods that integrate all coordinates call the tasks EVALUATE_WITHOUT_PROJECTION and PROJECT
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
@@ -306,7 +283,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
         return project_state(f, w, t, q, v, tolerance, a, lam)
     code = DONE
     if task <= tasks.RESTORE:
-        reuse_limit = w.notes[REUSE] if task == tasks.EVALUATE else w.notes[ROUNDED]
+        reuse_limit = w.reuse if task == tasks.EVALUATE else w.rounded
         code = restore_positions(f, w, t, q, v, tolerance, reuse_limit)
         if code == DONE and task != tasks.EVALUATE:
             code = _verify_pattern(w)
@@ -327,7 +304,7 @@ def evaluate(f, w, t, q, v, tolerance, a):
     """Compute the dependent entries of q and v from the independent ones, and the accelerations `a`; return a code.
 
     Velocities and accelerations are computed with the Jacobian that was factored last, at a position that differs from
-    the final q by at most w.notes[REUSE].
+    the final q by at most w.reuse.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
@@ -414,15 +391,15 @@ def rounding_floor(q):
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
     """Do a task by the code generated for the mechanism or, if it fails, by the general inner loop; return a code."""
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
-        w.counters[N_EVALUATIONS] += 1
-        w.counters[N_FACTORIZATIONS] += 1
+        w.n_evaluations += 1
+        w.n_factorizations += 1
         if f.own_accelerate(t, q, v, f.numbers, a):
             return DONE
     elif task == tasks.PROJECT:
-        tolerance, last_correction = max(theta, MIN_CORRECTION * w.notes[ROUNDED]), np.inf
+        tolerance, last_correction = max(theta, MIN_CORRECTION * w.rounded), np.inf
         for k in range(MAX_ITERATIONS):
-            w.counters[N_INNER] += 1
-            w.counters[N_FACTORIZATIONS] += 1
+            w.n_inner += 1
+            w.n_factorizations += 1
             if k == 0:
                 is_valid = f.own_correct_positions(t, q, v, f.numbers, w.x, q)
             else:
@@ -433,17 +410,17 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
             for j in range(q.size):
                 correction = max(correction, abs(w.x[j]))
             if correction <= tolerance and k > 0:
-                w.counters[N_EVALUATIONS] += 1
-                w.notes[BY_GENERAL] = 0.0
+                w.n_evaluations += 1
+                w.by_general = 0.0
                 return DONE
             if correction > CONTRACTION * last_correction:
                 break
             last_correction = max(correction, tolerance)
-        w.notes[BY_GENERAL] = 1.0
-    elif task == tasks.CHECK_REDUNDANT and w.notes[BY_GENERAL] == 0.0:
+        w.by_general = 1.0
+    elif task == tasks.CHECK_REDUNDANT and w.by_general == 0.0:
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
         f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores the rows at q in w
     elif task <= tasks.MULTIPLIERS:  # tasks with a partition, for which there is no generated code
-        w.notes[BY_GENERAL] = 1.0
+        w.by_general = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)

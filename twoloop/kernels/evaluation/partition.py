@@ -8,28 +8,11 @@ import numpy as np
 
 from twoloop.kernels.data.common import CONSTRAINT, JACOBIAN, compiled, finite, merged, not_finite
 from twoloop.kernels.data.indices import (
-    CONSTRAINT_RATE_GIVEN,
-    CONTRADICTION,
     DONE,
-    FACTORED,
-    FORM,
-    GENERATION,
     INNER_DIVERGED,
-    KINEMATICS_GIVEN,
-    KNOWN,
-    LEANING,
-    N_FACTORIZATIONS,
-    N_INNER,
-    N_PARTITIONS,
-    NONHOLONOMIC_RATE_GIVEN,
     NULL_SPACE,
-    ORIENTATION,
-    PIVOT,
-    RANK,
     RANK_DIFFERS,
-    RANK_V,
     ROWS_CONTRADICT,
-    SENSITIVITY,
     SINGULAR,
     STATIC,
 )
@@ -127,10 +110,10 @@ def min_pivot_ratio(f, w, t, q):
 
     Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the static
     form, or with more than MAX_ROWS_ELIMINATED rows, the result is the smallest pivot of the last choice of a
-    partition, w.notes[PIVOT].
+    partition, w.pivot.
     """
-    if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
-        return w.notes[PIVOT]
+    if f.form == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
+        return w.pivot
     if w.rows_v.size == 0:
         return 1.0
     G, order, row_order = w.Gx, w.order, w.row_order
@@ -163,7 +146,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     for i in range(n_rows):
         row_order[i] = i
     rank = full_pivoting(G, order, row_order, w.g, 0, n_c, max_rank)
-    w.notes[PIVOT] = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
+    w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
     last = rank  # end of the rows to eliminate: rows of A replace the redundant rows of C_q, from row `rank` on
@@ -216,10 +199,10 @@ def _adopt_pivot_order(w):
         _copy_in_ascending_order(w.row_order[:rank_v], w.rows_v)
         _copy_in_ascending_order(w.order[:rank_v], w.dependent_v)
         _copy_in_ascending_order(w.order[rank_v:], w.independent_v)
-    w.notes[SENSITIVITY] = 0.0
-    w.notes[LEANING] = 0.0
-    w.notes[ORIENTATION] = 0.0
-    w.notes[GENERATION] += 1.0
+    w.sensitivity = 0.0
+    w.leaning = 0.0
+    w.orientation = 0.0
+    w.generation += 1.0
     if w.G_of_S.size > 0:
         w.G_of_S[0, 0] = np.nan
     if rank_v < w.Rate.size:
@@ -231,7 +214,7 @@ def _adopt_pivot_order(w):
 def write_programs(w):
     """Write the programs that factor the dependent columns of w.G; return False if these columns are singular."""
     _record_columns_of_entries(w)
-    w.notes[FACTORED] = 0.0
+    w.factored = 0.0
     is_regular = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
     if is_regular and w.Rate.size > w.C.size:
         is_regular = make_program(w.G, w.pattern, w.rows_v, w.dependent_v, w.index_v, w.values_v)
@@ -266,19 +249,19 @@ def choose_partition(f, w, t, q):
     """Choose and store the dependent and independent coordinates and the independent rows at (t, q); return a code.
 
     The code is SINGULAR if the rank is less than that of the previous partition. It is RANK_DIFFERS, with the ranks in
-    w.notes, if this is the first partition and the workspace is allocated for other ranks.
+    w, if this is the first partition and the workspace is allocated for other ranks.
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
     record_entries(w)
     copy_matrix(w.G, w.Gx)
-    w.counters[N_FACTORIZATIONS] += 1
-    w.counters[N_PARTITIONS] += 1
-    is_first = w.notes[GENERATION] == 0.0
+    w.n_factorizations += 1
+    w.n_partitions += 1
+    is_first = w.generation == 0.0
     max_rank, max_rank_v = (w.C.size, w.Rate.size) if is_first else (w.rows.size, w.rows_v.size)
     rank, rank_v = _find_pivot_order(w, max_rank, max_rank_v)
     if is_first and (rank != w.rows.size or rank_v != w.rows_v.size):
-        w.notes[RANK], w.notes[RANK_V] = rank, rank_v
+        w.rank, w.rank_v = rank, rank_v
         return RANK_DIFFERS
     if rank < w.rows.size or rank_v < w.rows_v.size:
         return SINGULAR
@@ -305,14 +288,14 @@ def adopt_partition_of_midpoint(f, w, t_mid, state, new_state):
     has_new_entry = record_entries(w)
     copy_matrix(w.G, w.Gx)
     rank, rank_v = w.rows.size, w.rows_v.size
-    w.counters[N_FACTORIZATIONS] += 1
+    w.n_factorizations += 1
     new_rank, new_rank_v = _find_pivot_order(w, rank, rank_v)
     if new_rank < rank or new_rank_v < rank_v:
         return SINGULAR
     is_same = _is_same_set(w.independent, w.order[rank:])
     if is_same and not has_new_entry and _is_same_set(w.independent_v, w.order[rank_v:]):
         return DONE
-    w.counters[N_PARTITIONS] += 1
+    w.n_partitions += 1
     return PARTITION_CHANGED if _adopt_pivot_order(w) else SINGULAR
 
 
@@ -328,13 +311,13 @@ def _is_same_set(a, b):
 def choose_oriented_partition(f, w, t, q):
     """Choose a partition at an accepted state, and store the sign of det C_qd as ORIENTATION; return a code."""
     code = choose_partition(f, w, t, q)
-    w.notes[ORIENTATION] = 0.0
+    w.orientation = 0.0
     if code != DONE:
         return code
     ratio = min(factor(w.entries, w.index, w.values), factor(w.entries, w.index_v, w.values_v))
     if not ratio > RANK_TOLERANCE:
         return SINGULAR
-    w.notes[ORIENTATION] = determinant_sign(w.index, w.values)
+    w.orientation = determinant_sign(w.index, w.values)
     return DONE
 
 
@@ -368,17 +351,17 @@ def partition_is_poor(w):
     largest = 0.0
     for j in range(w.independent_v.size):
         largest = max(largest, largest_of(w.D[j]))
-    if w.notes[SENSITIVITY] == 0.0:  # first check of a new partition
-        w.notes[SENSITIVITY] = max(largest, 1.0)
-    if not largest <= SENSITIVITY_GROWTH * w.notes[SENSITIVITY]:
+    if w.sensitivity == 0.0:  # first check of a new partition
+        w.sensitivity = max(largest, 1.0)
+    if not largest <= SENSITIVITY_GROWTH * w.sensitivity:
         return True
     # the static form chooses its independent rows at every state
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     coefficient = _largest_coefficient(w)
-    if w.notes[LEANING] == 0.0:
-        w.notes[LEANING] = max(coefficient, 1.0)
-    return not coefficient <= SENSITIVITY_GROWTH * w.notes[LEANING]
+    if w.leaning == 0.0:
+        w.leaning = max(coefficient, 1.0)
+    return not coefficient <= SENSITIVITY_GROWTH * w.leaning
 
 
 MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
@@ -388,7 +371,7 @@ ROUNDING_OF_CORRECTIONS = 1e-12  # largest correction due to rounding alone, rel
 # the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
 AMPLIFICATION = 1e3
 ROUNDING_OF_ROWS = 2e-15  # largest |C_i| that counts as a rounding error, relative to the largest |G_ij q_j|
-MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.notes[ROUNDED], the rounding error of q
+MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.rounded, the rounding error of q
 MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
 
 
@@ -397,7 +380,7 @@ def _factor_in_new_order(w, t, q):
     """Factor the dependent columns of w.G in a new order of elimination; return DONE, SINGULAR or NOT_FINITE."""
     record_entries(w)
     if not finite(w.G):
-        return not_finite(w.notes, JACOBIAN, t, q)
+        return not_finite(w, JACOBIAN, t, q)
     if not write_programs(w):
         return SINGULAR
     ratio = min(factor(w.entries, w.index, w.values), factor(w.entries, w.index_v, w.values_v))
@@ -407,12 +390,12 @@ def _factor_in_new_order(w, t, q):
 @merged
 def factor_dependent_columns(w, t, q):
     """Factor the dependent columns of w.G; return DONE, SINGULAR or NOT_FINITE."""
-    w.notes[FACTORED] = 0.0
+    w.factored = 0.0
     ratio = factor(w.entries, w.index, w.values)
-    w.counters[N_FACTORIZATIONS] += 1
+    w.n_factorizations += 1
     if w.Rate.size > w.C.size:
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
-        w.counters[N_FACTORIZATIONS] += 1
+        w.n_factorizations += 1
     # the ratio may also be small because of NaN, or of an order of elimination that does not suit the values
     return DONE if ratio > RANK_TOLERANCE else _factor_in_new_order(w, t, q)
 
@@ -420,7 +403,7 @@ def factor_dependent_columns(w, t, q):
 @merged
 def evaluate_and_factor_columns(f, w, t, q):
     """Store C_q and A at (t, q) in w.G, and factor the dependent columns; return DONE, SINGULAR or NOT_FINITE."""
-    w.notes[KNOWN] = 0.0
+    w.known = 0.0
     clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
     return factor_dependent_columns(w, t, q)
@@ -448,7 +431,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """
     last_correction = np.inf
     has_converged = w.C.size == 0
-    is_fused = f.flags[KINEMATICS_GIVEN] == 1
+    is_fused = f.kinematics_given == 1
     for _ in range(MAX_ITERATIONS):
         if is_fused:
             kinematics(f, w, t, q, v)
@@ -460,7 +443,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
         if not is_fused:
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
-        w.counters[N_INNER] += 1
+        w.n_inner += 1
         rows, columns = rows_of(w.index), columns_of(w.index)
         for k in range(rows.size):
             w.z[k] = w.C[rows[k]]
@@ -468,7 +451,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
         correction = 0.0
         for k in range(rows.size):
             if not np.isfinite(w.z[k]):
-                return not_finite(w.notes, CONSTRAINT, t, q)
+                return not_finite(w, CONSTRAINT, t, q)
             q[columns[k]] -= w.z[k]
             correction = max(correction, abs(w.z[k]))
         if correction <= reuse_limit:
@@ -488,10 +471,10 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
 @merged
 def find_null_space(f, w, t, q):
     """Store in w.D the null space of G and the driven velocities (see Work), from the rows and factors in w."""
-    if f.flags[KINEMATICS_GIVEN] == 0 or w.notes[KNOWN] == 0.0:
+    if f.kinematics_given == 0 or w.known == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
-    is_driven = f.flags[CONSTRAINT_RATE_GIVEN] == 1 or f.flags[NONHOLONOMIC_RATE_GIVEN] == 1
+    is_driven = f.constraint_rate_given == 1 or f.nonholonomic_rate_given == 1
     solve_rows(w.index_v, w.values_v, w.D, w.D.shape[0] if is_driven else w.D.shape[0] - 1)
 
 
@@ -503,8 +486,8 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size
-    w.notes[KNOWN] = float(f.flags[KINEMATICS_GIVEN])
-    if f.flags[FORM] == NULL_SPACE:
+    w.known = float(f.kinematics_given)
+    if f.form == NULL_SPACE:
         find_null_space(f, w, t, q)
         for k in range(rows.size):
             w.z[k] = w.D[n_dof, k]
@@ -513,7 +496,7 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
             for k in range(rows.size):
                 w.z[k] += w.D[j, k] * speed
     else:
-        if w.notes[KNOWN] == 0.0:
+        if w.known == 0.0:
             constraint_rates(f, w, t, q, w.Rate)
         row_residual(w, v, rows)
         solve(w.index_v, w.values_v, w.z)
@@ -524,7 +507,7 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
         change = max(change, abs(v[columns[k]] - w.z[k]))
         v[columns[k]] = w.z[k]
     if not change <= reuse_limit:
-        w.notes[KNOWN] = 0.0
+        w.known = 0.0
 
 
 @compiled
@@ -539,6 +522,6 @@ def check_all_rows(f, w, t, q, v):
             velocity_violation += w.G[i, j] * v[j]
         is_violated = abs(w.C[i]) > MAX_VIOLATION * size * largest if i < w.C.size else False
         if is_violated or abs(velocity_violation) > MAX_VIOLATION * speed * largest:
-            w.notes[CONTRADICTION] = i
+            w.contradiction = i
             return ROWS_CONTRADICT
     return DONE

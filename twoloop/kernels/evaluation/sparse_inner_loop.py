@@ -35,30 +35,13 @@ from twoloop.kernels.data.common import (
     not_finite,
 )
 from twoloop.kernels.data.indices import (
-    CONSTANT_MASS,
-    CONTRADICTION,
     DONE,
-    GAMMA_GIVEN,
-    GENERATION,
     INNER_DIVERGED,
-    JACOBIAN_VALUES_GIVEN,
-    MASS_VALUES_GIVEN,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_INNER,
-    N_PARTITIONS,
-    NEARLY_SINGULAR,
     NEEDS_DENSE,
-    PIVOT,
-    RANK,
     RANK_DIFFERS,
-    RANK_V,
-    ROUNDED,
     ROWS_CONTRADICT,
     SINGULAR,
-    SMALLEST,
     STOPPED,
-    TIME_IS_UP,
 )
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates
@@ -86,7 +69,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
 SUSPECT_PIVOT = 1e-6
 MIN_PIVOT = 1e-10  # smallest pivot, relative to the size of its row, with which factors by 1-by-1 pivots are accurate
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows is at most this
-PROJECT_STAGES = 2.0  # value of w.notes[NEARLY_SINGULAR] near a singular position, where stages must be projected
+PROJECT_STAGES = 2.0  # value of w.nearly_singular near a singular position, where stages must be projected
 # solutions are refined once if the smallest pivot, relative to the size of its row, is at most REFINE_ONCE_BELOW, and
 # twice if it is at most REFINE_TWICE_BELOW
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
@@ -95,7 +78,7 @@ REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 @compiled
 def fill_mass_values(f, w, t, q):
     """Store the entries of M(t, q) in w.mass_values, unless M is constant and dense, when they are already stored."""
-    if f.flags[MASS_VALUES_GIVEN] == 1:
+    if f.mass_values_given == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
     elif w.M.size > 0:
@@ -110,7 +93,7 @@ def fill_mass_values(f, w, t, q):
 @compiled
 def fill_jacobian_values(f, w, t, q):
     """Store the entries of C_q(t, q) in w.jacobian_values."""
-    if f.flags[JACOBIAN_VALUES_GIVEN] == 1:
+    if f.jacobian_values_given == 1:
         w.jacobian_values[:] = 0.0
         f.jacobian_values(t, q, f.p, w.jacobian_values)
         return
@@ -126,12 +109,12 @@ def fill_jacobian_values(f, w, t, q):
 @compiled
 def _factor_entries(f, w, min_sine_square):
     """Factor [M G^T; G 0] from the entries in w; return the smallest squared sine, see `factor` of sparse_ldl.py."""
-    w.counters[N_FACTORIZATIONS] += 1
+    w.n_factorizations += 1
     stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
     load_matrix(f.static_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
     smallest = factor(f.static_program, w.is_independent, w.factors, w.pivot_sizes, min_sine_square)
-    w.notes[SMALLEST] = smallest
-    w.notes[PIVOT] = np.sqrt(max(smallest, 0.0))
+    w.smallest = smallest
+    w.pivot = np.sqrt(max(smallest, 0.0))
     return smallest
 
 
@@ -139,16 +122,16 @@ def _factor_entries(f, w, min_sine_square):
 def _failure_of_factorization(w, t, q):
     """Return the code of a failed factorization: NOT_FINITE, NEEDS_DENSE (singular M) or SINGULAR (dependent rows)."""
     if not finite_vector(w.mass_values):
-        return not_finite(w.notes, MASS, t, q)
+        return not_finite(w, MASS, t, q)
     if not finite_vector(w.jacobian_values):
-        return not_finite(w.notes, JACOBIAN, t, q)
-    return NEEDS_DENSE if w.notes[SMALLEST] < 0.0 else SINGULAR
+        return not_finite(w, JACOBIAN, t, q)
+    return NEEDS_DENSE if w.smallest < 0.0 else SINGULAR
 
 
 @compiled
 def factor_equations_at(f, w, t, q):
     """Store the entries of M and G at (t, q), and factor the equations of the independent rows; return a code."""
-    if f.flags[CONSTANT_MASS] == 0:
+    if f.constant_mass == 0:
         fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
     smallest = _factor_entries(f, w, MIN_PIVOT)
@@ -156,7 +139,7 @@ def factor_equations_at(f, w, t, q):
         return _failure_of_factorization(w, t, q)
     if _count_independent(w.is_independent) == w.rows_v.size:
         return DONE
-    w.counters[N_PARTITIONS] += 1  # independent rows have become dependent: other rows may replace them
+    w.n_partitions += 1  # independent rows have become dependent: other rows may replace them
     code = _choose_rows(f, w, t, q)
     return _adopt_rows(w) if code == DONE else code
 
@@ -184,7 +167,7 @@ def solve_unknowns(f, w, n_corrections):
 @compiled
 def n_refinements(w):
     """Return how many times solutions with the factors in w must be refined: 0, 1 or 2."""
-    smallest = w.notes[SMALLEST]
+    smallest = w.smallest
     return 0 if smallest > REFINE_ONCE_BELOW else 1 if smallest > REFINE_TWICE_BELOW else 2
 
 
@@ -257,17 +240,17 @@ def _adopt_rows(w):
 @compiled
 def choose_rows(f, w, t, q):
     """Choose and store the independent rows at (t, q); return a code, RANK_DIFFERS if w is made for another rank."""
-    w.counters[N_PARTITIONS] += 1
+    w.n_partitions += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
     code = _choose_rows(f, w, t, q)
     if code != DONE:
         return code
     n_independent = _count_independent(w.is_independent)
-    if w.notes[GENERATION] == 0.0 and n_independent != w.rows_v.size:
-        w.notes[RANK] = w.notes[RANK_V] = n_independent
+    if w.generation == 0.0 and n_independent != w.rows_v.size:
+        w.rank = w.rank_v = n_independent
         return RANK_DIFFERS
-    w.notes[GENERATION] += 1.0
+    w.generation += 1.0
     return _adopt_rows(w)
 
 
@@ -366,7 +349,7 @@ def _add_jacobian_times(f, w, x, out):
 def _fill_gamma(f, w, t, q, v):
     """Store Gamma, of G a = Gamma, in w.Gamma; return DONE, or NEEDS_DENSE if only differences could compute Gamma."""
     w.Gamma[:] = 0.0
-    if f.flags[GAMMA_GIVEN] == 1:
+    if f.gamma_given == 1:
         f.gamma(t, q, v, f.p, w.Gamma)
         return DONE
     return DONE if gamma_by_program(f, w, t, q, v) else NEEDS_DENSE
@@ -374,18 +357,18 @@ def _fill_gamma(f, w, t, q, v):
 
 @compiled
 def _failure_of_accelerations(w, t, q):
-    """Store in w.notes the callback whose values made an acceleration non-finite; return NOT_FINITE."""
+    """Store in w the callback whose values made an acceleration non-finite; return NOT_FINITE."""
     if not finite_vector(w.Gamma):
-        return not_finite(w.notes, GAMMA, t, q)
+        return not_finite(w, GAMMA, t, q)
     if not finite_vector(w.Q):
-        return not_finite(w.notes, FORCE, t, q)
-    return not_finite(w.notes, MASS if not finite_vector(w.mass_values) else -1, t, q)
+        return not_finite(w, FORCE, t, q)
+    return not_finite(w, MASS if not finite_vector(w.mass_values) else -1, t, q)
 
 
 @compiled
 def _compute_accelerations(f, w, t, q, v, a):
     """Store the accelerations at (q, v) in `a`, and the multipliers in w.z, with the factors in w; return a code."""
-    w.counters[N_EVALUATIONS] += 1
+    w.n_evaluations += 1
     code = _fill_gamma(f, w, t, q, v)
     if code != DONE:
         return code
@@ -441,19 +424,19 @@ def _is_on_constraints(f, w, q):
 def _project_state(f, w, t, q, v, theta):
     """Project (q, v) in place; return a code. On return, the factors in w are those at q before the last correction."""
     last_correction = np.inf
-    theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
+    theta = max(theta, MIN_CORRECTION * w.rounded)
     for _ in range(MAX_ITERATIONS):
         code = factor_equations_at(f, w, t, q)
         if code != DONE:
             return code
         w.C[:] = 0.0
         f.constraint(t, q, f.p, w.C)
-        w.counters[N_INNER] += 1
+        w.n_inner += 1
         for i in range(w.g.size):
             w.g[i] = -w.C[i]
         correction_q = _add_least_correction(f, w, q)
         if not np.isfinite(correction_q):
-            return not_finite(w.notes, CONSTRAINT, t, q)
+            return not_finite(w, CONSTRAINT, t, q)
         constraint_rates(f, w, t, q, w.Rate)
         copy(w.Rate, w.g)
         _add_jacobian_times(f, w, v, w.g)
@@ -461,10 +444,10 @@ def _project_state(f, w, t, q, v, theta):
             w.g[i] = -w.g[i]
         correction_v = _add_least_correction(f, w, v)
         if not np.isfinite(correction_v):
-            return not_finite(w.notes, RATE, t, q)
+            return not_finite(w, RATE, t, q)
         if correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v)):
             return DONE
-        if correction_q <= w.notes[PIVOT] * theta:
+        if correction_q <= w.pivot * theta:
             return DONE
         if correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
@@ -498,7 +481,7 @@ def _check_redundant_rows(f, w, t, q, v):
         row_maxima[rows[k]] = max(row_maxima[rows[k]], abs(w.jacobian_values[k]))
     for i in range(w.g.size):
         if abs(w.C[i]) > MAX_VIOLATION * size * row_maxima[i] or abs(w.g[i]) > MAX_VIOLATION * speed * row_maxima[i]:
-            w.notes[CONTRADICTION] = i
+            w.contradiction = i
             return ROWS_CONTRADICT
     return DONE
 
@@ -523,7 +506,7 @@ def _do_other_task(f, w, task, t, q, v, a, lam):
         return choose_rows(f, w, t, q)
     if task == tasks.PREPARE_MASS:
         fill_mass_values(f, w, t, q)
-        return DONE if finite_vector(w.mass_values) else not_finite(w.notes, MASS, t, q)
+        return DONE if finite_vector(w.mass_values) else not_finite(w, MASS, t, q)
     if task == tasks.CHECK_REDUNDANT:
         return _check_redundant_rows(f, w, t, q, v)
     if task == tasks.SOLVE:
@@ -535,8 +518,8 @@ def _do_other_task(f, w, task, t, q, v, a, lam):
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """Do `task` at (t, q, v), see inner_loop.py; return a code. For SOLVE, q and v are the right-hand side."""
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
-        code = STOPPED if w.notes[TIME_IS_UP] == 1.0 else DONE
-        if code == DONE and task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
+        code = STOPPED if w.time_is_up == 1.0 else DONE
+        if code == DONE and task == tasks.EVALUATE and w.nearly_singular == PROJECT_STAGES:
             code = _project_state(f, w, t, q, v, tolerance)
         if code == DONE:
             code = factor_equations_at(f, w, t, q)

@@ -9,39 +9,8 @@ from numba import types
 
 from twoloop.kernels.compile.callbacks import VECTOR
 from twoloop.kernels.data.common import INTEGERS, compiled, kernel
-from twoloop.kernels.lanes.layout import (
-    ACCEPTED,
-    AHEAD,
-    CODE,
-    ENDED,
-    EVALUATED,
-    FINE,
-    FRESH,
-    LANES,
-    N_EVALUATIONS,
-    N_ROWS,
-    NO_START,
-    NO_VALUES,
-    OFTEN_REFUSED,
-    ORDER,
-    REACHED,
-    REFUSED,
-    REQUESTED,
-    RUN,
-    RUNNING,
-    T0,
-    T1,
-    UNDECIDED,
-    UNIT,
-    H,
-    N,
-    T,
-    X,
-    fill_field,
-    offsets_in_work,
-    project_lanes,
-    remove_run,
-)
+from twoloop.kernels.lanes import layout as at
+from twoloop.kernels.lanes.layout import CODE, LANES, fill_field, offsets_in_work, project_lanes, remove_run
 
 TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
@@ -52,33 +21,33 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
     state, new, _, _, _, _, own, _ = offsets_in_work(n, n_rows, numbers.shape[1])
     n_fresh, n_running = 0, 0
     for k in range(LANES):
-        previous_run = int(work[RUN * LANES + k])
+        previous_run = int(work[at.RUN * LANES + k])
         # the generated code of a series method clears RUNNING without storing a reason in `status`
-        if work[RUNNING * LANES + k] == 0.0 and previous_run >= 0 and status[previous_run] == UNDECIDED:
-            status[previous_run] = OFTEN_REFUSED if work[REFUSED * LANES + k] < np.inf else NO_VALUES
-        work[FINE * LANES + k] = work[FRESH * LANES + k] = 0.0
-        if work[RUNNING * LANES + k] == 0.0 and next_run < numbers.shape[0]:
-            work[FINE * LANES + k] = work[FRESH * LANES + k] = work[RUNNING * LANES + k] = 1.0
-            work[T * LANES + k] = work[AHEAD * LANES + k] = control[T0]
-            work[REFUSED * LANES + k] = work[REACHED * LANES + k] = 0.0
-            work[RUN * LANES + k] = next_run
+        if work[at.RUNNING * LANES + k] == 0.0 and previous_run >= 0 and status[previous_run] == at.UNDECIDED:
+            status[previous_run] = at.OFTEN_REFUSED if work[at.REFUSED * LANES + k] < np.inf else at.NO_VALUES
+        work[at.FINE * LANES + k] = work[at.FRESH * LANES + k] = 0.0
+        if work[at.RUNNING * LANES + k] == 0.0 and next_run < numbers.shape[0]:
+            work[at.FINE * LANES + k] = work[at.FRESH * LANES + k] = work[at.RUNNING * LANES + k] = 1.0
+            work[at.T * LANES + k] = work[at.AHEAD * LANES + k] = control[at.T0]
+            work[at.REFUSED * LANES + k] = work[at.REACHED * LANES + k] = 0.0
+            work[at.RUN * LANES + k] = next_run
             for j in range(n):
                 work[(new + j) * LANES + k], work[(new + n + j) * LANES + k] = q0[next_run, j], v0[next_run, j]
             for i in range(numbers.shape[1]):
                 work[(own + i) * LANES + k] = numbers[next_run, i]
             next_run += 1
             n_fresh += 1
-        n_running += int(work[RUNNING * LANES + k])
+        n_running += int(work[at.RUNNING * LANES + k])
     if n_fresh > 0:
         for k in range(LANES):
-            work[REQUESTED * LANES + k] = work[FINE * LANES + k]
+            work[at.REQUESTED * LANES + k] = work[at.FINE * LANES + k]
         project_lanes(code, order, control, work)
         for k in range(LANES):
-            if work[REQUESTED * LANES + k] == 1.0:
+            if work[at.REQUESTED * LANES + k] == 1.0:
                 for j in range(2 * n):
                     work[(state + j) * LANES + k] = work[(new + j) * LANES + k]
-                if work[FINE * LANES + k] == 0.0:
-                    remove_run(work, status, k, NO_START)
+                if work[at.FINE * LANES + k] == 0.0:
+                    remove_run(work, status, k, at.NO_START)
                     n_running -= 1
     return next_run, n_running
 
@@ -89,25 +58,25 @@ def _write_states_in_steps(code, settings, control, options, work, n, new, times
     while True:
         n_requested = 0
         for k in range(LANES):
-            i_time = int(work[REACHED * LANES + k])
-            work[FINE * LANES + k] = work[X * LANES + k] = 0.0
-            if work[ACCEPTED * LANES + k] == 1.0 and i_time < times.size:
-                step_end = work[T * LANES + k] + work[H * LANES + k]
-                if times[i_time] < step_end and times[i_time] < control[T1]:
-                    work[FINE * LANES + k], n_requested = 1.0, n_requested + 1
-                    work[X * LANES + k] = times[i_time] - work[T * LANES + k]
-                    work[AHEAD * LANES + k] = times[i_time]
-            work[REQUESTED * LANES + k] = work[FINE * LANES + k]
+            i_time = int(work[at.REACHED * LANES + k])
+            work[at.FINE * LANES + k] = work[at.X * LANES + k] = 0.0
+            if work[at.ACCEPTED * LANES + k] == 1.0 and i_time < times.size:
+                step_end = work[at.T * LANES + k] + work[at.H * LANES + k]
+                if times[i_time] < step_end and times[i_time] < control[at.T1]:
+                    work[at.FINE * LANES + k], n_requested = 1.0, n_requested + 1
+                    work[at.X * LANES + k] = times[i_time] - work[at.T * LANES + k]
+                    work[at.AHEAD * LANES + k] = times[i_time]
+            work[at.REQUESTED * LANES + k] = work[at.FINE * LANES + k]
         if n_requested == 0:
             return
         code.step(code, settings, control, options, work, status, n_steps, True)
-        project_lanes(code, settings[ORDER], control, work)
+        project_lanes(code, settings[at.ORDER], control, work)
         for k in range(LANES):
-            if work[REQUESTED * LANES + k] == 1.0:
-                run, i_time = int(work[RUN * LANES + k]), int(work[REACHED * LANES + k])
-                work[REACHED * LANES + k] += 1.0
+            if work[at.REQUESTED * LANES + k] == 1.0:
+                run, i_time = int(work[at.RUN * LANES + k]), int(work[at.REACHED * LANES + k])
+                work[at.REACHED * LANES + k] += 1.0
                 for j in range(n):
-                    is_valid = work[FINE * LANES + k] == 1.0
+                    is_valid = work[at.FINE * LANES + k] == 1.0
                     out_q[run, j, i_time] = work[(new + j) * LANES + k] if is_valid else np.nan
                     out_v[run, j, i_time] = work[(new + n + j) * LANES + k] if is_valid else np.nan
 
@@ -119,10 +88,10 @@ def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, ou
     `last` is the index of t1 among the output times.
     """
     for k in range(LANES):
-        if work[ACCEPTED * LANES + k] == 0.0 or work[H * LANES + k] != control[T1] - work[T * LANES + k]:
+        if work[at.ACCEPTED * LANES + k] == 0.0 or work[at.H * LANES + k] != control[at.T1] - work[at.T * LANES + k]:
             continue
-        run = int(work[RUN * LANES + k])
-        work[RUNNING * LANES + k], status[run] = 0.0, ENDED
+        run = int(work[at.RUN * LANES + k])
+        work[at.RUNNING * LANES + k], status[run] = 0.0, at.ENDED
         for j in range(n):
             out_q[run, j, last], out_v[run, j, last] = work[(new + j) * LANES + k], work[(new + n + j) * LANES + k]
         for j in range(n + n_rows):  # accelerations and multipliers, which are adjacent in `work`
@@ -133,20 +102,20 @@ def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, ou
 def _count_evaluations(settings, work, n_evaluations):
     """Add the number of evaluations in the last step to `n_evaluations` (n_runs) for the run of each lane."""
     for k in range(LANES):
-        if work[RUNNING * LANES + k] == 1.0:
-            n_within = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
-            n_evaluations[int(work[RUN * LANES + k])] += n_within + 1  # one more at the end of the step
+        if work[at.RUNNING * LANES + k] == 1.0:
+            n_within = settings[at.N_EVALUATIONS] + int(work[at.EVALUATED * LANES + k])
+            n_evaluations[int(work[at.RUN * LANES + k])] += n_within + 1  # one more at the end of the step
 
 
 @compiled
 def _advance_time(work, control, n_steps):
     """In lanes whose step was accepted, add the step size to T, and 1 to the entry of `n_steps` (n_runs) of the run."""
     for k in range(LANES):
-        if work[ACCEPTED * LANES + k] == 1.0:
-            h, t = work[H * LANES + k], work[T * LANES + k]
-            n_steps[int(work[RUN * LANES + k])] += 1
-            work[T * LANES + k] = control[T1] if h == control[T1] - t else t + h
-            work[REFUSED * LANES + k] = 0.0
+        if work[at.ACCEPTED * LANES + k] == 1.0:
+            h, t = work[at.H * LANES + k], work[at.T * LANES + k]
+            n_steps[int(work[at.RUN * LANES + k])] += 1
+            work[at.T * LANES + k] = control[at.T1] if h == control[at.T1] - t else t + h
+            work[at.REFUSED * LANES + k] = 0.0
 
 
 _ADVANCE_SIGNATURE = types.void(
@@ -165,17 +134,17 @@ def advance_lanes(
     out_v : (n_runs, n, n_t); out_a : (n_runs, n + n_rows) accelerations and multipliers at t1; status and n_steps :
     (n_runs,); n_evaluations : (n_runs,) increased by the number of evaluations.
     """
-    n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
+    n, n_rows, order = settings[at.N], settings[at.N_ROWS], settings[at.ORDER]
     _, new, _, _, a, _, _, _ = offsets_in_work(n, n_rows, numbers.shape[1])
     next_run, has_new_runs = 0, False
-    for field in (T, AHEAD, H, X, RUNNING, ACCEPTED):
+    for field in (at.T, at.AHEAD, at.H, at.X, at.RUNNING, at.ACCEPTED):
         fill_field(work, field, 0.0)
-    fill_field(work, UNIT, 1.0)
-    fill_field(work, RUN, -1.0)
+    fill_field(work, at.UNIT, 1.0)
+    fill_field(work, at.RUN, -1.0)
     while True:
         n_running = 0.0
         for k in range(LANES):
-            n_running += work[RUNNING * LANES + k]
+            n_running += work[at.RUNNING * LANES + k]
         if n_running < LANES or has_new_runs:
             first_new_run = next_run
             next_run, n_used = _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status)
@@ -184,7 +153,7 @@ def advance_lanes(
                 if next_run == numbers.shape[0]:
                     return
                 continue
-        fill_field(work, EVALUATED, 0.0)
+        fill_field(work, at.EVALUATED, 0.0)
         code.step(code, settings, control, options, work, status, n_steps, False)
         _count_evaluations(settings, work, n_evaluations)
         code.commit(order, control, work)

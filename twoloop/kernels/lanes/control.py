@@ -9,47 +9,10 @@ import numpy as np
 from twoloop.kernels.control.loop_state import N_PAST, N_RULE
 from twoloop.kernels.control.step_size import record_accepted_step, step_size_ratio
 from twoloop.kernels.data.common import compiled, inlined, kernel, merged
+from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.layout import (
-    ACCEPTED,
-    AHEAD,
-    ATOL,
-    BEGIN,
-    CHECKS_REDUNDANT,
-    ERROR,
-    EVALUATED,
-    FINE,
-    FRESH,
-    GAP,
-    H_FREE,
-    H_LIMIT,
-    H_NEXT,
     LANES,
-    LIMIT_AGE,
-    MANY_STEPS,
-    N_NUMBERS,
-    N_ROWS,
-    NO_VALUES,
-    OFF,
-    OFTEN_REFUSED,
-    ORDER,
-    PAST,
-    PREDICTED_V,
-    REFUSED,
-    ROUGH_TO,
-    RTOL,
-    RUN,
-    RUNNING,
-    SHORTEST,
-    SLOPES,
-    START,
     STEP,
-    T0,
-    T1,
-    UNIT,
-    H,
-    N,
-    T,
-    X,
     copy_vectors,
     offsets_in_work,
     project_lanes,
@@ -69,7 +32,7 @@ MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that 
 END_ROUNDING = 1e-10
 LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of the last failed step, as in `Plan`
 LIMIT_MEMORY = 10.0  # number of accepted steps after which H_LIMIT no longer applies, as in `Plan`
-LEAST_FIRST_STEP = 20.0 * SHORTEST  # lower bound of the first step size, relative to |t0|
+LEAST_FIRST_STEP = 20.0 * at.SHORTEST  # lower bound of the first step size, relative to |t0|
 # number of successive rejected steps after which a run leaves its lane, because the motion may be stiff
 MAX_REJECTED = 30
 MOST_STEPS = 100_000  # largest number of steps of a run in a lane, because the user cannot interrupt runs in lanes
@@ -78,7 +41,7 @@ MOST_STEPS = 100_000  # largest number of steps of a run in a lane, because the 
 @inlined
 def _history_view(work, k):
     """Return a view (N_PAST) of the history of step-size control in lane k."""
-    return work[PAST * LANES + N_PAST * k : PAST * LANES + N_PAST * (k + 1)]
+    return work[at.PAST * LANES + N_PAST * k : at.PAST * LANES + N_PAST * (k + 1)]
 
 
 @compiled
@@ -89,61 +52,61 @@ def _first_step_size(options, control, work, n, state, a, k):
         largest_q = max(largest_q, abs(work[(state + j) * LANES + k]))
         largest_v = max(largest_v, abs(work[(state + n + j) * LANES + k]))
         largest_a = max(largest_a, abs(work[(a + j) * LANES + k]))
-        least = min(least, control[ATOL + j])
-    largest_q, scale = max(largest_q, least), control[T1] - control[T0]
+        least = min(least, control[at.ATOL + j])
+    largest_q, scale = max(largest_q, least), control[at.T1] - control[at.T0]
     if largest_v > 0.0:
         scale = min(scale, largest_q / largest_v)
     if largest_a > 0.0:
         scale = min(scale, np.sqrt(largest_q / largest_a))
     if largest_v > 0.0 and largest_a > 0.0 and largest_v / largest_a > options[FIRST] * scale:
         scale = min(scale, largest_v / largest_a)
-    return max(options[FIRST] * scale, LEAST_FIRST_STEP * abs(control[T0]))
+    return max(options[FIRST] * scale, LEAST_FIRST_STEP * abs(control[at.T0]))
 
 
 @compiled
 def begin_control(options, control, work, n, state, a, start):
     """Initialize step-size control, and copy the accelerations at offset `a` to `start`, in lanes with FRESH = 1."""
     for k in range(LANES):
-        if work[FRESH * LANES + k] == 1.0:
+        if work[at.FRESH * LANES + k] == 1.0:
             for j in range(n):
                 work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
-            work[H_NEXT * LANES + k] = _first_step_size(options, control, work, n, state, a, k)
-            work[H_LIMIT * LANES + k], work[LIMIT_AGE * LANES + k] = np.inf, 0.0
-            work[ROUGH_TO * LANES + k] = -np.inf
+            work[at.H_NEXT * LANES + k] = _first_step_size(options, control, work, n, state, a, k)
+            work[at.H_LIMIT * LANES + k], work[at.LIMIT_AGE * LANES + k] = np.inf, 0.0
+            work[at.ROUGH_TO * LANES + k] = -np.inf
             for i in range(N_PAST):
-                work[PAST * LANES + N_PAST * k + i] = 0.0
+                work[at.PAST * LANES + N_PAST * k + i] = 0.0
 
 
 @compiled
 def choose_steps(work, control, status, n_steps):
     """Store the next step size, at most control[GAP], in H and X (0 in lanes without a run); copy RUNNING to FINE."""
-    t1 = control[T1]
+    t1 = control[at.T1]
     for k in range(LANES):
-        work[H * LANES + k], t = 0.0, work[T * LANES + k]
-        if work[RUNNING * LANES + k] == 1.0:
-            h_wanted = min(work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k], control[GAP])
+        work[at.H * LANES + k], t = 0.0, work[at.T * LANES + k]
+        if work[at.RUNNING * LANES + k] == 1.0:
+            h_wanted = min(work[at.H_NEXT * LANES + k], work[at.H_LIMIT * LANES + k], control[at.GAP])
             h, time_left = h_wanted, t1 - t
             if h >= time_left * (1.0 - END_ROUNDING):
                 h = time_left
             elif h > 0.5 * time_left:
                 h = 0.5 * time_left  # two equal steps rather than a long and a tiny one
-            if n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
-                remove_run(work, status, k, MANY_STEPS)
-            elif h > SHORTEST * max(abs(t), abs(t1)):
-                work[H * LANES + k], work[H_FREE * LANES + k] = h, h_wanted
+            if n_steps[int(work[at.RUN * LANES + k])] >= MOST_STEPS:
+                remove_run(work, status, k, at.MANY_STEPS)
+            elif h > at.SHORTEST * max(abs(t), abs(t1)):
+                work[at.H * LANES + k], work[at.H_FREE * LANES + k] = h, h_wanted
             else:
-                last_step_failed = work[H_LIMIT * LANES + k] < np.inf and work[LIMIT_AGE * LANES + k] == 0.0
-                remove_run(work, status, k, NO_VALUES if last_step_failed else OFTEN_REFUSED)
-        work[X * LANES + k] = work[H * LANES + k]
-        work[FINE * LANES + k] = work[RUNNING * LANES + k]
+                last_step_failed = work[at.H_LIMIT * LANES + k] < np.inf and work[at.LIMIT_AGE * LANES + k] == 0.0
+                remove_run(work, status, k, at.NO_VALUES if last_step_failed else at.OFTEN_REFUSED)
+        work[at.X * LANES + k] = work[at.H * LANES + k]
+        work[at.FINE * LANES + k] = work[at.RUNNING * LANES + k]
 
 
 @compiled
 def set_end(work, control):
     """Set AHEAD, the time of NEW, to T + X; to exactly t1 at the end of the run."""
     for k in range(LANES):
-        t, x = work[T * LANES + k], work[X * LANES + k]
-        work[AHEAD * LANES + k] = control[T1] if x == control[T1] - t else t + x
+        t, x = work[at.T * LANES + k], work[at.X * LANES + k]
+        work[at.AHEAD * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x
 
 
 @compiled
@@ -152,48 +115,49 @@ def end_steps(code, settings, control, work, predicted_v):
 
     If velocities change by more than the tolerances, a drive jumps or bends between the stages. Scratch: `predicted_v`.
     """
-    n, order = settings[N], settings[ORDER]
-    state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
+    n, order = settings[at.N], settings[at.ORDER]
+    state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     for i in range(n * LANES):
         work[predicted * LANES + i] = work[new * LANES + i]
         work[predicted_v * LANES + i] = work[(new + n) * LANES + i]
     project_lanes(code, order, control, work)
-    if settings[CHECKS_REDUNDANT] == 1:
+    if settings[at.CHECKS_REDUNDANT] == 1:
         code.redundant(order, control, work)
     code.departure(order, control, work)
     for i in range(n * LANES):
         work[predicted_v * LANES + i] -= work[(new + n) * LANES + i]
     for j in range(n):
-        atol = control[ATOL + j]
-        raise_to_ratio(work, ERROR, predicted_v + j, RUNNING, state + n + j, new + n + j, atol, control[RTOL])
+        atol = control[at.ATOL + j]
+        raise_to_ratio(work, at.ERROR, predicted_v + j, at.RUNNING, state + n + j, new + n + j, atol, control[at.RTOL])
     for k in range(LANES):
-        work[ERROR * LANES + k] = max(work[ERROR * LANES + k], work[OFF * LANES + k])
+        work[at.ERROR * LANES + k] = max(work[at.ERROR * LANES + k], work[at.OFF * LANES + k])
 
 
 @merged
 def _accept_or_shorten(options, work, k):
     """Store the size of the next step in lane k in H_NEXT; return whether the last step in this lane is accepted."""
-    h, t, error = work[H * LANES + k], work[T * LANES + k], work[ERROR * LANES + k]
-    if work[FINE * LANES + k] == 0.0 or not np.isfinite(error):
-        work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
-        work[LIMIT_AGE * LANES + k] = 0.0
+    h, t, error = work[at.H * LANES + k], work[at.T * LANES + k], work[at.ERROR * LANES + k]
+    if work[at.FINE * LANES + k] == 0.0 or not np.isfinite(error):
+        work[at.H_NEXT * LANES + k], work[at.H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
+        work[at.LIMIT_AGE * LANES + k] = 0.0
         return False
     # where a force jumps, the error estimate may be small by chance: until ROUGH_TO, multiply the estimate by ROUGH
-    error_factor = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
+    error_factor = options[ROUGH] if t < work[at.ROUGH_TO * LANES + k] else 1.0
     is_accepted = error * error_factor <= 1.0
     if error > SUDDEN_ERROR and not is_accepted:
-        work[ROUGH_TO * LANES + k] = t + h
+        work[at.ROUGH_TO * LANES + k] = t + h
     error *= error_factor
     past = _history_view(work, k)
-    h_proposed = min(h * step_size_ratio(options, past, h, error), work[H_LIMIT * LANES + k])
+    h_proposed = min(h * step_size_ratio(options, past, h, error), work[at.H_LIMIT * LANES + k])
     if not is_accepted:
-        work[H_NEXT * LANES + k] = min(h_proposed, MAX_RATIO_AFTER_REJECTION * h)
+        work[at.H_NEXT * LANES + k] = min(h_proposed, MAX_RATIO_AFTER_REJECTION * h)
         return False
     record_accepted_step(options, past, h, error)
-    work[H_NEXT * LANES + k] = max(h_proposed, work[H_FREE * LANES + k]) if h < work[H_FREE * LANES + k] else h_proposed
-    work[LIMIT_AGE * LANES + k] += 1.0
-    if work[LIMIT_AGE * LANES + k] > LIMIT_MEMORY:
-        work[H_LIMIT * LANES + k] = np.inf
+    h_free = work[at.H_FREE * LANES + k]
+    work[at.H_NEXT * LANES + k] = max(h_proposed, h_free) if h < h_free else h_proposed
+    work[at.LIMIT_AGE * LANES + k] += 1.0
+    if work[at.LIMIT_AGE * LANES + k] > LIMIT_MEMORY:
+        work[at.H_LIMIT * LANES + k] = np.inf
     return True
 
 
@@ -201,22 +165,22 @@ def _accept_or_shorten(options, work, k):
 def judge_steps(options, work, n, a, start, status):
     """Set ACCEPTED according to ERROR and FINE; copy the final accelerations `a` of accepted steps to `start`."""
     for k in range(LANES):
-        work[ACCEPTED * LANES + k] = 0.0
-        if work[RUNNING * LANES + k] == 0.0:
+        work[at.ACCEPTED * LANES + k] = 0.0
+        if work[at.RUNNING * LANES + k] == 0.0:
             continue
         if _accept_or_shorten(options, work, k):
-            work[ACCEPTED * LANES + k] = 1.0
+            work[at.ACCEPTED * LANES + k] = 1.0
             for j in range(n):
                 work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
         else:
-            work[REFUSED * LANES + k] += 1.0
-            if work[REFUSED * LANES + k] > MAX_REJECTED:
-                remove_run(work, status, k, OFTEN_REFUSED if work[FINE * LANES + k] == 1.0 else NO_VALUES)
+            work[at.REFUSED * LANES + k] += 1.0
+            if work[at.REFUSED * LANES + k] > MAX_REJECTED:
+                remove_run(work, status, k, at.OFTEN_REFUSED if work[at.FINE * LANES + k] == 1.0 else at.NO_VALUES)
 
 
 def memory_size(s: int, n: int) -> int:
     """Return the length of the method's memory, in vectors, for s stages and n coordinates."""
-    return (SLOPES + s) * n
+    return (at.SLOPES + s) * n
 
 
 @kernel(STEP)
@@ -225,18 +189,18 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 
     With `within`, compute instead the states at the time X after the beginning of the last accepted step.
     """
-    n = settings[N]
-    state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
-    start = memory + START * n
+    n = settings[at.N]
+    state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
+    start = memory + at.START * n
     if not within:
         begin_control(options, control, work, n, state, a, start)
         choose_steps(work, control, status, n_steps)
-        copy_vectors(work, state, memory + BEGIN * n, 2 * n)
-        copy_vectors(work, start, memory + SLOPES * n, n)
-    code.stages(settings[ORDER], control, work)
+        copy_vectors(work, state, memory + at.BEGIN * n, 2 * n)
+        copy_vectors(work, start, memory + at.SLOPES * n, n)
+    code.stages(settings[at.ORDER], control, work)
     set_end(work, control)
     if not within:
-        end_steps(code, settings, control, work, memory + PREDICTED_V * n)
+        end_steps(code, settings, control, work, memory + at.PREDICTED_V * n)
         judge_steps(options, work, n, a, start, status)
 
 
@@ -246,24 +210,24 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
 
     With `within`, compute instead the states at the time X after the beginning of the last accepted step.
     """
-    order = settings[ORDER]
+    order = settings[at.ORDER]
     if within:
         for k in range(LANES):
-            work[X * LANES + k] = work[X * LANES + k] / work[UNIT * LANES + k]
+            work[at.X * LANES + k] = work[at.X * LANES + k] / work[at.UNIT * LANES + k]
         code.evaluate(order, control, work)
         return
     for k in range(LANES):  # end runs with too many steps: in stiff motion, any tolerance may need many
-        if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
-            remove_run(work, status, k, MANY_STEPS)
+        if work[at.RUNNING * LANES + k] == 1.0 and n_steps[int(work[at.RUN * LANES + k])] >= MOST_STEPS:
+            remove_run(work, status, k, at.MANY_STEPS)
     code.series(order, control, work)
     code.lengths(order, control, work)
     for k in range(LANES):  # count the evaluations of the defect within the step
-        if work[FINE * LANES + k] == 1.0 and work[H * LANES + k] > control[GAP]:
-            work[EVALUATED * LANES + k] = np.ceil(work[H * LANES + k] / control[GAP]) - 1.0
+        if work[at.FINE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
+            work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0
     code.check_within(order, control, work)
     code.evaluate(order, control, work)
     project_lanes(code, order, control, work)
-    if settings[CHECKS_REDUNDANT] == 1:
+    if settings[at.CHECKS_REDUNDANT] == 1:
         code.redundant(order, control, work)
     code.departure(order, control, work)
     code.defect(order, control, work)

@@ -12,27 +12,11 @@ differences, for all lanes at once. Offsets are those in `work`, see layout.py.
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, kernel, merged
+from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.control import LEAST, N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
 from twoloop.kernels.lanes.layout import (
-    ACCEPTED,
-    AHEAD,
-    ATOL,
-    ERROR,
-    EVALUATED,
-    FINE,
-    FRESH,
-    GAP,
     LANES,
-    N_NUMBERS,
-    N_ROWS,
-    ORDER,
-    RTOL,
-    RUNNING,
     STEP,
-    H,
-    N,
-    T,
-    X,
     add_product,
     copy_vectors,
     factor_matrices,
@@ -142,11 +126,11 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 
     The state is extrapolated from the beginning of the step, and its positions are moved towards the constraints.
     """
-    n, order = settings[N], settings[ORDER]
+    n, order = settings[at.N], settings[at.ORDER]
     node, begin = middle_node(c), vector_offset(memory, n, BEGIN_Q)
     for k in range(LANES):
-        x = node * work[X * LANES + k]
-        work[AHEAD * LANES + k] = work[T * LANES + k] + x
+        x = node * work[at.X * LANES + k]
+        work[at.AHEAD * LANES + k] = work[at.T * LANES + k] + x
         for j in range(n):
             index = (begin + j) * LANES + k
             q, v, a0 = work[index], work[index + n * LANES], work[index + 2 * n * LANES]
@@ -164,8 +148,8 @@ def compute_derivatives(code, settings, control, c, work):
 
     The middle is the time of a stage, because forces that act only between two stages must not affect the step.
     """
-    n, order = settings[N], settings[ORDER]
-    _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
+    n, order = settings[at.N], settings[at.ORDER]
+    _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
     _evaluate_middle_state(code, settings, control, c, work, new, a, memory)
     middle, middle_a = vector_offset(memory, n, MIDDLE_Q), vector_offset(memory, n, MIDDLE_A)
@@ -186,8 +170,8 @@ def compute_derivatives(code, settings, control, c, work):
 @compiled
 def factor_systems_of_lanes(settings, method_options, s, work):
     """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one l of each pair; X: step size."""
-    n = settings[N]
-    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    n = settings[at.N]
+    memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_index(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
@@ -199,7 +183,7 @@ def factor_systems_of_lanes(settings, method_options, s, work):
         for i in range(n * n):
             diagonal = 1.0 if i % (n + 1) == 0 else 0.0
             for k in range(LANES):
-                x = work[X * LANES + k]
+                x = work[at.X * LANES + k]
                 q, v = x * x * work[(by_q + i) * LANES + k], x * work[(by_v + i) * LANES + k]
                 work[(matrix + i) * LANES + k] = diagonal - (re * re - im * im) * q - re * v
                 work[(matrix + i) * LANES + k + apart] = -2.0 * re * im * q - im * v
@@ -214,14 +198,14 @@ def predict_stages(settings, c, work, begins):
     If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, the prediction is constant. `begins` is 1 if
     PREVIOUS belongs to the last step, and 0 if it belongs to this step.
     """
-    n = settings[N]
-    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    n = settings[at.N]
+    memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = c.size
     weights, stages = _weights_offset(memory, n, s), block_offset(memory, n, s, STAGES)
     previous, a = block_offset(memory, n, s, PREVIOUS), vector_offset(memory, n, BEGIN_A)
     for k in range(LANES):
         h_previous = work[(memory + H_PREVIOUS) * LANES + k]
-        ratio = work[X * LANES + k] / h_previous if h_previous > 0.0 else np.inf
+        ratio = work[at.X * LANES + k] / h_previous if h_previous > 0.0 else np.inf
         has_previous = 1.0 if ratio <= MAX_STEP_RATIO else 0.0
         work[(memory + CONSTANT) * LANES + k] = 1.0 - has_previous
         for j in range(s):
@@ -245,8 +229,8 @@ def predict_stages(settings, c, work, begins):
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
     """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations in STAGES; clear FINE in lanes with invalid values."""
-    n, order = settings[N], settings[ORDER]
-    _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
+    n, order = settings[at.N], settings[at.ORDER]
+    _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
     stages, sums = block_offset(memory, n, s, STAGES), vector_offset(memory, n, SUMS)
     begin, residual = vector_offset(memory, n, BEGIN_Q), block_offset(memory, n, s, RESIDUAL)
@@ -257,19 +241,19 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
         sum_rows(A2[j], stage_rows, total)
         for m in range(n):
             for k in range(LANES):
-                x, index = work[X * LANES + k], (begin + m) * LANES + k
+                x, index = work[at.X * LANES + k], (begin + m) * LANES + k
                 displacement = x * c[j] * work[index + n * LANES] + x * x * work[(sums + m) * LANES + k]
                 work[(new + m) * LANES + k] = work[index] + displacement
         sum_rows(A[j], stage_rows, total)
         for m in range(n):
             for k in range(LANES):
-                v = work[(begin + n + m) * LANES + k] + work[X * LANES + k] * work[(sums + m) * LANES + k]
+                v = work[(begin + n + m) * LANES + k] + work[at.X * LANES + k] * work[(sums + m) * LANES + k]
                 work[(new + n + m) * LANES + k] = v
                 index_of_scale_q, index_of_scale_v = (memory + SCALE_Q) * LANES + k, (memory + SCALE_V) * LANES + k
                 work[index_of_scale_q] = max(work[index_of_scale_q], abs(work[(new + m) * LANES + k]))
                 work[index_of_scale_v] = max(work[index_of_scale_v], abs(v))
         for k in range(LANES):
-            work[AHEAD * LANES + k] = work[T * LANES + k] + c[j] * work[X * LANES + k]
+            work[at.AHEAD * LANES + k] = work[at.T * LANES + k] + c[j] * work[at.X * LANES + k]
         code.accelerate(order, control, work)
         for i in range(n * LANES):
             work[(residual + j * n) * LANES + i] = work[a * LANES + i] - work[(stages + j * n) * LANES + i]
@@ -278,8 +262,8 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
 @compiled
 def _correct_stages(settings, method_options, s, work):
     """Store the corrections of the stage accelerations in CHANGES; add them to STAGES in lanes with ITERATING = 1."""
-    n = settings[N]
-    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    n = settings[at.N]
+    memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_index(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
@@ -319,8 +303,8 @@ def _raise_to_largest_value(work, target, begin, n):
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
     """Store in LARGEST_Q and LARGEST_V the largest changes of q and v by CHANGES, divided by X^2 and by X."""
-    n = settings[N]
-    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    n = settings[at.N]
+    memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = A.shape[0]
     sums, stage_rows = vector_offset(memory, n, SUMS), matrix_view(work, block_offset(memory, n, s, CHANGES), s, n)
     fill_field(work, memory + LARGEST_Q, 0.0)
@@ -335,13 +319,13 @@ def _store_largest_corrections(settings, A, A2, work):
 @merged
 def _has_iteration_ended(options, work, memory, iteration, k):
     """Set DONE to 1 if the iteration of lane k has converged, otherwise to 0; return whether the iteration ends."""
-    x, tolerance = work[X * LANES + k], options[N_HEAD + OUTER_TOL]
+    x, tolerance = work[at.X * LANES + k], options[N_HEAD + OUTER_TOL]
     rounding_limit = MAX_ROUNDING_CORRECTION * options[LEAST]
     change_v = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
     change_q = x * x * work[(memory + LARGEST_Q) * LANES + k] / work[(memory + SCALE_Q) * LANES + k]
     change, before = max(change_v, change_q), work[(memory + CHANGE_BEFORE) * LANES + k]
     work[(memory + CHANGE_BEFORE) * LANES + k] = change
-    if not np.isfinite(change_v + change_q) or work[FINE * LANES + k] == 0.0:
+    if not np.isfinite(change_v + change_q) or work[at.FINE * LANES + k] == 0.0:
         return True
     n_left = MAX_ITERATIONS - 1 - iteration
     contraction = change / before if iteration > 0 and before > 0.0 else 0.0
@@ -362,18 +346,18 @@ def _has_iteration_ended(options, work, memory, iteration, k):
 @compiled
 def solve_stages(code, settings, control, options, method_options, A, A2, c, work):
     """Solve for STAGES of a step of size X, from the prediction, in lanes with FINE = 1; clear FINE on divergence."""
-    n = settings[N]
-    memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    n = settings[at.N]
+    memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     iterating, done = memory + ITERATING, memory + DONE
     for k in range(LANES):
-        work[iterating * LANES + k] = work[FINE * LANES + k]
+        work[iterating * LANES + k] = work[at.FINE * LANES + k]
         work[done * LANES + k] = 0.0
     for iteration in range(MAX_ITERATIONS):
         n_left = 0.0
         for k in range(LANES):
-            work[FINE * LANES + k] = work[iterating * LANES + k]
+            work[at.FINE * LANES + k] = work[iterating * LANES + k]
             n_left += work[iterating * LANES + k]
-            work[EVALUATED * LANES + k] += c.size * work[iterating * LANES + k]
+            work[at.EVALUATED * LANES + k] += c.size * work[iterating * LANES + k]
         if n_left == 0.0:
             break
         _compute_residuals(code, settings, control, A, A2, c, work)
@@ -383,24 +367,24 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
             if work[iterating * LANES + k] == 1.0 and _has_iteration_ended(options, work, memory, iteration, k):
                 work[iterating * LANES + k] = 0.0
     for k in range(LANES):
-        work[FINE * LANES + k] = work[done * LANES + k]
+        work[at.FINE * LANES + k] = work[done * LANES + k]
 
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
     """Store the state at the time X after the beginning of the step in NEW, computed from STAGES."""
-    n = settings[N]
-    _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
+    n = settings[at.N]
+    _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
     begin, sums = vector_offset(memory, n, BEGIN_Q), vector_offset(memory, n, SUMS)
     stage_rows, total = matrix_view(work, block_offset(memory, n, s, STAGES), s, n), vector_range(work, sums, n)
     sum_rows(bA, stage_rows, total)
     for i in range(n * LANES):
-        x, index = work[X * LANES + i % LANES], begin * LANES + i
+        x, index = work[at.X * LANES + i % LANES], begin * LANES + i
         work[new * LANES + i] = work[index] + (x * work[index + n * LANES] + x * x * work[sums * LANES + i])
     sum_rows(b, stage_rows, total)
     for i in range(n * LANES):
-        x, index = work[X * LANES + i % LANES], (begin + n) * LANES + i
+        x, index = work[at.X * LANES + i % LANES], (begin + n) * LANES + i
         work[(new + n) * LANES + i] = work[index] + x * work[sums * LANES + i]
 
 
@@ -408,13 +392,13 @@ def store_state_from_stages(settings, b, bA, work):
 def _allowed_error(control, work, state, new, j, entry, k):
     """Return the allowed error in lane k of entry number `entry` of a state [q, v], which belongs to coordinate j."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
-    return control[ATOL + j] + control[RTOL] * magnitude
+    return control[at.ATOL + j] + control[at.RTOL] * magnitude
 
 
 @compiled
 def _store_embedded_estimate(settings, method_options, A, work, memory):
     """Store the unfiltered error estimate of the embedded formula in E_Q and E_V."""
-    n, s = settings[N], A.shape[0]
+    n, s = settings[at.N], A.shape[0]
     offset = newton_options_index(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
     stage_rows, begin = matrix_view(work, block_offset(memory, n, s, STAGES), s, n), vector_offset(memory, n, BEGIN_V)
@@ -427,10 +411,10 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
     for j in range(s):  # the velocity at stage j changes by H sum_k A_jk a_k from the beginning of the step
         sum_rows(A[j], stage_rows, vector_range(work, sums, n))
         for i in range(n * LANES):
-            work[e_q * LANES + i] += e[j] * work[H * LANES + i % LANES] * work[sums * LANES + i]
+            work[e_q * LANES + i] += e[j] * work[at.H * LANES + i % LANES] * work[sums * LANES + i]
     sum_rows(e, stage_rows, vector_range(work, sums, n))
     for i in range(n * LANES):
-        h = work[H * LANES + i % LANES]
+        h = work[at.H * LANES + i % LANES]
         work[e_q * LANES + i] *= h
         work[e_v * LANES + i] = h * (gamma0 * work[(begin + n) * LANES + i] + work[sums * LANES + i])
 
@@ -438,7 +422,7 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
 @compiled
 def _filter_errors(settings, method_options, s, work, memory):
     """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), with z = gamma0 H and the Jacobian J of (v, F) by (q, v)."""
-    n = settings[N]
+    n = settings[at.N]
     gamma0 = method_options[newton_options_index(s) + GAMMA0]
     e_q, e_v, scratch = vector_offset(memory, n, E_Q), vector_offset(memory, n, E_V), vector_offset(memory, n, COMPLEX)
     by_q = matrix_offset(memory, n, s, DERIVATIVE_Q)
@@ -447,12 +431,12 @@ def _filter_errors(settings, method_options, s, work, memory):
             total = 0.0
             for j in range(n):
                 total += work[(by_q + i * n + j) * LANES + k] * work[(e_q + j) * LANES + k]
-            work[(scratch + i) * LANES + k] = work[(e_v + i) * LANES + k] + gamma0 * work[H * LANES + k] * total
+            work[(scratch + i) * LANES + k] = work[(e_v + i) * LANES + k] + gamma0 * work[at.H * LANES + k] * total
     pivots = pivots_offset(memory, n, s, count_systems(method_options, s), 0)
     solve_systems(work, matrix_offset(memory, n, s, SYSTEMS), pivots, n, 0, scratch)
     copy_vectors(work, scratch, e_v, n)
     for i in range(n * LANES):
-        work[e_q * LANES + i] += gamma0 * work[H * LANES + i % LANES] * work[e_v * LANES + i]
+        work[e_q * LANES + i] += gamma0 * work[at.H * LANES + i % LANES] * work[e_v * LANES + i]
 
 
 @compiled
@@ -498,23 +482,23 @@ def _motion_time(control, work, n, memory, k):
     for j in range(n):
         largest_v = max(largest_v, abs(work[(begin + j) * LANES + k]))
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
-    max_time = LONGEST_GAPS * control[GAP]
+    max_time = LONGEST_GAPS * control[at.GAP]
     return largest_v / largest_a if largest_v < max_time * largest_a else max_time
 
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
     """Raise ERROR to the error caused by the slowly changing part of E_V, if that is larger, see newton_step.py."""
-    n = settings[N]
-    state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
+    n = settings[at.N]
+    state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
     has_large_error = False
     for k in range(LANES):
         error = 0.0
-        if work[ERROR * LANES + k] <= 1.0:
+        if work[at.ERROR * LANES + k] <= 1.0:
             motion_time = _motion_time(control, work, n, memory, k)
             error = _velocity_error(control, work, n, e_v, motion_time, state, new, k)
-        work[error_field * LANES + k], work[fine_copy * LANES + k] = error, work[FINE * LANES + k]
+        work[error_field * LANES + k], work[fine_copy * LANES + k] = error, work[at.FINE * LANES + k]
         has_large_error = has_large_error or error > 1.0
     if not has_large_error:
         return
@@ -522,7 +506,7 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
     matrix = matrix_offset(memory, n, s, SYSTEMS)
     for i in range(n * n):
         for k in range(LANES):
-            z = STEPS_TO_DECAY * work[H * LANES + k]
+            z = STEPS_TO_DECAY * work[at.H * LANES + k]
             entry = -z * z * work[(by_q + i) * LANES + k] - z * work[(by_v + i) * LANES + k]
             work[(matrix + i) * LANES + k] = entry + (1.0 if i % (n + 1) == 0 else 0.0)
     pivots = pivots_offset(memory, n, s, count_systems(method_options, s), 0)
@@ -530,39 +514,40 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
     solve_systems(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[error_field * LANES + k]
-        if work[FINE * LANES + k] == 1.0:  # in unstable motion, the filter may enlarge the error: use the smaller error
+        # in unstable motion, the filter may enlarge the error: use the smaller error
+        if work[at.FINE * LANES + k] == 1.0:
             motion_time = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, motion_time, state, new, k))
-        work[FINE * LANES + k] = work[fine_copy * LANES + k]
+        work[at.FINE * LANES + k] = work[fine_copy * LANES + k]
         if work[error_field * LANES + k] > 1.0:
-            work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
+            work[at.ERROR * LANES + k] = max(work[at.ERROR * LANES + k], error)
 
 
 @compiled
 def _estimate_error(settings, control, method_options, A, work):
     """Store in ERROR the error estimate of the step, in tolerances; filters suppress stiff components."""
-    n, s = settings[N], A.shape[0]
-    state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
+    n, s = settings[at.N], A.shape[0]
+    state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     offset = newton_options_index(s)
     e_q, e_v = vector_offset(memory, n, E_Q), vector_offset(memory, n, E_V)
     _store_embedded_estimate(settings, method_options, A, work, memory)
     copy_vectors(work, e_v, vector_offset(memory, n, UNFILTERED), n)
     _filter_errors(settings, method_options, s, work, memory)
     tests_velocities = method_options[offset + TESTS_VELOCITIES] == 1.0
-    fill_field(work, ERROR, 0.0)
+    fill_field(work, at.ERROR, 0.0)
     for j in range(n):
-        atol, rtol = control[ATOL + j], control[RTOL]
-        raise_to_ratio(work, ERROR, e_q + j, RUNNING, state + j, new + j, atol, rtol)
+        atol, rtol = control[at.ATOL + j], control[at.RTOL]
+        raise_to_ratio(work, at.ERROR, e_q + j, at.RUNNING, state + j, new + j, atol, rtol)
         if tests_velocities:
-            raise_to_ratio(work, ERROR, e_v + j, RUNNING, state + n + j, new + n + j, atol, rtol)
+            raise_to_ratio(work, at.ERROR, e_v + j, at.RUNNING, state + n + j, new + n + j, atol, rtol)
     if tests_velocities:
         return
     copy_vectors(work, e_v, vector_offset(memory, n, FILTERED_ONCE), n)
     _filter_errors(settings, method_options, s, work, memory)
     for k in range(LANES):
-        z = method_options[offset + GAMMA0] * work[H * LANES + k]
+        z = method_options[offset + GAMMA0] * work[at.H * LANES + k]
         error = _filtered_velocity_error(control, work, n, memory, z, state, new, k)
-        work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
+        work[at.ERROR * LANES + k] = max(work[at.ERROR * LANES + k], error)
     _add_error_in_slow_directions(settings, control, method_options, s, work)
 
 
@@ -571,8 +556,8 @@ def _store_stages(work, memory, n, s):
     """Copy STAGES of accepted steps to PREVIOUS, the basis of predictions for the next step and within this step."""
     stages, previous = block_offset(memory, n, s, STAGES), block_offset(memory, n, s, PREVIOUS)
     for k in range(LANES):
-        if work[ACCEPTED * LANES + k] == 1.0:
-            work[(memory + H_PREVIOUS) * LANES + k] = work[H * LANES + k]
+        if work[at.ACCEPTED * LANES + k] == 1.0:
+            work[(memory + H_PREVIOUS) * LANES + k] = work[at.H * LANES + k]
             for i in range(s * n):
                 work[(previous + i) * LANES + k] = work[(stages + i) * LANES + k]
 
@@ -583,15 +568,15 @@ def step_by_newton(code, settings, control, options, work, status, n_steps, with
 
     With `within`, compute instead the states at the time X after the beginning of the last accepted step.
     """
-    n = settings[N]
-    state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[N_ROWS], settings[N_NUMBERS])
+    n = settings[at.N]
+    state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     method_options = options[N_HEAD:]
     s, A, A2, b, bA, c = tableau_of(method_options)
     start, begin = vector_offset(memory, n, START), vector_offset(memory, n, BEGIN_Q)
     if not within:
         begin_control(options, control, work, n, state, a, start)
         for k in range(LANES):
-            if work[FRESH * LANES + k] == 1.0:
+            if work[at.FRESH * LANES + k] == 1.0:
                 work[(memory + H_PREVIOUS) * LANES + k] = work[(memory + DURATION) * LANES + k] = 0.0
         choose_steps(work, control, status, n_steps)
         copy_vectors(work, state, begin, 2 * n)

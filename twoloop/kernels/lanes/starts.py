@@ -16,22 +16,8 @@ from numba import types
 
 from twoloop.kernels.compile.callbacks import VECTOR, f8
 from twoloop.kernels.data.common import INTEGERS, KIT, compiled, kernel, merged
-from twoloop.kernels.data.indices import GAMMA_GIVEN
-from twoloop.kernels.lanes.layout import (
-    AHEAD,
-    CODE,
-    FINE,
-    LANES,
-    LEFT_TO_MOVE,
-    N_NUMBERS,
-    N_ROWS,
-    RUNNING,
-    T0,
-    N,
-    copy_vectors,
-    fill_field,
-    offsets_in_work,
-)
+from twoloop.kernels.lanes import layout as at
+from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, offsets_in_work
 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
@@ -292,47 +278,47 @@ def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
 @compiled
 def _gauss_newton(code, settings, control, pattern, moves, work):
     """Project the positions of NEW onto the constraints by Gauss-Newton steps; clear RUNNING where this fails."""
-    n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
-    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
+    n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
+    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     G, x, change, _, _, _, _, row, _, factors, _ = _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors
     for k in range(LANES):
-        work[LEFT_TO_MOVE * LANES + k] = work[RUNNING * LANES + k]
+        work[at.LEFT_TO_MOVE * LANES + k] = work[at.RUNNING * LANES + k]
     for _ in range(MAX_ITERATIONS):
-        fill_field(work, FINE, 1.0)
+        fill_field(work, at.FINE, 1.0)
         code.rows(0, control, work)
         factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
         copy_vectors(work, memory, x, n_rows)
         solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change)
         n_left = 0.0
         for k in range(LANES):
-            if work[LEFT_TO_MOVE * LANES + k] == 0.0:
+            if work[at.LEFT_TO_MOVE * LANES + k] == 0.0:
                 continue
-            if work[FINE * LANES + k] == 0.0 or not _largest_value(work, change, n, k) < np.inf:
-                work[LEFT_TO_MOVE * LANES + k] = work[RUNNING * LANES + k] = 0.0
+            if work[at.FINE * LANES + k] == 0.0 or not _largest_value(work, change, n, k) < np.inf:
+                work[at.LEFT_TO_MOVE * LANES + k] = work[at.RUNNING * LANES + k] = 0.0
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
             # the last change is applied, too, so that the result is as accurate as possible
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
-                work[LEFT_TO_MOVE * LANES + k] = 0.0
+                work[at.LEFT_TO_MOVE * LANES + k] = 0.0
             else:
                 n_left += 1.0
         if n_left == 0.0:
             return
     for k in range(LANES):
-        if work[LEFT_TO_MOVE * LANES + k] == 1.0:
-            work[RUNNING * LANES + k] = 0.0
+        if work[at.LEFT_TO_MOVE * LANES + k] == 1.0:
+            work[at.RUNNING * LANES + k] = 0.0
 
 
 @compiled
 def _project_velocities(code, settings, control, pattern, moves, work):
     """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at its positions."""
-    n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
-    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
+    n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
+    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     G, x, change, _, _, _, _, row, factors, _, _ = _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors
-    fill_field(work, FINE, 1.0)
+    fill_field(work, at.FINE, 1.0)
     code.rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
     for _ in range(2):  # the second pass removes the rounding errors of a large change
@@ -345,8 +331,8 @@ def _project_velocities(code, settings, control, pattern, moves, work):
         for j in range(n * LANES):
             work[(new + n) * LANES + j] += work[change * LANES + j]
     for k in range(LANES):
-        if work[FINE * LANES + k] == 0.0 or not _largest_value(work, new, 2 * n, k) < np.inf:
-            work[RUNNING * LANES + k] = 0.0
+        if work[at.FINE * LANES + k] == 0.0 or not _largest_value(work, new, 2 * n, k) < np.inf:
+            work[at.RUNNING * LANES + k] = 0.0
 
 
 @compiled
@@ -362,7 +348,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
     min_eigenvalue = MIN_EIGENVALUE if n_redundant == 0 else MAX_REDUNDANT_EIGENVALUE * n_rows
     for k in range(LANES):
         if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` is now the smallest eigenvalue
-            work[RUNNING * LANES + k] = 0.0
+            work[at.RUNNING * LANES + k] = 0.0
         factor = _largest_value(work, correction, n, k) / max(_largest_value(work, weakest, n, k), DIAGONAL_SHIFT)
         for j in range(n):
             work[(weakest + j) * LANES + k] *= factor
@@ -371,8 +357,8 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
 @compiled
 def _check_other_guesses(code, settings, control, pattern, moves, work):
     """Clear RUNNING in lanes in which another guess has a projection far from its linear prediction by C_q."""
-    n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
-    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[N_NUMBERS])
+    n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
+    _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     _, x, change, nearest, correction, weakest, displacement, _, factors, _, _ = _memory_offsets(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
@@ -396,7 +382,7 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
                 expected = work[nearest * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
                 distance = max(distance, abs(work[new * LANES + m] - expected))
             if not distance <= MAX_CURVATURE * _largest_value(work, displacement, n, k) + rounding:
-                work[RUNNING * LANES + k] = 0.0
+                work[at.RUNNING * LANES + k] = 0.0
 
 
 _START_SIGNATURE = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.float64[:, ::1]] * 3, INTEGERS, VECTOR)
@@ -409,18 +395,18 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
     `fine` (n_runs,) becomes 1 for runs whose projection succeeds, otherwise 0. pattern : sparsity pattern of G, see
     module docstring; moves : (n,) 1 for coordinates that may change; numbers : (n_runs, n_numbers) data of the code.
     """
-    n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
+    n, n_rows, n_redundant, n_runs = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = offsets_in_work(n, n_rows, numbers.shape[1])
     _, _, _, nearest_positions, change_from_guess, _, _, row, _, _, _ = _memory_offsets(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
-    fill_field(work, AHEAD, control[T0])
+    fill_field(work, at.AHEAD, control[at.T0])
     for j in range(n):
         fill_field(work, memory + row + j, 0.0)
     for first in range(0, n_runs, LANES):
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
-            work[RUNNING * LANES + k] = 1.0
+            work[at.RUNNING * LANES + k] = 1.0
             for j in range(n):
                 work[(new + j) * LANES + k], work[(new + n + j) * LANES + k] = q[run, j], v[run, j]
             for i in range(numbers.shape[1]):
@@ -434,7 +420,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
                 work[(memory + change_from_guess + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
         _check_other_guesses(code, settings, control, pattern, moves, work)
         for k in range(min(LANES, n_runs - first)):
-            fine[first + k] = int(work[RUNNING * LANES + k])
+            fine[first + k] = int(work[at.RUNNING * LANES + k])
             for j in range(n):
                 q[first + k, j] = work[(memory + nearest_positions + j) * LANES + k]
                 v[first + k, j] = work[(new + n + j) * LANES + k]
@@ -475,7 +461,7 @@ def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states
     )
     offset += 3 * n_c
     q, v, last = scratch[offset : offset + n], scratch[offset + n : offset + 2 * n], states_q.shape[2] - 1
-    has_gamma = f.flags[GAMMA_GIVEN] == 1
+    has_gamma = f.gamma_given == 1
     for k in range(runs.size):
         if runs[k] < 0:
             continue

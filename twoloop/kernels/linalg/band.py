@@ -16,7 +16,7 @@ from numba.extending import get_cython_function_address, intrinsic
 
 from twoloop.kernels.compile.linking import cgutils
 from twoloop.kernels.data.common import compiled, inlined, merged
-from twoloop.kernels.data.indices import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFINITE, SINGULAR
+from twoloop.kernels.data.indices import DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
 # names of LAPACK routines, and their indices in `lapack_addresses`: Cholesky factorization of a banded matrix (dpbtrf),
@@ -30,10 +30,7 @@ UPPER, NO_TRANSPOSE = ord("U"), ord("N")
 def lapack_addresses() -> list[int]:
     """Return the addresses of the ROUTINES in this process.
 
-    Raises
-    ------
-    ImportError
-        If SciPy's LAPACK does not use 32-bit integers.
+    Raises ImportError if SciPy's LAPACK does not use 32-bit integers.
     """
     for name in ROUTINES:
         signature = repr(scipy.linalg.cython_lapack.__pyx_capi__[name])
@@ -83,7 +80,7 @@ def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
 @merged
 def has_banded_mass(f):
     """Return whether M is factored as a banded matrix; False if M is diagonal, because divisions are faster."""
-    return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
+    return f.bandwidth >= 0 and f.diagonal_mass == 0
 
 
 @inlined
@@ -104,7 +101,7 @@ def _mass_diagonals(w, b):
 def factor_banded_mass(f, w):
     """Store the Cholesky factor and the diagonals of w.M in w.L; return DONE or MASS_NOT_DEFINITE."""
     n = w.Q.size
-    b = f.flags[BANDWIDTH]
+    b = f.bandwidth
     band = _mass_band(w, b)
     for j in range(n):
         for i in range(max(0, j - b), j + 1):
@@ -120,7 +117,7 @@ def factor_banded_mass(f, w):
 def solve_banded_mass(f, w, x):
     """Replace x (n_q) by M^-1 x, with the Cholesky factor that `factor_banded_mass` stored."""
     n = w.Q.size
-    b = f.flags[BANDWIDTH]
+    b = f.bandwidth
     call_lapack(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))
 
 
@@ -130,9 +127,9 @@ def add_banded_mass_times(f, w, x, y):
     n = w.Q.size
     for i in range(n):
         y[i] += w.M[i, i] * x[i]
-    if f.flags[DIAGONAL_MASS] == 1:
+    if f.diagonal_mass == 1:
         return
-    b = f.flags[BANDWIDTH]
+    b = f.bandwidth
     diagonals = _mass_diagonals(w, b)
     for k in range(1, b + 1):
         for i in range(n - k):

@@ -4,7 +4,7 @@
   columns of T = [I; D^T], D^T = -G_d^-1 G_i, are the velocities that the constraints allow. x is the solution of
   (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
 - MULTIPLIERS: by the Schur complement G M^-1 G^T.
-- AUGMENTED: by sparse factors of the augmented matrix [M G^T; G 0], in which M is multiplied by w.notes[MASS_SCALE].
+- AUGMENTED: by sparse factors of the augmented matrix [M G^T; G 0], in which M is multiplied by w.mass_scale.
 """
 
 import numpy as np
@@ -12,16 +12,9 @@ import numpy as np
 from twoloop.kernels.data.common import compiled, finite, merged
 from twoloop.kernels.data.indices import (
     AUGMENTED,
-    CONSTANT_MASS,
-    DENSE_FORM,
-    DIAGONAL_MASS,
     DONE,
-    FACTORED,
-    FORM,
     MASS_NOT_DEFINITE,
-    MASS_SCALE,
     MULTIPLIERS,
-    N_FACTORIZATIONS,
     NOT_FINITE,
     NULL_SPACE,
     SINGULAR,
@@ -103,11 +96,11 @@ def _reduce_dense_mass(columns, independent, M, D, A, MT):
 def factor_reduced_mass(f, w):
     """Store in w.A the LDL factors of T^T M T, computed from w.M and w.D; return a code."""
     columns = columns_of(w.index_v)
-    if f.flags[DIAGONAL_MASS] == 1:
+    if f.diagonal_mass == 1:
         _reduce_diagonal_mass(columns, w.independent_v, w.M, w.D, w.A, w.x)
     else:
         _reduce_dense_mass(columns, w.independent_v, w.M, w.D, w.A, w.MT)
-    w.counters[N_FACTORIZATIONS] += 1
+    w.n_factorizations += 1
     if ldl_factor(w.A):
         return DONE
     return MASS_NOT_DEFINITE if finite(w.M) and finite(w.D) else NOT_FINITE
@@ -125,7 +118,7 @@ def solve_by_reduced_mass(f, w, r, c, a):
     # `a` becomes r - M g, where g has the dependent entries z, and zero independent entries
     for k in range(columns.size):
         column = columns[k]
-        if f.flags[DIAGONAL_MASS] == 1:
+        if f.diagonal_mass == 1:
             a[column] -= M[column, column] * z[k]
         else:
             for j in range(a.size):
@@ -152,7 +145,7 @@ def multipliers_by_elimination(f, w, r, a, lam):
     for k in range(columns.size):
         column = columns[k]
         total = r[column]
-        if f.flags[DIAGONAL_MASS] == 1:
+        if f.diagonal_mass == 1:
             total -= w.M[column, column] * a[column]
         else:
             for j in range(a.size):
@@ -173,7 +166,7 @@ def factor_mass(f, w):
         is_definite = factor_banded_mass(f, w) == DONE
     else:
         copy_matrix(w.M, w.L)
-        is_definite = invert_definite(w.L) if f.flags[CONSTANT_MASS] == 1 else ldl_factor(w.L)
+        is_definite = invert_definite(w.L) if f.constant_mass == 1 else ldl_factor(w.L)
     if is_definite:
         return DONE
     return MASS_NOT_DEFINITE if finite(w.M) else NOT_FINITE
@@ -183,10 +176,10 @@ def factor_mass(f, w):
 def _apply_inverse_mass(f, w, x, y):
     """Store M^-1 x in y, by w.L; x and y may be the same array unless M is constant, dense and not diagonal."""
     n = x.size
-    if f.flags[DIAGONAL_MASS] == 1:
+    if f.diagonal_mass == 1:
         for i in range(n):
             y[i] = x[i] * w.L[i, i]
-    elif f.flags[CONSTANT_MASS] == 1 and not has_banded_mass(f):
+    elif f.constant_mass == 1 and not has_banded_mass(f):
         for i in range(n):
             total = 0.0
             for j in range(n):
@@ -212,7 +205,7 @@ def _is_equal(A, B):
 @merged
 def factor_schur_complement(f, w):
     """Store in w.S the factors of S = G M^-1 G^T (G: independent rows), unless G and M are unchanged; return a code."""
-    is_constant = f.flags[CONSTANT_MASS] == 1
+    is_constant = f.constant_mass == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
     rows = w.rows_v
@@ -225,7 +218,7 @@ def factor_schur_complement(f, w):
             for j in range(w.Q.size):
                 total += w.G[rows[i], j] * M_inverse_G[k, j]
             S[i, k] = total
-    w.counters[N_FACTORIZATIONS] += 1
+    w.n_factorizations += 1
     if rows.size > 0:
         w.G_of_S[0, 0] = np.nan
     if not ldl_factor(S):
@@ -280,7 +273,7 @@ def _write_augmented_program(w):
     clear_lists(index, n + rows.size)
     matrix = views_of_lists(index, values)
     scale = 2.0 ** np.round(np.log2(_largest_entry(w.G) / _largest_entry(w.M))) if rows.size > 0 else 1.0
-    w.notes[MASS_SCALE] = scale
+    w.mass_scale = scale
     for i in range(n):
         for j in range(n):
             source = w.entries.size + i * n + j
@@ -298,7 +291,7 @@ def _write_augmented_program(w):
 @compiled
 def _run_augmented_program(w):
     """Store the factors of the augmented matrix in w.values_a; return False if the program does not suit it."""
-    index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
+    index, values, scale, first_of_mass = w.index_a, w.values_a, w.mass_scale, w.entries.size
     source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
         entry = index[source + s]
@@ -308,15 +301,15 @@ def _run_augmented_program(w):
 
 @compiled
 def factor_augmented(f, w):
-    """Factor the augmented matrix; if its factors are not sparse, set f.flags[FORM] to a dense form; return a code."""
-    w.counters[N_FACTORIZATIONS] += 1
-    has_new_entry = f.flags[CONSTANT_MASS] == 0 and update_pattern(w.M, w.mass_pattern)
+    """Factor the augmented matrix; if its factors are not sparse, set f.form to a dense form; return a code."""
+    w.n_factorizations += 1
+    has_new_entry = f.constant_mass == 0 and update_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or has_new_entry or not _run_augmented_program(w):
         if not finite(w.M):
             return NOT_FINITE
         ordering_code = _write_augmented_program(w)
         if ordering_code == at.TOO_MANY_ENTRIES:
-            f.flags[FORM] = f.flags[DENSE_FORM]
+            f.form = f.dense_form
             return DONE
         if ordering_code != at.ORDER_CHOSEN or not _run_augmented_program(w):
             w.index_a[at.SIZE] = 0
@@ -329,7 +322,7 @@ def factor_augmented(f, w):
 @compiled
 def solve_augmented(w, r, c, a):
     """Store the accelerations in `a` and the multipliers of the independent rows in w.z, by the sparse factors."""
-    n, size, scale = r.size, w.index_a[at.SIZE], w.notes[MASS_SCALE]
+    n, size, scale = r.size, w.index_a[at.SIZE], w.mass_scale
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
         x[j] = scale * r[j]
@@ -351,9 +344,9 @@ def solve_augmented(w, r, c, a):
 def _factor_augmented_or_dense(f, w):
     """Factor the augmented matrix; if a dense form replaces this form, store w.D or the factors of M; return a code."""
     code = factor_augmented(f, w)
-    if code == DONE and f.flags[FORM] == NULL_SPACE:
+    if code == DONE and f.form == NULL_SPACE:
         find_null_space(w)
-    elif code == DONE and f.flags[FORM] == MULTIPLIERS and f.flags[CONSTANT_MASS] == 1:
+    elif code == DONE and f.form == MULTIPLIERS and f.constant_mass == 1:
         code = factor_mass(f, w)
     return code
 
@@ -361,28 +354,28 @@ def _factor_augmented_or_dense(f, w):
 @merged
 def factor(f, w):
     """Factor the equations of the accelerations, from w.M, w.D, the rows of G and their factors; return a code."""
-    if w.notes[FACTORED] == 1.0:
+    if w.factored == 1.0:
         return DONE
-    code = _factor_augmented_or_dense(f, w) if f.flags[FORM] == AUGMENTED else DONE
-    if code == DONE and f.flags[FORM] == NULL_SPACE:
+    code = _factor_augmented_or_dense(f, w) if f.form == AUGMENTED else DONE
+    if code == DONE and f.form == NULL_SPACE:
         code = factor_reduced_mass(f, w)
-    elif code == DONE and f.flags[FORM] == MULTIPLIERS:
-        if f.flags[CONSTANT_MASS] == 0:
-            w.counters[N_FACTORIZATIONS] += 1
+    elif code == DONE and f.form == MULTIPLIERS:
+        if f.constant_mass == 0:
+            w.n_factorizations += 1
             code = factor_mass(f, w)
         if code == DONE:
             code = factor_schur_complement(f, w)
     if code == DONE:
-        w.notes[FACTORED] = 1.0
+        w.factored = 1.0
     return code
 
 
 @merged
 def solve(f, w, r, c, a):
     """Store in `a` the accelerations with M a + G^T lam = r and G a = c; r, c and `a` must be different arrays."""
-    if f.flags[FORM] == NULL_SPACE:
+    if f.form == NULL_SPACE:
         solve_by_reduced_mass(f, w, r, c, a)
-    elif f.flags[FORM] == MULTIPLIERS:
+    elif f.form == MULTIPLIERS:
         solve_by_schur_complement(f, w, r, c, a)
     else:
         solve_augmented(w, r, c, a)
@@ -391,7 +384,7 @@ def solve(f, w, r, c, a):
 @merged
 def multipliers(f, w, r, a, lam):
     """Store in lam the multipliers of the independent rows for the last solution `a`; leave the other entries."""
-    if f.flags[FORM] == NULL_SPACE:
+    if f.form == NULL_SPACE:
         multipliers_by_elimination(f, w, r, a, lam)
     else:
         for i in range(w.rows_v.size):

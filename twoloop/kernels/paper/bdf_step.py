@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.control.step_size import departure
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
-from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.paper.iterations import iterate_accelerations
@@ -167,7 +167,7 @@ def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
     copy(rate[n:], a1)
     last_change = np.inf
     for iteration in range(MAX_ITERATIONS):
-        w.counters[N_OUTER] += 1
+        w.n_outer += 1
         for m in w.independent:
             v1[m] = prediction[n + m] + c * (a1[m] - rate[n + m])
             q1[m] = prediction[m] + c * (v1[m] - rate[m])
@@ -265,27 +265,15 @@ def _update_differences(memory, trial, y1, d):
 def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     """Compute a step of the Gauss method of order 6, to fill the history if the step size is fixed; return a code."""
     s, n = STARTER_STAGES, w.Q.size
-    q1, v1 = new_state[:n], new_state[n : 2 * n]
+    q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
+    own_options, no_rounding = options[N_OPTION_SCALARS:], scratch[:0].reshape((0, n))
     A_stage = scratch[: s * n].reshape((s, n))
     Q_stage = scratch[s * n : 2 * s * n].reshape((s, n))
     V_stage = scratch[2 * s * n : 3 * s * n].reshape((s, n))
     for j in range(s):
         copy(state[2 * n : 3 * n], A_stage[j])
     code, _ = iterate_accelerations(
-        f,
-        w,
-        options[N_OPTION_SCALARS:],
-        tolerances,
-        t,
-        h,
-        state[:n],
-        state[n : 2 * n],
-        A_stage,
-        Q_stage,
-        V_stage,
-        q1,
-        v1,
-        scratch[:0].reshape((0, n)),
+        f, w, own_options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, no_rounding
     )
     if code == DONE:
         code = accelerations(f, w, t + h, q1, v1, new_state[2 * n : 3 * n], new_state[3 * n :])

@@ -15,6 +15,7 @@ from twoloop.kernels.paper.iterations import (
     memory_block,
     memory_vector,
     rounding_errors_of,
+    step_views,
     store_rounding_errors,
 )
 from twoloop.kernels.steps.stages import (
@@ -57,12 +58,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     previous = memory_block(memory, s, n, at.A_PREVIOUS)
-    trial = memory_block(memory, s, n, at.A_TRIAL)
-    half = memory_block(memory, s, n, at.A_HALF)
-    Q_stage = memory_block(memory, s, n, at.Q_STAGE)
-    V_stage = memory_block(memory, s, n, at.V_STAGE)
-    q_full, v_full = memory_vector(memory, s, n, at.Q_FULL), memory_vector(memory, s, n, at.V_FULL)
-    q_mid, v_mid = memory_vector(memory, s, n, at.Q_MID), memory_vector(memory, s, n, at.V_MID)
+    trial, half, Q_stage, V_stage, q_full, v_full, q_mid, v_mid = step_views(memory, s, n)
     weights = memory[memory.size - s :]
     rounding = rounding_errors_of(memory, s, n, tolerances)
     ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
@@ -123,12 +119,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    A_stage = memory_block(memory, s, n, at.A_TRIAL)
-    A_full = memory_block(memory, s, n, at.A_HALF)
-    Q_stage = memory_block(memory, s, n, at.Q_STAGE)
-    V_stage = memory_block(memory, s, n, at.V_STAGE)
-    q_full, v_full = memory_vector(memory, s, n, at.Q_FULL), memory_vector(memory, s, n, at.V_FULL)
-    q_mid, v_mid = memory_vector(memory, s, n, at.Q_MID), memory_vector(memory, s, n, at.V_MID)
+    A_stage, A_full, Q_stage, V_stage, q_full, v_full, q_mid, v_mid = step_views(memory, s, n)
     a_mid = memory_vector(memory, s, n, at.A_MID)
     q_old, v_old = memory_vector(memory, s, n, at.Q_OLD), memory_vector(memory, s, n, at.V_OLD)
     code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)

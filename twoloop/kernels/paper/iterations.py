@@ -11,7 +11,7 @@ import numpy as np
 
 from twoloop.kernels.control.step_size import project_prediction
 from twoloop.kernels.data.common import compiled, exact, inlined, merged
-from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
@@ -44,6 +44,21 @@ def memory_vector(memory, s, n, which):
     """Return a view (n) of the vector with the index `which`, such as Q_FULL, in `memory`."""
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
     return memory[start : start + n]
+
+
+@inlined
+def step_views(memory, s, n):
+    """Return views of `memory`: the blocks A_TRIAL, A_HALF, Q_STAGE and V_STAGE, the vectors Q_FULL to V_MID."""
+    return (
+        memory_block(memory, s, n, A_TRIAL),
+        memory_block(memory, s, n, A_HALF),
+        memory_block(memory, s, n, Q_STAGE),
+        memory_block(memory, s, n, V_STAGE),
+        memory_vector(memory, s, n, Q_FULL),
+        memory_vector(memory, s, n, V_FULL),
+        memory_vector(memory, s, n, Q_MID),
+        memory_vector(memory, s, n, V_MID),
+    )
 
 
 @inlined
@@ -125,7 +140,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     last_change = np.inf
     convergence = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
-        w.counters[N_OUTER] += 1
+        w.n_outer += 1
         # all stages are computed before any is evaluated: in Gauss-Seidel order, convergence requires a smaller h
         for j in range(s):
             for m in w.independent:
@@ -203,7 +218,7 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
         copy(q1, Q_stage[j])
     norm_before = np.inf
     for _ in range(MAX_ITERATIONS_PAPER):
-        w.counters[N_OUTER] += 1
+        w.n_outer += 1
         for j in range(s):
             for m in w.independent:
                 sum_q = 0.0

@@ -4,7 +4,7 @@ import numpy as np
 
 from twoloop.kernels.control.step_size import commit_nothing, departure
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
-from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, N_OUTER, OUTER_DIVERGED, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
@@ -78,7 +78,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
         q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # start values of Newton's method for dependent coordinates
     last_change = np.inf
     for _ in range(MAX_ITERATIONS):
-        w.counters[N_OUTER] += 1
+        w.n_outer += 1
         for m in w.independent:
             q1[m] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
             v1[m] = v[m] + h * ((1.0 - gamma) * a[m] + gamma * a1[m])

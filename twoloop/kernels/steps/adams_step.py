@@ -17,7 +17,7 @@ import numpy as np
 
 from twoloop.kernels.control.step_size import departure, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined, kernel, merged
-from twoloop.kernels.data.indices import ATOL, DONE, N_OUTER, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 
 HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES is exact up to order 13
@@ -289,7 +289,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if memory[DEPTH] == 0.0:
         _begin_history(memory, n, state)
     k = int(memory[ORDER])
-    w.counters[N_OUTER] += 1
+    w.n_outer += 1
     old, new = _difference_table(memory, n, memory[CURRENT]), _difference_table(memory, n, 1.0 - memory[CURRENT])
     _compute_coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)

@@ -21,23 +21,10 @@ import numpy as np
 from twoloop.kernels.control.singular_positions import MAX_NEAR_RATIO, MIN_NEAR_RATIO, near_pivot_ratio
 from twoloop.kernels.control.step_size import commit_nothing, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, kernel, merged
-from twoloop.kernels.data.indices import (
-    ATOL,
-    BY_GENERAL,
-    DONE,
-    ESTIMATE,
-    GAP,
-    N_OUTER,
-    ORIENTATION,
-    ORIENTATION_NEW,
-    OUTER_DIVERGED,
-    PIVOT,
-    RTOL,
-    SINGULAR,
-    STRAIGHT,
-)
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, OUTER_DIVERGED, RTOL, SINGULAR
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
+from twoloop.kernels.steps.stages import lagrange_values
 
 # indices of the scalars in `options`, followed by A, A @ A and Legendre coefficients (S, S each), b, b @ A, c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
@@ -210,7 +197,7 @@ def _choose_partition_at_end(f, w, t, q, pivot, min_node_pivot):
     beginning of the step; `min_node_pivot` is the pivot below which nodes are left out.
     """
     code = renew_partition(f, w, t, q)
-    if code == DONE and w.notes[PIVOT] < max(MIN_PIVOT_RATIO * pivot, min(END_MARGIN * min_node_pivot, pivot)):
+    if code == DONE and w.pivot < max(MIN_PIVOT_RATIO * pivot, min(END_MARGIN * min_node_pivot, pivot)):
         return SINGULAR
     return code
 
@@ -287,10 +274,10 @@ def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, ne
     copy(stage[0], q1)
     copy(stage[1], v1)
     code = renew_partition(f, w, t, q1)
-    is_determined = code == DONE and w.notes[PIVOT] >= min_node_pivot
+    is_determined = code == DONE and w.pivot >= min_node_pivot
     if code == DONE:
         store_prediction(w, q1)
-        w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
+        w.orientation_new = w.orientation
         code = evaluate_state(f, w, t, q1, v1, options[INNER_TOL], a1, lam1)
     if min_node_pivot > 0.0 and not (is_determined and code == DONE):
         if code != DONE:
@@ -314,18 +301,11 @@ def state_at(memory, options, t):
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
     fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
     # values of the Lagrange polynomials at the Gauss nodes of the interval from the beginning to t, and at t
-    weights = np.array([_lagrange_values(c, x) for x in (*(fraction * c), fraction)])
+    weights = np.array([lagrange_values(c, x) for x in (*(fraction * c), fraction)])
     weights_v = fraction * b @ weights[:-1]
     weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
     q, v = q_0 + duration * (fraction * v_0 + duration * (weights_q @ a)), v_0 + duration * (weights_v @ a)
     return np.concatenate([q, v, weights[-1] @ a])
-
-
-def _lagrange_values(c, x):
-    """Return the values (S) at x of the Lagrange polynomials of the nodes c (S)."""
-    factors = (x - c) / (c[:, None] - c + np.eye(S))
-    np.fill_diagonal(factors, 1.0)
-    return factors.prod(axis=1)
 
 
 @kernel(ATTEMPT)
@@ -340,7 +320,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     left_out, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
-    is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.flags[STRAIGHT] == 1
+    is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.straight == 1
     min_node_pivot, duration = MIN_NEAR_RATIO, h
     q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
     if is_estimated:
@@ -363,9 +343,9 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n_before_base = 0  # number of nodes before the state `base`
     while n_before_base < S and c[n_before_base] < c_base:
         n_before_base += 1
-    w.counters[N_OUTER] += 1
+    w.n_outer += 1
     code = renew_partition(f, w, t, q)
-    pivot = w.notes[PIVOT] if code == DONE else 0.0
+    pivot = w.pivot if code == DONE else 0.0
     for j in range(S):
         copy(state[2 * n : 3 * n], a[j])
     left_out[:] = 0.0
@@ -398,8 +378,8 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 code = renew_partition(f, w, time, q_stage)
                 left_out[j] = 0.0
                 if code == DONE:  # in a run that begins near a singular position, earlier pivots may all be small
-                    largest_pivot = max(largest_pivot, w.notes[PIVOT])
-                if is_estimated and (code != DONE or w.notes[PIVOT] < min_node_pivot * largest_pivot):
+                    largest_pivot = max(largest_pivot, w.pivot)
+                if is_estimated and (code != DONE or w.pivot < min_node_pivot * largest_pivot):
                     left_out[j], code = 1.0, DONE
             elif renews_partition and left_out[j] == 0.0:
                 code = renew_partition(f, w, time, q_stage)
@@ -410,7 +390,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             while True:
                 if code == DONE:
                     code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
-                if renews_partition or w.notes[BY_GENERAL] == 0.0:
+                if renews_partition or w.by_general == 0.0:
                     break
                 # pivots of the generated code were too small, and the general code used the partition of another
                 # stage: repeat the projection with a partition chosen at this stage

@@ -24,21 +24,7 @@ import numpy as np
 
 from twoloop.kernels.control.step_size import departure, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
-from twoloop.kernels.data.indices import (
-    BANDWIDTH,
-    DONE,
-    ESTIMATE,
-    FORCE_BY_Q_GIVEN,
-    FORCE_BY_V_GIVEN,
-    FORM,
-    GENERATION,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
-    N_OUTER,
-    OUTER_DIVERGED,
-    SINGULAR,
-    STATIC,
-)
+from twoloop.kernels.data.indices import DONE, ESTIMATE, OUTER_DIVERGED, SINGULAR, STATIC
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
 from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.steps import stages as at
@@ -53,18 +39,7 @@ from twoloop.kernels.steps.newton_systems import (
     filter_error,
     reduce_to_independents,
 )
-from twoloop.kernels.steps.stages import (
-    DIAGONAL_OFFSET,
-    INNER_TOL,
-    NEWTON_OFFSET,
-    OUTER_TOL,
-    STAGES,
-    as_matrix,
-    block,
-    matrix_storage,
-    pivots_of,
-    vector,
-)
+from twoloop.kernels.steps.stages import as_matrix, block, matrix_storage, pivots_of, vector
 from twoloop.kernels.steps.velocity_errors import (
     STEPS_TO_DECAY,
     derivatives_agree,
@@ -111,7 +86,7 @@ def factor_newton_matrix(w, memory, z):
     n, m = w.Q.size, w.independent.size
     storage = matrix_storage(w, n, at.FILTER)
     H = as_matrix(storage, m)
-    w.counters[N_FACTORIZATIONS] += 1
+    w.n_factorizations += 1
     _fill_newton_matrix(w, memory, n, m, z, storage)
     memory[at.IS_SYMMETRIC] = 0.0
     if _is_symmetric(H):
@@ -131,7 +106,7 @@ def compute_and_factor_matrix(f, w, memory, t, q, v, z):
     """
     n = q.size
     m = w.independent.size
-    w.counters[N_JACOBIANS] += 1
+    w.n_jacobians += 1
     storage = matrix_storage(w, n, at.FILTER)
     K, R = storage.reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
     AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
@@ -141,7 +116,7 @@ def compute_and_factor_matrix(f, w, memory, t, q, v, z):
     if code != DONE:
         return code
     reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m))
-    memory[at.HAS_DAMPING] = f.flags[FORCE_BY_V_GIVEN]
+    memory[at.HAS_DAMPING] = f.force_by_v_given
     code = fill_tangent_by_v(f, t, q, v, n - 1, K)
     if code != DONE:
         return code
@@ -219,8 +194,8 @@ def stage_views(memory, s, n):
 @merged
 def gamma_of(options):
     """Return gamma, the diagonal entry of A (s, s) in all rows but the first."""
-    s = int(options[DIAGONAL_OFFSET])
-    return options[DIAGONAL_OFFSET + s * s]
+    s = int(options[at.DIAGONAL_OFFSET])
+    return options[at.DIAGONAL_OFFSET + s * s]
 
 
 @merged
@@ -234,24 +209,19 @@ def _set_stage_state(z, q_bar, v_bar, a, Q, V):
 @merged
 def has_dense_tangents(f, w):
     """Return whether every iteration of Newton's method factors a new dense matrix T^T (M - z^2 K - z D) T."""
-    return (
-        f.flags[FORCE_BY_Q_GIVEN] == 1
-        and f.flags[BANDWIDTH] < 0
-        and w.Rate.size == w.C.size
-        and f.flags[FORM] != STATIC
-    )
+    return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != STATIC
 
 
 @merged
 def stages_at_once(options):
     """Return the number of stages solved at once, 1; for a literal 1, numba would compile newton_systems.py again."""
-    return int(options[STAGES])
+    return int(options[at.STAGES])
 
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
     """Update the derivatives at (t, Q, V), with accelerations F, and the factors, unless still valid; return a code."""
-    if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
+    if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
         memory[at.IS_FRESH] = 1.0
@@ -279,12 +249,12 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     residual = block(memory, 1, n, at.RESIDUAL)
     a = A_stage[0]
-    has_tangents = f.flags[FORCE_BY_Q_GIVEN] == 1
+    has_tangents = f.force_by_q_given == 1
     last_change = 0.0
     for iteration in range(MAX_ITERATIONS):
-        w.counters[N_OUTER] += 1
+        w.n_outer += 1
         _set_stage_state(z, q_bar, v_bar, a, Q, V)
-        code = evaluate(f, w, t, Q, V, options[INNER_TOL], F)
+        code = evaluate(f, w, t, Q, V, options[at.INNER_TOL], F)
         if code != DONE:
             return code
         scale_q, scale_v = 1.0, 1.0
@@ -313,13 +283,13 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if iteration > 0 and last_change > 0.0:
             contraction = change / last_change
             memory[at.CONTRACTION] = contraction
-        if has_tangents and change <= options[OUTER_TOL]:
+        if has_tangents and change <= options[at.OUTER_TOL]:
             break
         if iteration > 0:
             if contraction > DIVERGENCE_RATIO:
                 return OUTER_DIVERGED
             factor = 1.0 if has_tangents else LINEAR_FACTOR
-            if contraction < 1.0 and contraction / (1.0 - contraction) * change <= factor * options[OUTER_TOL]:
+            if contraction < 1.0 and contraction / (1.0 - contraction) * change <= factor * options[at.OUTER_TOL]:
                 break
             if contraction > MAX_CONTRACTION and memory[at.IS_FRESH] == 0.0:
                 memory[at.HAS_JACOBIAN] = 0.0
@@ -389,7 +359,7 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
     copy(new_state[:n], Q)
     copy(new_state[n : 2 * n], V)
     memory[at.HAS_JACOBIAN] = 0.0
-    code = evaluate(f, w, t, Q, V, options[INNER_TOL], F)
+    code = evaluate(f, w, t, Q, V, options[at.INNER_TOL], F)
     if code != DONE:
         return code
     multipliers(f, w, t, Q, V, F, w.lam)
@@ -419,7 +389,7 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
     _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
     copy(e_v, unfiltered)
     _filter_errors(f, w, options, memory, h, e_q, e_v)
-    if f.flags[FORCE_BY_Q_GIVEN] == 0 and not derivatives_agree(
+    if f.force_by_q_given == 0 and not derivatives_agree(
         f, w, options, memory, 1, t + h, z, tolerances, unfiltered, e_q, e_v, state, new_state, A_stage[-1]
     ):
         memory[at.DERIVATIVES_RENEWED] = 1.0
@@ -433,7 +403,7 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
         j = w.independent[i]
         scale = allowed_error(tolerances, j, q[j], q1[j])
         error = max(error, abs(e_q[i]) / scale)
-        if options[NEWTON_OFFSET + at.TESTS_VELOCITIES] == 1.0:
+        if options[at.NEWTON_OFFSET + at.TESTS_VELOCITIES] == 1.0:
             scale = allowed_error(tolerances, j, v[j], v1[j])
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, filtered_once)
@@ -518,7 +488,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
 def settle_diagonal(f, w, options, memory, tolerances, accepted):
     """Store the accelerations of the last stage of an accepted step, which is the first stage of the next step."""
     if accepted:
-        s = int(options[DIAGONAL_OFFSET])
+        s = int(options[at.DIAGONAL_OFFSET])
         _, A_stage, a_end = stage_views(memory, s, w.Q.size)
         copy(A_stage[s - 1], a_end)  # not F at the last stage, which contains Newton's residual times the stiffness
         memory[at.IS_FRESH] = 0.0
@@ -527,8 +497,8 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
 @kernel(ATTEMPT, vectorized=True)
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: solve for the stages one after another; the last stage is the end of the step."""
-    s = int(options[DIAGONAL_OFFSET])
-    begin = DIAGONAL_OFFSET + 1
+    s = int(options[at.DIAGONAL_OFFSET])
+    begin = at.DIAGONAL_OFFSET + 1
     A = options[begin : begin + s * s].reshape((s, s))
     c, weights = options[begin + s * s : begin + s * s + s], options[begin + s * s + s : begin + s * s + 2 * s]
     jump_weights = options[begin + s * s + 2 * s : begin + s * s + 3 * s]
@@ -536,9 +506,9 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     V_stage, A_stage, a_end = stage_views(memory, s, n)
-    if memory[at.HAS_TRIAL] == 0.0 or memory[at.PARTITION_NUMBER] != w.notes[GENERATION]:
+    if memory[at.HAS_TRIAL] == 0.0 or memory[at.PARTITION_NUMBER] != w.generation:
         memory[at.HAS_TRIAL] = 1.0
-        memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
+        memory[at.PARTITION_NUMBER] = w.generation
         memory[at.HAS_JACOBIAN] = 0.0
         copy(a, a_end)
     if memory[at.IS_FRESH] == 0.0 and memory[at.CONTRACTION] > MAX_CONTRACTION:
@@ -587,7 +557,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     store_prediction(w, q1)
-    code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
+    code = evaluate_state(f, w, t + h, q1, v1, options[at.INNER_TOL], a1, lam1)
     if code == DONE:
         error = max(error, departure(w, tolerances, h, q, v, q1))
     return Attempt(code, error, 0.0)

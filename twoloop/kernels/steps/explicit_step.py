@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.control.step_size import commit_nothing, departure, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, gap_ratio, inlined, kernel
-from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, N_OUTER, NEARLY_SINGULAR, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
 from twoloop.kernels.linalg.dense import copy
 
@@ -169,12 +169,12 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     slopes = _slope_views(memory, s, n)
     # near a singular position all stages are projected: it matters on which side of the position a stage lies, and how
     # accurate its velocities are
-    is_near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
+    is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
     is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)
     if ratio_to_gap > 0.0 and not is_free:
         return Attempt(DONE, ratio_to_gap, 1.0 / ratio_to_gap)
-    w.counters[N_OUTER] += 1
+    w.n_outer += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
         _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # entries of dependent coordinates are start values

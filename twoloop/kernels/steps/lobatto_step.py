@@ -34,28 +34,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import (
-    BY_GENERAL,
-    DEFECT,
-    DONE,
-    ESTIMATE,
-    LEAST,
-    LOOK,
-    N_ACCEPTED,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_INNER,
-    N_OUTER,
-    N_REJECTED_ERROR,
-    NEAR_NOW,
-    NEARLY_SINGULAR,
-    ORIENTATION_NEW,
-    OUTER_DIVERGED,
-    PIVOT,
-    ROUNDED,
-    SINGULAR,
-    UNSUITED,
-)
+from twoloop.kernels.data.indices import DONE, ESTIMATE, LEAST, LOOK, OUTER_DIVERGED, SINGULAR, UNSUITED
 from twoloop.kernels.evaluation.inner_loop import check_redundant_rows, project, renew_partition
 from twoloop.kernels.evaluation.partition import MIN_CORRECTION
 from twoloop.kernels.linalg.dense import copy
@@ -123,9 +102,9 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         data[field.MAY_GUESS] = 1.0 if is_estimated and data[field.STARTS] < MAX_STARTS else 0.0
     result = int(f.attempt_nodes(data, state, tolerances, f.own_numbers))
     n_sweeps = int(data[field.SWEEPS])
-    w.counters[N_OUTER] += n_sweeps
-    w.counters[N_EVALUATIONS] += LANES * n_sweeps
-    w.counters[N_FACTORIZATIONS] += LANES * n_sweeps
+    w.n_outer += n_sweeps
+    w.n_evaluations += LANES * n_sweeps
+    w.n_factorizations += LANES * n_sweeps
     if result == GUESSED:
         data[field.STARTS] += 1.0
         return result, 2.0, min(max(START_CONTRACTION / data[field.RHO], 0.05), 30.0)
@@ -142,7 +121,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     if max_factor > GROWTH and n_sweeps == 1:
         max_factor = GROWTH_ONE_SWEEP
     if h > options[FREE] * tolerances[LOOK] * (1.0 + GAP_SLACK):
-        w.counters[N_EVALUATIONS] += LANES
+        w.n_evaluations += LANES
         defect = f.audit_nodes(data, state, f.own_numbers)
         if defect < 0.0:
             return NOT_COMPUTED, 2.0, FACTOR_AFTER_DIVERGENCE
@@ -184,8 +163,8 @@ def _accept_polynomial(data):
 def _must_change_method(w, data, tolerances):
     """Return whether another method has to take over, because stiffness limits steps or a singular position is near."""
     is_stiff = data[field.LIMITED] >= MAX_LIMITED or data[field.FAILURES] >= MAX_FAILURES
-    is_near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
-    return is_stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and is_near)
+    is_near = w.near_now == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
+    return is_stiff or (w.nearly_singular == 1.0 and is_near)
 
 
 @compiled
@@ -195,14 +174,14 @@ def _passes_singular_position(f, w, t, h, state, new_state):
     Another method then has to cross the singular position, near which stages that violate the constraints have wrong
     accelerations. Positions within the step are those of the cubic through the states at both ends.
     """
-    n, pivot = w.Q.size, w.notes[PIVOT]
+    n, pivot = w.Q.size, w.pivot
     for k in range(1, N_PIVOT_PARTS):
         s = k / N_PIVOT_PARTS
         rest = 1.0 - s
         for m in range(n):
             q0, v0, q1, v1 = state[m], h * state[n + m], new_state[m], h * new_state[n + m]
             w.y[m] = q0 + s * s * (3.0 - 2.0 * s) * (q1 - q0) + s * rest * (rest * v0 - s * v1)
-        if renew_partition(f, w, t + s * h, w.y) != DONE or w.notes[PIVOT] < MIN_PIVOT_RATIO * pivot:
+        if renew_partition(f, w, t + s * h, w.y) != DONE or w.pivot < MIN_PIVOT_RATIO * pivot:
             return True
     return False
 
@@ -228,7 +207,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(OUTER_DIVERGED, math.inf, 0.0)
     if result != CONVERGED:
         return Attempt(DONE, error, factor)
-    w.notes[DEFECT] = data[field.DEFECT]
+    w.defect = data[field.DEFECT]
     f.end_nodes(data, state, new_state)
     data[field.TRIED] = 1.0
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -236,8 +215,8 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code == DONE:
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
-    if code == DONE and error <= 1.0 and w.notes[NEARLY_SINGULAR] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        w.notes[NEAR_NOW] = 2.0  # after the step, `check_partition` renews the partition and checks its pivots
+    if code == DONE and error <= 1.0 and w.nearly_singular == 1.0 and tolerances[ESTIMATE] == 1.0:
+        w.near_now = 2.0  # after the step, `check_partition` renews the partition and checks its pivots
         if _passes_singular_position(f, w, t, h, state, new_state):
             code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)
@@ -256,12 +235,12 @@ def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
         for i in range(2 * n):
             data[begin_ends + LANES * (1 + i) + k] = out_state[row, i]
         data[field.FINE + k] = 1.0
-    tolerance = max(options[THETA], MIN_CORRECTION * w.notes[ROUNDED])
+    tolerance = max(options[THETA], MIN_CORRECTION * w.rounded)
     f.correct_ends(data, f.own_numbers)
     for _ in range(4):
         f.project_ends(data, f.own_numbers)
-        w.counters[N_INNER] += n_ends
-        w.counters[N_FACTORIZATIONS] += n_ends
+        w.n_inner += n_ends
+        w.n_factorizations += n_ends
         largest_move = 0.0
         for k in range(n_ends):
             largest_move = max(largest_move, data[field.MOVED + k])
@@ -296,7 +275,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
     for i in range(state.size - 3 * n):
         row[3 * n + i] = data[lam + LANES * i + k]
     if w.rows_v.size < w.Rate.size:
-        w.notes[BY_GENERAL] = 0.0
+        w.by_general = 0.0
         if check_redundant_rows(f, w, t, row[:n], row[n : 2 * n]) != DONE:
             return False
     copy(row, state)
@@ -309,7 +288,7 @@ def _can_take_next_step(w, data, tolerances, control, clock, h):
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
-    is_near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
+    is_near = control[at.BRIDGE] == 1.0 and w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
     return not (is_near and h < SHORT_STEP * h_long)
 
 
@@ -329,7 +308,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
             break
         if result != CONVERGED:
             clock[at.H_NEXT] = h * factor
-            w.counters[N_REJECTED_ERROR] += 1 if result == REFUSED else 0
+            w.n_rejected_error += 1 if result == REFUSED else 0
             continue
         f.end_nodes(data, state, state)
         _accept_polynomial(data)
@@ -353,13 +332,13 @@ def lobatto_steps(
     depend on the times at which the integrator pauses.
     """
     data, n = _aligned_view(memory), w.Q.size
-    if out_t.size < LANES or w.notes[NEARLY_SINGULAR] == 1.0:
+    if out_t.size < LANES or w.nearly_singular == 1.0:
         return 0
     if control[at.FIRST_GIVEN] == 1.0:
         data[field.STARTS] = MAX_STARTS
-    n_most = LANES - w.counters[N_ACCEPTED] % LANES
-    if n_most > control[at.MAX_STEPS] - w.counters[N_ACCEPTED]:
-        n_most = int(control[at.MAX_STEPS]) - w.counters[N_ACCEPTED]
+    n_most = LANES - w.n_accepted % LANES
+    if n_most > control[at.MAX_STEPS] - w.n_accepted:
+        n_most = int(control[at.MAX_STEPS]) - w.n_accepted
     copy(state, new_state)
     driven = control[at.DRIVEN] == 1.0
     n_ends = _take_steps(
@@ -376,7 +355,7 @@ def lobatto_steps(
             clock[at.H_NEXT], data[field.PREDICTS] = FACTOR_AFTER_DIVERGENCE * h, 0.0
             return k
         clock[at.T] = out_t[k]
-        w.notes[DEFECT], w.notes[ORIENTATION_NEW] = data[field.DEFECTS + k], 0.0
+        w.defect, w.orientation_new = data[field.DEFECTS + k], 0.0
         count_step(w, tolerances, control, clock, h, out_steps[k])
     return n_ends
 

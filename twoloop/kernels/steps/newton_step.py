@@ -15,7 +15,7 @@ import numpy as np
 
 from twoloop.kernels.control.step_size import project_prediction
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed_error, compiled, kernel
-from twoloop.kernels.data.indices import DONE, ESTIMATE, GENERATION, LEAST, N_OUTER, OUTER_DIVERGED
+from twoloop.kernels.data.indices import DONE, ESTIMATE, LEAST, OUTER_DIVERGED
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import stages as at
@@ -65,7 +65,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     if tolerances[ESTIMATE] == 1.0:
         max_rounding = MAX_ROUNDING_CORRECTION * tolerances[LEAST]
     for iteration in range(MAX_ITERATIONS):
-        w.counters[N_OUTER] += 1
+        w.n_outer += 1
         for j in range(s):
             for m in range(n):
                 Q_stage[j, m] = q[m] + c[j] * h * v[m]
@@ -229,9 +229,9 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)
     weights = memory[memory.size - s :]
     q_mid, v_mid, a_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID), vector(memory, s, n, at.A_MID)
-    if memory[at.PARTITION_NUMBER] != w.notes[GENERATION]:
+    if memory[at.PARTITION_NUMBER] != w.generation:
         memory[at.HAS_JACOBIAN] = 0.0
-        memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
+        memory[at.PARTITION_NUMBER] = w.generation
     if memory[at.IS_FRESH] == 0.0 and memory[at.CONTRACTION] > SLOW_CONTRACTION:
         memory[at.HAS_JACOBIAN] = 0.0
     node = middle_node(c)

@@ -27,21 +27,7 @@ There are two kinds of storage; in the static form of large systems there is non
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, inlined
-from twoloop.kernels.data.indices import (
-    BANDWIDTH,
-    DONE,
-    FORCE_BY_Q_GIVEN,
-    FORCE_BY_V_GIVEN,
-    FORM,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
-    NEEDS_DENSE,
-    NOT_FINITE,
-    REACTION_BY_Q_GIVEN,
-    SINGULAR,
-    STATIC,
-)
+from twoloop.kernels.data.indices import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
 from twoloop.kernels.linalg.band import (
@@ -56,21 +42,8 @@ from twoloop.kernels.linalg.band import (
 )
 from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.linalg.markowitz_lu import columns_of
+from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.stages import (
-    A_NEW,
-    DERIVATIVE_Q,
-    DERIVATIVE_V,
-    FILTER,
-    GAMMA0,
-    H_FACTORED,
-    HAS_DAMPING,
-    INNER_TOL,
-    N_EIGEN_SCALARS,
-    N_REAL,
-    Q_MOVED,
-    Q_STAGE,
-    SYSTEMS,
-    V_MOVED,
     as_matrix,
     block,
     complex_vector,
@@ -167,7 +140,7 @@ def fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
     """
     _clear_band(K, b)
     f.force_by_q(t, q, v, f.p, K)
-    if f.flags[REACTION_BY_Q_GIVEN] == 1:
+    if f.reaction_by_q_given == 1:
         _clear_band(R, b)
         f.reaction_by_q(t, q, w.lam, f.p, R)
         for i in range(q.size):
@@ -181,7 +154,7 @@ def fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
 @compiled
 def fill_tangent_by_v(f, t, q, v, b, D):
     """Store the entries of dQ/dv with |i - j| <= b in D (n_q, n_q), if the system provides dQ/dv; return a code."""
-    if f.flags[FORCE_BY_V_GIVEN] == 0:
+    if f.force_by_v_given == 0:
         return DONE
     _clear_band(D, b)
     f.force_by_v(t, q, v, f.p, D)
@@ -219,81 +192,79 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
     """Store J_q and J_v, computed from K and D at (t, q, v), the last evaluated state, in w.matrices; return a code."""
     n = q.size
     m = w.independent.size
-    w.counters[N_JACOBIANS] += 1
+    w.n_jacobians += 1
     # the storage of earlier factors, which are no longer needed, receives K (later D), T^T M T and products A T
-    K, R = as_matrix(matrix_storage(w, n, FILTER), n), as_matrix(matrix_storage(w, n, SYSTEMS), n)
-    code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
+    K, R = as_matrix(matrix_storage(w, n, at.FILTER), n), as_matrix(matrix_storage(w, n, at.SYSTEMS), n)
+    code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
         return code
-    AT = matrix_storage(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
+    AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
     code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    Jq, Jv = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, DERIVATIVE_V), m)
-    N = as_matrix(matrix_storage(w, n, SYSTEMS), m)
+    Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
+    N = as_matrix(matrix_storage(w, n, at.SYSTEMS), m)
     reduce_to_independents(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
     reduce_to_independents(w, K, AT, Jq)
     ldl_solve_rows(N, Jq)
-    memory[HAS_DAMPING] = f.flags[FORCE_BY_V_GIVEN]
+    memory[at.HAS_DAMPING] = f.force_by_v_given
     code = fill_tangent_by_v(f, t, q, v, n - 1, K)
-    if code == DONE and memory[HAS_DAMPING] == 1.0:
+    if code == DONE and memory[at.HAS_DAMPING] == 1.0:
         reduce_to_independents(w, K, AT, Jv)
         ldl_solve_rows(N, Jv)
     return code
 
 
 @compiled
-def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v at (t, q, v) in w.matrices; return a code. a: accelerations at (t, q, v), evaluated last."""
-    if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
-        return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
-    n = q.size
-    m = w.independent.size
-    Jq, Jv = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, DERIVATIVE_V), m)
-    q_moved, v_moved = vector(memory, s, n, Q_MOVED), vector(memory, s, n, V_MOVED)
-    a_new = vector(memory, s, n, A_NEW)
-    w.counters[N_JACOBIANS] += 1
-    for column in range(m):
+def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
+    """Store J_q, or J_v if `by_v`, at (t, q, v) with the accelerations a in J; return a code. Others: scratch."""
+    base, moved = (v, v_moved) if by_v else (q, q_moved)
+    for column in range(w.independent.size):
         j = w.independent[column]
         copy(q, q_moved)
         copy(v, v_moved)
-        q_moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(q[j]))
-        displacement = q_moved[j] - q[j]
-        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
+        moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(base[j]))
+        displacement = moved[j] - base[j]
+        code = evaluate(f, w, t, q_moved, v_moved, options[at.INNER_TOL], a_new)
         if code != DONE:
             return code
-        for row in range(m):
+        for row in range(w.independent.size):
             i = w.independent[row]
-            Jq[row, column] = (a_new[i] - a[i]) / displacement
+            J[row, column] = (a_new[i] - a[i]) / displacement
+    return DONE
+
+
+@compiled
+def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
+    """Store J_q and J_v at (t, q, v) in w.matrices; return a code. a: accelerations at (t, q, v), evaluated last."""
+    if f.force_by_q_given == 1 and w.Rate.size == w.C.size:
+        return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
+    n = q.size
+    m = w.independent.size
+    Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
+    q_moved, v_moved = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
+    a_new = vector(memory, s, n, at.A_NEW)
+    w.n_jacobians += 1
+    code = _fill_by_differences(f, w, options, t, q, v, a, False, q_moved, v_moved, a_new, Jq)
+    if code != DONE:
+        return code
     # displace all velocities at once: if this changes no acceleration, J_v is zero
     copy(q, q_moved)
     for column in range(m):
         j = w.independent[column]
         v_moved[j] = displace_unequally(v[j], column)
-    code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
+    code = evaluate(f, w, t, q_moved, v_moved, options[at.INNER_TOL], a_new)
     if code != DONE:
         return code
-    memory[HAS_DAMPING] = 0.0
+    memory[at.HAS_DAMPING] = 0.0
     for i in w.independent:
         if a_new[i] != a[i]:
-            memory[HAS_DAMPING] = 1.0
-    if memory[HAS_DAMPING] == 0.0:
+            memory[at.HAS_DAMPING] = 1.0
+    if memory[at.HAS_DAMPING] == 0.0:
         return DONE
-    for column in range(m):
-        j = w.independent[column]
-        copy(q, q_moved)
-        copy(v, v_moved)
-        v_moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(v[j]))
-        displacement = v_moved[j] - v[j]
-        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
-        if code != DONE:
-            return code
-        for row in range(m):
-            i = w.independent[row]
-            Jv[row, column] = (a_new[i] - a[i]) / displacement
-    return DONE
+    return _fill_by_differences(f, w, options, t, q, v, a, True, q_moved, v_moved, a_new, Jv)
 
 
 @compiled
@@ -303,8 +274,8 @@ def _factor_dense_matrix(w, memory, s, which, z, matrix):
     `which`: index of the pivots, see `pivots_of`.
     """
     n, m = w.Q.size, w.independent.size
-    Jq, Jv = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, DERIVATIVE_V), m)
-    damped = memory[HAS_DAMPING] == 1.0
+    Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
+    damped = memory[at.HAS_DAMPING] == 1.0
     for i in range(m):
         for j in range(m):
             matrix[i, j] = -z * z * Jq[i, j]
@@ -319,14 +290,14 @@ def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
     """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
     n = w.Q.size
     m = e_q.size
-    gamma0 = options[newton_options_index(s) + GAMMA0]
-    Jq = as_matrix(matrix_storage(w, n, DERIVATIVE_Q), m)
+    gamma0 = options[newton_options_index(s) + at.GAMMA0]
+    Jq = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
     for i in range(m):
         total = 0.0
         for j in range(m):
             total += Jq[i, j] * e_q[j]
         e_v[i] += h * gamma0 * total
-    lu_solve(as_matrix(matrix_storage(w, n, FILTER), m), pivots_of(memory, s, n, 0), e_v)
+    lu_solve(as_matrix(matrix_storage(w, n, at.FILTER), m), pivots_of(memory, s, n, 0), e_v)
 
 
 # --- banded storage
@@ -345,7 +316,7 @@ def _border_views(w, n, r, b):
     C_q and D, a copy of w.D, belong to the state at which K was computed; the indices are those of the dependent
     coordinates to which the columns of D belong.
     """
-    numbers = matrix_storage(w, n, DERIVATIVE_Q)
+    numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
     Cq = numbers[start : start + r * n].reshape((r, n))
     start += r * n
@@ -357,7 +328,7 @@ def _border_views(w, n, r, b):
 @compiled
 def _update_banded_residual(f, w, t, q, v):
     """Store Q - C_q^T w.lam at (t, q, v) in w.Q, and C_q in w.Gx."""
-    w.counters[N_EVALUATIONS] += 1
+    w.n_evaluations += 1
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
     w.Gx[:, :] = 0.0
@@ -405,15 +376,15 @@ def _copy_band(A, b, band):
 def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
     """Store the tangents K and D at (t, q, v), the last evaluated state, as bands in w.matrices; return a code."""
     n = q.size
-    K, R = matrix_storage(w, n, FILTER).reshape((n, n)), matrix_storage(w, n, SYSTEMS).reshape((n, n))
-    code = fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
+    K, R = matrix_storage(w, n, at.FILTER).reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
+    code = fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
         return code
-    _copy_band(K, b, _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b))
-    memory[HAS_DAMPING] = f.flags[FORCE_BY_V_GIVEN]
+    _copy_band(K, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b))
+    memory[at.HAS_DAMPING] = f.force_by_v_given
     code = fill_tangent_by_v(f, t, q, v, b, K)
-    if memory[HAS_DAMPING] == 1.0:
-        _copy_band(K, b, _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b))
+    if memory[at.HAS_DAMPING] == 1.0:
+        _copy_band(K, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_V), n, b))
     return code
 
 
@@ -421,8 +392,8 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 def _fill_banded_tangents(f, w, memory, s, t, q, v):
     """Store the bands of K and D at (t, q, v), evaluated last, and the border in w.matrices; return a code."""
     n = q.size
-    b = f.flags[BANDWIDTH]
-    w.counters[N_JACOBIANS] += 1
+    b = f.bandwidth
+    w.n_jacobians += 1
     Cq, D, columns = _border_views(w, n, w.rows.size, b)
     for i in range(w.rows.size):
         copy(w.G[w.rows[i]], Cq[i])
@@ -431,25 +402,25 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
         return code
     copy_matrix(w.D, D)
     copy(columns_of(w.index), columns)
-    if f.flags[FORCE_BY_Q_GIVEN] == 1:
+    if f.force_by_q_given == 1:
         return _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b)
-    base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
+    base, moved = vector(memory, s, n, at.A_NEW), vector(memory, s, n, at.Q_MOVED)
     _update_banded_residual(f, w, t, q, v)
     copy(w.Q, base)
-    code = _fill_band(f, w, t, q, v, False, base, moved, b, _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b))
+    code = _fill_band(f, w, t, q, v, False, base, moved, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b))
     if code != DONE:
         return code
     # displace all velocities at once: if this does not change the residual, D is zero
     for j in range(n):
         moved[j] = displace_unequally(v[j], j)
     _update_banded_residual(f, w, t, q, moved)
-    memory[HAS_DAMPING] = 0.0
+    memory[at.HAS_DAMPING] = 0.0
     for i in range(n):
         if w.Q[i] != base[i]:
-            memory[HAS_DAMPING] = 1.0
-    if memory[HAS_DAMPING] == 0.0:
+            memory[at.HAS_DAMPING] = 1.0
+    if memory[at.HAS_DAMPING] == 0.0:
         return DONE
-    return _fill_band(f, w, t, q, v, True, base, moved, b, _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b))
+    return _fill_band(f, w, t, q, v, True, base, moved, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_V), n, b))
 
 
 @compiled
@@ -459,8 +430,9 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
     `which`: index of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
     """
     n = w.Q.size
-    K, D = _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b), _band_view(matrix_storage(w, n, DERIVATIVE_V), n, b)
-    damped = memory[HAS_DAMPING] == 1.0
+    K = _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b)
+    D = _band_view(matrix_storage(w, n, at.DERIVATIVE_V), n, b)
+    damped = memory[at.HAS_DAMPING] == 1.0
     band = lu_band(numbers, n, b)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
@@ -516,9 +488,9 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
     The other entries of e_v (n_q) are scratch.
     """
     n = w.Q.size
-    b = f.flags[BANDWIDTH]
-    z = h * options[newton_options_index(s) + GAMMA0]
-    K, X = _band_view(matrix_storage(w, n, DERIVATIVE_Q), n, b), vector(memory, s, n, Q_MOVED)
+    b = f.bandwidth
+    z = h * options[newton_options_index(s) + at.GAMMA0]
+    K, X = _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b), vector(memory, s, n, at.Q_MOVED)
     _multiply_by_T(w, b, e_v, X)
     e_v[:] = 0.0
     add_banded_mass_times(f, w, X, e_v)
@@ -527,7 +499,7 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
         for j in range(max(0, i - b), min(n, i + b + 1)):
             e_v[i] += z * K[i, b + j - i] * X[j]
     pivots = pivots_of(memory, s, n, 0)
-    _solve_and_keep_independents(w, b, matrix_storage(w, n, FILTER), pivots, DGBTRS, e_v)
+    _solve_and_keep_independents(w, b, matrix_storage(w, n, at.FILTER), pivots, DGBTRS, e_v)
 
 
 # --- functions for both kinds of storage, which the steps call
@@ -539,83 +511,70 @@ def fill_derivatives(f, w, options, memory, s, t, q, v, a):
 
     (t, q, v) is the last evaluated state, and a its accelerations.
     """
-    if f.flags[FORM] == STATIC:
+    if f.form == STATIC:
         return NEEDS_DENSE
-    if f.flags[BANDWIDTH] >= 0:
+    if f.bandwidth >= 0:
         return _fill_banded_tangents(f, w, memory, s, t, q, v)
     return _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a)
 
 
 @compiled
-def factor_filter(f, w, options, memory, s, h):
-    """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, with z = h gamma0; return a code."""
-    n, z = w.Q.size, h * options[newton_options_index(s) + GAMMA0]
-    w.counters[N_FACTORIZATIONS] += 1
-    if f.flags[BANDWIDTH] >= 0:
-        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 0, z, matrix_storage(w, n, FILTER), DGBTRF, DGBTRS)
-    return _factor_dense_matrix(w, memory, s, 0, z, as_matrix(matrix_storage(w, n, FILTER), w.independent.size))
+def _factor_system(f, w, memory, s, which, z, numbers, factorize, substitute):
+    """Store the factors of I - z^2 J_q - z J_v, real or complex as z is, in `numbers`; see `_factor_banded`."""
+    w.n_factorizations += 1
+    if f.bandwidth >= 0:
+        return _factor_banded(w, memory, s, f.bandwidth, which, z, numbers, factorize, substitute)
+    return _factor_dense_matrix(w, memory, s, which, z, as_matrix(numbers, w.independent.size))
 
 
 @compiled
-def _factor_complex_system(f, w, memory, s, k, z):
-    """Factor the complex matrix I - z^2 J_q - z J_v for z, the step size times eigenvalue k of A; return a code."""
-    n = w.Q.size
-    w.counters[N_FACTORIZATIONS] += 1
-    if f.flags[BANDWIDTH] >= 0:
-        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 1 + k, z, system_storage(w, n, k), ZGBTRF, ZGBTRS)
-    return _factor_dense_matrix(w, memory, s, 1 + k, z, as_matrix(system_storage(w, n, k), w.independent.size))
+def factor_filter(f, w, options, memory, s, h):
+    """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, with z = h gamma0; return a code."""
+    z = h * options[newton_options_index(s) + at.GAMMA0]
+    return _factor_system(f, w, memory, s, 0, z, matrix_storage(w, w.Q.size, at.FILTER), DGBTRF, DGBTRS)
 
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
     """Factor I - z^2 J_q - z J_v for z = h gamma0, and for z = h l with each eigenvalue l of A; return a code."""
     offset = newton_options_index(s)
-    n_systems, n_real = count_systems(options, s), int(options[offset + N_REAL])
+    n_systems, n_real = count_systems(options, s), int(options[offset + at.N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
-    offset += N_EIGEN_SCALARS + s
+    offset += at.N_EIGEN_SCALARS + s
     for k in range(n_systems):
         # if the first eigenvalue is real, it is gamma0, for which `factor_filter` has computed the factors
         if code == DONE and (k > 0 or n_real == 0):
-            code = _factor_complex_system(f, w, memory, s, k, h * complex(options[offset], options[offset + 1]))
+            z = h * complex(options[offset], options[offset + 1])
+            code = _factor_system(f, w, memory, s, 1 + k, z, system_storage(w, w.Q.size, k), ZGBTRF, ZGBTRS)
         offset += 2 + 4 * s
-    memory[H_FACTORED] = h
+    memory[at.H_FACTORED] = h
     return code
 
 
 @compiled
-def _solve_real_system(f, w, memory, s, x):
-    """Replace x[:n_dof] by (I - z^2 J_q - z J_v)^-1 x[:n_dof], with z = h gamma0; x has n_q entries."""
-    n, m = w.Q.size, w.independent.size
-    if f.flags[BANDWIDTH] >= 0:
-        X, pivots = vector(memory, s, n, Q_MOVED), pivots_of(memory, s, n, 0)
-        _solve_banded_system(f, w, f.flags[BANDWIDTH], matrix_storage(w, n, FILTER), pivots, DGBTRS, X, x)
+def _solve_system(f, w, memory, s, which, numbers, substitute, X, x):
+    """Replace x[:n_dof] by the solution, with the factors of `_factor_system` in `numbers`; X (n_q) is scratch."""
+    m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, which)
+    if f.bandwidth >= 0:
+        _solve_banded_system(f, w, f.bandwidth, numbers, pivots, substitute, X, x)
     else:
-        lu_solve(as_matrix(matrix_storage(w, n, FILTER), m), pivots_of(memory, s, n, 0), x[:m])
-
-
-@compiled
-def _solve_complex_system(f, w, options, memory, s, k, x):
-    """Replace x[:n_dof], a complex right-hand side, by the solution of the linear system for eigenvalue k of A."""
-    n, m = w.Q.size, w.independent.size
-    if f.flags[BANDWIDTH] >= 0:
-        X, pivots = complex_vector(memory, s, n, count_systems(options, s), 1), pivots_of(memory, s, n, 1 + k)
-        _solve_banded_system(f, w, f.flags[BANDWIDTH], system_storage(w, n, k), pivots, ZGBTRS, X, x)
-    else:
-        lu_solve(as_matrix(system_storage(w, n, k), m), pivots_of(memory, s, n, 1 + k), x[:m])
+        lu_solve(as_matrix(numbers, m), pivots, x[:m])
 
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
     """Replace x[:n_dof], a complex right-hand side, by the solution for eigenvalue k of A, which may be real."""
-    if k == 0 and options[newton_options_index(s) + N_REAL] > 0.0:  # the first eigenvalue is real: it is gamma0
-        real_part = vector(memory, s, w.Q.size, V_MOVED)
+    n = w.Q.size
+    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # the first eigenvalue is real: it is gamma0
+        real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
-        _solve_real_system(f, w, memory, s, real_part)
+        _solve_system(f, w, memory, s, 0, matrix_storage(w, n, at.FILTER), DGBTRS, X, real_part)
         for i in range(x.size):
             x[i] = real_part[i]
     else:
-        _solve_complex_system(f, w, options, memory, s, k, x)
+        X = complex_vector(memory, s, n, count_systems(options, s), 1)
+        _solve_system(f, w, memory, s, 1 + k, system_storage(w, n, k), ZGBTRS, X, x)
 
 
 @compiled
@@ -625,7 +584,7 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
     """
     m = w.independent.size
-    if f.flags[BANDWIDTH] >= 0:
+    if f.bandwidth >= 0:
         _filter_error_banded(f, w, options, memory, s, h, e_q, e_v)
     else:
         _filter_error_dense(w, options, memory, s, h, e_q[:m], e_v[:m])
@@ -640,11 +599,11 @@ def correct_stages(f, w, options, memory, s, residual, A_stage):
     n = w.Q.size
     m = w.independent.size
     offset = newton_options_index(s)
-    n_real = int(options[offset + N_REAL])
+    n_real = int(options[offset + at.N_REAL])
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)
-    offset += N_EIGEN_SCALARS + s
-    corrections = block(memory, s, n, Q_STAGE)  # used as scratch: stage positions are computed anew before their use
+    offset += at.N_EIGEN_SCALARS + s
+    corrections = block(memory, s, n, at.Q_STAGE)  # used as scratch: stage positions are computed anew before their use
     corrections[:, :] = 0.0
     for k in range(n_systems):
         begin_row = offset + 2

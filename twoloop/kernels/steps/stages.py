@@ -41,11 +41,11 @@ def options_array(
     """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
-    vectors = (b, b @ A, c, _lagrange_values(c, 0.0), _lagrange_values(c, 1.0))
+    vectors = (b, b @ A, c, lagrange_values(c, 0.0), lagrange_values(c, 1.0))
     return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), *vectors])
 
 
-def _lagrange_values(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
+def lagrange_values(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
     """Return the values (s) at x of the Lagrange polynomials of distinct `nodes` (s)."""
     factors = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
     np.fill_diagonal(factors, 1.0)

@@ -32,23 +32,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import (
-    ATOL,
-    BY_GENERAL,
-    DEFECT,
-    DONE,
-    ESTIMATE,
-    FORM,
-    LOOK,
-    N_EVALUATIONS,
-    N_OUTER,
-    NEAR_NOW,
-    NEARLY_SINGULAR,
-    NOT_FINITE,
-    RTOL,
-    STATIC,
-    STRAIGHT,
-)
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LOOK, NOT_FINITE, RTOL, STATIC
 from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
@@ -316,7 +300,7 @@ def integrate_coefficients(K, unit, N, series, a):
 @merged
 def finish_series(w, order, series):
     """Count the evaluations in w.counters; return DONE, or NOT_FINITE if `series` is not finite in its last order."""
-    w.counters[N_EVALUATIONS] += order - 1
+    w.n_evaluations += order - 1
     n = series.size // (order + 1)
     for j in range(n):
         if not np.isfinite(series[order * n + j]):
@@ -358,7 +342,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
         a, lam = N[k, A : A + n], N[k, LAM : LAM + n_rows]
         if w.rows_v.size < n_rows:
             lam[:] = 0.0
-        if f.flags[FORM] == STATIC:
+        if f.form == STATIC:
             f.inner(f, w, SOLVE, t, r, c, 0.0, a, lam)
         else:
             solve_with_multipliers(f, w, r, c, a, lam)
@@ -388,7 +372,7 @@ def _compute_series(f, w, options, memory, t, state, unit, which):
     """Store series `which` about `state`, the result of the last projection, at t in `memory`; return a code."""
     n = w.Q.size
     memory[TARGET] = which
-    if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # generated code leaves no factors in w
+    if f.straight == 1 and w.by_general == 0.0:  # generated code leaves no factors in w
         q, v, a = state[:n], state[n : 2 * n], series_accelerations(memory, n)
         code = f.general(f, w, EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
         if code != DONE:
@@ -473,7 +457,7 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 @compiled
 def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the first defect within the step that is too large, or 0; update w.notes[DEFECT] by smaller defects.
+    """Return the first defect within the step that is too large, or 0; update w.defect by smaller defects.
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
@@ -491,7 +475,7 @@ def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
                 memory[SUSPECT] = t + s * h
             memory[SUSPECTED] = 1.0
             return defect
-        w.notes[DEFECT] = max(w.notes[DEFECT], defect)
+        w.defect = max(w.defect, defect)
     return 0.0
 
 
@@ -516,7 +500,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n, order, is_estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    w.counters[N_OUTER] += 1
+    w.n_outer += 1
     if memory[HAS_SERIES] == 0.0:
         copy(state, new_state)
         code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
@@ -537,9 +521,9 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
-        was_near_singular = w.notes[NEARLY_SINGULAR] != 0.0  # true from the first singular position of the run on
-        checks_defect = w.notes[NEAR_NOW] == 0.0  # near singular positions, accelerations off the constraints are wrong
-        w.notes[NEAR_NOW] = 0.0 if checks_defect else 2.0
+        was_near_singular = w.nearly_singular != 0.0  # true from the first singular position of the run on
+        checks_defect = w.near_now == 0.0  # near singular positions, accelerations off the constraints are wrong
+        w.near_now = 0.0 if checks_defect else 2.0
         ratio_to_gap = gap_ratio(tolerances, h)
         if ratio_to_gap > 0.0 and was_near_singular:
             return Attempt(DONE, ratio_to_gap, 1.0 / ratio_to_gap)
@@ -547,7 +531,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             memory[ATTEMPTS] += 1.0
             if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
                 memory[SUSPECTED] = 0.0
-            w.notes[DEFECT] = 0.0
+            w.defect = 0.0
             defect = _first_large_defect(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
                 return Attempt(DONE, min(defect, MAX_DEFECT), _factor_after_large_defect(defect, order))
@@ -577,7 +561,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
-        w.notes[DEFECT] = max(w.notes[DEFECT], defect)
+        w.defect = max(w.defect, defect)
     series = series_view(memory, order, n, 1.0 - memory[CURRENT])
     unit = min(memory[ALLOWED_SIZE] * unit, MAX_GROWTH * h) if is_estimated else h
     code = _compute_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[CURRENT])
