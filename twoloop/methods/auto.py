@@ -70,6 +70,15 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, estimates: int 
     )
 
 
+def with_matrix_cost(plan: Plan, cost: float) -> Plan:
+    """Return a copy of a plan of `switching` with the cost of a Newton matrix set to `cost`, in evaluations."""
+    from twoloop.kernels.control import stiffness as kernels
+
+    options = plan.options.copy()
+    options[kernels.MATRIX_COST] = cost
+    return plan.changed(options=options)
+
+
 @dataclass(frozen=True)
 class Auto:
     """Default method: "Lobatto16" or explicit steps, and Newton's method while the motion is stiff.

@@ -213,7 +213,7 @@ class ConstrainedSystem:
         flags[BANDWIDTH] = -1  # each run decides by the size whether to use the bandwidth
         all_callbacks = {kind: self.given.get(kind) or substitute(kind, self.given) for kind in KINDS}
         none = (np.zeros(0, np.int64), np.zeros(0))
-        programs = dict(zip(PROGRAMS, (*none, *none, np.zeros(0, np.int32)), strict=True))
+        programs = dict(zip(PROGRAMS, (*none, *none, *[np.zeros(0, np.int32)] * 2), strict=True))
         self.functions: Any = Functions(**all_callbacks, p=p, flags=flags, **programs)  # type: ignore[call-arg]
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}

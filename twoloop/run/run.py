@@ -24,6 +24,7 @@ from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import cached_run, copy_workspace
+from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import describe_not_finite
@@ -34,7 +35,7 @@ from twoloop.run.singular_positions import (
     describe_singular_start,
     singular_threshold,
 )
-from twoloop.run.workspace import kit_for_plan, kit_of, static_form, workspace
+from twoloop.run.workspace import kit_for_plan, kit_of, static_form, with_newton, workspace
 
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
@@ -253,18 +254,25 @@ class Run:
         )
 
     def change_form(self) -> None:
-        """Change from the static form to a form of saddle_point.py at the current state; renew kit and workspace."""
+        """Change the form of linear algebra at the current state, and replace the run's kit and workspace.
+
+        The new form is the static form with Newton's matrices, if these are missing, else a form of saddle_point.py.
+        """
         n = self.system.n_q
         old_work, largest_pivot = self.work, float(self.clock[self.a.LARGEST_PIVOT])
         rank = len(old_work.rows_v)
         t, q = float(self.clock[self.a.T]), self.state[:n].copy()
-        self.static_form = None
-        self.kit = kit_of(self.system, t, q, self.plan)
+        static, self.static_form = self.static_form, None
+        if static is not None and static.newton_program is None and self.matrices > 0:
+            self.static_form = with_newton(self.system, t, q, static)
+        if self.static_form is not None and self.plan.first is not None:
+            self.plan = with_matrix_cost(self.plan, self.static_form.matrix_cost())
+        self.kit = kit_of(self.system, t, q, self.plan, self.static_form)
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = old_work.counters
         notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.KINK_BEFORE, indices.KINK_AFTER]
         self.work.notes[notes] = old_work.notes[notes]
-        self.control[self.a.BRIDGE] = 1.0
+        self.control[self.a.BRIDGE] = self.static_form is None
         clock, a = self.clock, self.a
         if clock[a.FAILURE_CODE] != indices.DONE:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start

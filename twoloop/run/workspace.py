@@ -24,6 +24,7 @@ from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import Static, cached_run, empty_workspace, lasting_arrays
 from twoloop.kernels.linalg.band import banded_pays, lapack_addresses
 from twoloop.kernels.linalg.saddle_point import sparse_pays
+from twoloop.kernels.linalg.sparse_lu import column_groups, grouped_entries, newton_program
 from twoloop.kernels.linalg.symbolic_factorization import (
     N_OFF_DIAGONAL,
     N_PIVOTS,
@@ -39,11 +40,82 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
+# displacement of a coordinate or velocity x, relative to max(1, |x|), that shows which forces depend on x
+DISPLACEMENT = 1e-3
+# sparse factors of Newton's matrix have at most this share of the entries, and operations, of dense factors
+MAX_NEWTON_SHARE = 0.2
+
+
+def newton_form(
+    system: ConstrainedSystem,
+    t0: float,
+    q0: Array,
+    mass: Entries,
+    jacobian: Entries,
+    bodies: list[tuple[int, ...]],
+    stiff: list[int],
+) -> tuple[NDArray[np.int32], int] | None:
+    """Return the program that factorizes Newton's matrix, see sparse_lu.py, and the number of groups of its columns.
+
+    The columns of a group are computed from one difference of forces. `mass`, `jacobian`: indices of nonzero entries.
+    `bodies`: coordinates of each body. `stiff`: indices of `_stiff_rows`. Return None if sparse factors do not pay.
+    """
+    entries: set[tuple[int, int]] = set()
+    rng = np.random.default_rng(9)
+    magnitude, lam = max(1.0, float(np.abs(q0).max())), rng.uniform(0.5, 1.5, system.n_c)
+    max_entries = MAX_NEWTON_SHARE * system.n_q**2
+    for scale in NEARBY[:2]:
+        q = q0 + scale * magnitude * rng.uniform(-1.0, 1.0, system.n_q)
+        try:
+            entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
+        except Exception:  # q is outside the domain of the callbacks; entries missed here are found during the run
+            continue
+        if len(entries) > max_entries:
+            return None
+    indices = np.array(sorted(entries), dtype=np.int64).reshape(-1, 2)
+    tangents = grouped_entries((indices[:, 0], indices[:, 1]), system.n_q)
+    program = newton_program(system.n_q, system.n_c, mass, jacobian, tangents, bodies, stiff)
+    if program is None or program[N_UPDATES] > MAX_NEWTON_SHARE * system.n_q**3 / 3.0:
+        return None
+    return program, int(column_groups(tangents, system.n_q).max(initial=-1)) + 1
+
+
+def _derivative_entries(
+    system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, max_entries: float
+) -> set[tuple[int, int]]:
+    """Return the indices of nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and of their transposes.
+
+    The search for entries ends after the column with which there are more than `max_entries` entries.
+    """
+
+    def reaction(q: Array) -> Array:
+        if "jacobian" not in system.entries:
+            return lam @ system.jacobian(t, q)
+        rows, columns = system.entries["jacobian"]
+        return np.bincount(columns, system.jacobian_values(t, q) * lam[rows], len(q)).astype(np.float64)
+
+    force, undisplaced_reaction = system.force(t, q, v), reaction(q)
+    entries: set[tuple[int, int]] = set()
+    for j in range(len(q)):
+        changed_q, changed_v = q.copy(), v.copy()
+        changed_q[j] += DISPLACEMENT * max(1.0, abs(q[j]))
+        changed_v[j] += DISPLACEMENT * max(1.0, abs(v[j]))
+        is_changed = (system.force(t, changed_q, v) != force) | (reaction(changed_q) != undisplaced_reaction)
+        is_changed |= system.force(t, q, changed_v) != force
+        for i in np.flatnonzero(is_changed).tolist():
+            entries |= {(i, j), (j, i)}
+        if len(entries) > max_entries:
+            break
+    return entries
+
+
 # a direction of a body has no mass if its eigenvalue of M, relative to the largest one, is at most this
 MASSLESS_RATIO = 1e-10
 # a row can give a massless direction of a body a mass if the row's component along these directions, relative to the
 # row, has a larger norm
 MIN_MASSLESS_FRACTION = 1e-3
+# Newton's matrix has sparse factors if the number of coordinates, relative to LARGE, is at least this
+MIN_SIZE_NEWTON = 1.6
 MAX_STATIC_SHARE = 0.05  # the static form has at most this share of the entries, and operations, of dense factors
 
 
@@ -55,6 +127,24 @@ class StaticForm(NamedTuple):
     mass: Entries  # row and column indices of the nonzero entries of M
     pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else (0, n_q)
     mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else (0, 0)
+    newton_arguments: tuple[Any, ...]  # arguments of `newton_form` that follow t0 and q0
+    newton_program: NDArray[np.int32] | None = None  # factorizes Newton's matrix; None until a plan needs it
+    n_groups: int = 0  # number of column groups of Newton's matrix; one difference of forces yields a group
+
+    def matrix_cost(self) -> float:
+        """Return the estimated cost of Newton's matrix and its factors, in evaluations of accelerations."""
+        assert self.newton_program is not None
+        return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
+
+    def newton_matrices_size(self, matrices: int) -> int:
+        """Return the number of floats in a plan's sparse Newton matrices; `matrices`: its number of dense matrices."""
+        from twoloop.kernels.steps.newton_systems import matrices_size
+        from twoloop.kernels.steps.stages import SYSTEMS
+
+        if self.newton_program is None or matrices == 0:
+            return 0
+        n_values = self.static.n_mass_values, self.static.n_jacobian_values
+        return matrices_size(self.newton_program, *n_values, (matrices - SYSTEMS) // 2)
 
 
 def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
@@ -64,10 +154,18 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
     has_gamma = "gamma" in system.given or system.functions.gamma_program.size > 0
     if not has_gamma or not all(plan.projects and plan.inner is None and not plan.own for plan in plans):
         return None
-    if any(plan.matrices and plan.first is None for plan in plans):  # Newton's matrices have no static form
-        return None
     form: StaticForm | None = system.remembered("static form", lambda: _create_static_form(system, t0, q0))
+    if form is not None and any(plan.matrices and plan.first is None for plan in plans):
+        return with_newton(system, t0, q0, form)
     return form
+
+
+def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
+    """Return a copy of `form` with the program of Newton's matrix; None if sparse factors of this matrix do not pay."""
+    if system.n_q < MIN_SIZE_NEWTON * LARGE:
+        return None
+    cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
+    return None if cached is None else form._replace(newton_program=cached[0], n_groups=cached[1])
 
 
 def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
@@ -93,7 +191,7 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF_DIAGONAL] + 1)
     static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
-    return StaticForm(program, static, mass, pattern, mass_pattern)
+    return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, bodies, stiff_rows))
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
@@ -220,6 +318,8 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
     flags = system.functions.flags.copy()
     flags[FORM] = STATIC
     functions = system.functions._replace(flags=flags, static_program=form.program)
+    if form.newton_program is not None:
+        functions = functions._replace(newton_program=form.newton_program)
     if plan is None:
         return Kit(functions, sparse_inner_loop)
     return Kit(functions, sparse_inner_loop, *_steps_of_plan(plan), sparse_inner_loop)
@@ -322,7 +422,7 @@ def workspace(
     full_ranks = min(n_c, n_q), min(n_c + n_a, n_q)
     rank, rank_v = (rank if rank is not None else highest for rank, highest in zip(ranks, full_ranks, strict=True))
     sizes = n_q, n_c, n_a, rank, rank_v, bool(uses_null_space and n_q > rank_v), bool(augmented), n_nodes
-    n_floats = matrices * n_q**2 if static is None else 0
+    n_floats = matrices * n_q**2 if static is None else static.newton_matrices_size(matrices)
     work = empty_workspace((*sizes, None if static is None else static.static, n_floats))
     return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, static)
 

@@ -29,8 +29,8 @@ INTEGERS = types.int64[::1]
 INTEGERS_32 = types.int32[::1]  # for long programs, which fit in the processor's cache as 32-bit integers
 
 # names of the programs in `Functions`: programs that replace missing callbacks (evaluation/operations.py), and programs
-# for sparse factors of large systems (linalg/symbolic_factorization.py). A missing program has size 0
-PROGRAMS = "jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "static_program"
+# for sparse factors of large systems (linalg/symbolic_factorization.py, sparse_lu.py). A missing program has size 0
+PROGRAMS = "jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "static_program", "newton_program"
 # the callbacks of a mechanism, its parameters, its flags and its programs
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # type: ignore[misc]
 
@@ -156,7 +156,7 @@ KIT = Reference(
     "Kit",
     {
         **{"p": VECTOR, "flags": INTEGERS, "numbers": VECTOR, "own_numbers": VECTOR},
-        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, INTEGERS_32), strict=True)),
+        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, INTEGERS_32, INTEGERS_32), strict=True)),
     },
     {"flags": FLAGS},
 )

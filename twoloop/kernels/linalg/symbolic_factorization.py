@@ -4,7 +4,7 @@
     [G   0 ]  = L D L^T
 
 is factored in an order of elimination that is chosen once, by the pattern of entries alone. Pivots are single entries:
-see sparse_ldl.py. A slot is the index of a number of the factors: the pivots come first, in their
+see sparse_ldl.py and sparse_lu.py. A slot is the index of a number of the factors: the pivots come first, in their
 order, then the columns of L, each downwards.
 
 Coordinates that M couples, or that the system declares as a group, form a body; the rows that involve the same bodies
@@ -50,8 +50,10 @@ class _DisjointSets:
 class _PartSupports:
     """Supports of each part: the ground, and hubs not eliminated yet. A part: bodies connected by eliminated joints."""
 
-    def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int]):
+    def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
+        # bodies with a single coordinate: a joint with one of these may fix a part to the ground
+        self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
         self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support each part
@@ -62,14 +64,15 @@ class _PartSupports:
         """Return whether a joint may be eliminated next: its rows must be independent, see the module's docstring."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
-        if any(not self.is_grounded[p] and not self.hubs_by_part[p] for p in parts):
+        if not bodies & self.lone_bodies and any(not self.is_grounded[p] and not self.hubs_by_part[p] for p in parts):
             return True
         return not bodies & self.hubs and not any(self.hubs_by_part[p] for p in parts)
 
     def eliminate_joint(self, joint: int) -> None:
         """Merge the parts that an eliminated joint connects, and update their supports."""
         bodies = self.joints[joint]
-        self._merge_parts((body for body in bodies if body not in self.hubs), len(bodies) == 1, bodies & self.hubs)
+        is_grounded = len(bodies) == 1 or bool(bodies & self.lone_bodies)
+        self._merge_parts((body for body in bodies if body not in self.hubs), is_grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
         """Merge an eliminated hub and the parts that it supports, and update their supports."""
@@ -102,11 +105,22 @@ def elimination_order(
     jacobian_entries: tuple[Integers, Integers],
     body_groups: Iterable[Sequence[int]] = (),
     early_rows: Sequence[int] = (),
+    couplings: tuple[Integers, Integers] | None = None,
 ) -> Integers:
     """Return the order of elimination (n_q + n_rows): j for coordinate j, n_q + i for row i of G.
 
-    The arguments are those of `factorization_program`. `early_rows`, rows of single bodies, are eliminated before all
-    joints, unless the body is a hub, so that no dependence on other rows makes their pivots small.
+    Parameters
+    ----------
+    n_q, n_rows : int
+    mass_entries, jacobian_entries : (rows, columns)
+        Entries of M and of G.
+    body_groups : iterable of sequence of int
+        Groups of coordinates that form one body each, even if M does not couple them.
+    early_rows : sequence of int
+        Rows of single bodies. Unless the body is a hub, they are eliminated before all joints, so that no dependence on
+        other rows makes their pivots small.
+    couplings : (rows, columns), optional
+        Entries of K and D, which couple bodies as springs do. All bodies are then hubs, each with its `early_rows`.
     """
     body_of = bodies_of(n_q, mass_entries, body_groups)
     bodies_in_row: list[set[int]] = [set() for _ in range(n_rows)]
@@ -123,16 +137,28 @@ def elimination_order(
         for body in joint:
             joints_of[body].append(k)
     hubs = {body for body in range(n_q) if len(joints_of[body]) > MAX_JOINTS}
+    if couplings is not None:
+        hubs = set(body_of)
     coordinates: dict[int, list[int]] = {}
     for j, body in enumerate(body_of):
         coordinates.setdefault(body, []).append(j)
     order = [j for j in range(n_q) if body_of[j] not in hubs]
     order += [n_q + i for i in early_rows if not bodies_in_row[i] & hubs]
+    rows_of_hubs = [n_q + i for i in early_rows if bodies_in_row[i] & hubs]
+    if couplings is not None:
+        for i in early_rows:
+            coordinates[next(iter(bodies_in_row[i]))].append(n_q + i)
+        rows_of_hubs = []
     nodes = [[n_q + i for i in rows_by_joint[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
+    pairs: set[tuple[int, int]] = set()
+    lone_bodies: set[int] = set()
+    if couplings is not None:
+        pairs = {(body_of[i], body_of[j]) for i, j in zip(*couplings, strict=True)}
+        lone_bodies = {hub for hub in hubs if len(coordinates[hub]) == 1}
     sizes = [len(node) for node in nodes]
-    for node in _minimum_degree_order(joints, joints_of, sorted(hubs), sizes, n_q):
+    for node in _minimum_degree_order(joints, joints_of, sorted(hubs), sizes, n_q, pairs, lone_bodies):
         order += nodes[node]
-    order += [n_q + i for i in early_rows if bodies_in_row[i] & hubs]
+    order += rows_of_hubs
     return np.array(order, dtype=np.int64)
 
 
@@ -156,10 +182,13 @@ def _minimum_degree_order(
     hubs: Sequence[int],
     sizes: Sequence[int],
     n_bodies: int,
+    pairs: Iterable[tuple[int, int]],
+    lone_bodies: AbstractSet[int],
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
     Among the joints and hubs that may be eliminated, the next one has neighbours with the fewest rows and coordinates.
+    `pairs`: pairs of hubs that are coupled other than by joints. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -172,9 +201,12 @@ def _minimum_degree_order(
         else:
             for k in joint_indices:
                 neighbours[k].update(joint_indices)
+    for hub_a, hub_b in pairs:
+        neighbours[node_of[hub_a]].add(node_of[hub_b])
+        neighbours[node_of[hub_b]].add(node_of[hub_a])
     for node, adjacent in enumerate(neighbours):
         adjacent.discard(node)
-    supports = _PartSupports(joints, n_bodies, set(hubs))
+    supports = _PartSupports(joints, n_bodies, set(hubs), lone_bodies)
 
     def degree(node: int) -> int:
         return sum(sizes[neighbour] for neighbour in neighbours[node])
@@ -228,6 +260,16 @@ def factorization_program(
     stiff_rows : rows g along which M is to be stiffened by a multiple of g g^T; M must have the entries of g g^T.
     """
     order = elimination_order(n_q, n_rows, mass, jacobian, body_groups, stiff_rows)
+    return program_in_order(order, n_q, mass, jacobian, stiff_rows)
+
+
+def program_in_order(
+    order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], unsymmetric: bool = False
+) -> NDArray[np.int32] | None:
+    """Return the program for an order of elimination; None if the program would have too many updates.
+
+    `unsymmetric`: factors also contain U; its entry (i, j) has the slot of (j, i) of L plus program[N_OFF_DIAGONAL].
+    """
     n = len(order)
     position = np.empty(n, dtype=np.int64)
     position[order] = np.arange(n)
@@ -256,9 +298,12 @@ def factorization_program(
     runs = _update_runs(slots_of(first_of, second_of), first_of == second_of)
     entry_slots = slots_of(low, high)
     n_mass = len(mass[0])
+    # entries of M above the diagonal get slots of U, or, with symmetric factors, a slot that is never read
+    is_above = rows[:n_mass] < columns[:n_mass]
     n_off_diagonal = len(entry_keys)
-    # entries of M above the diagonal get a slot that is never read
-    entry_slots[:n_mass][rows[:n_mass] < columns[:n_mass]] = n + n_off_diagonal
+    entry_slots[:n_mass][is_above] = (
+        entry_slots[:n_mass][is_above] + n_off_diagonal if unsymmetric else n + n_off_diagonal
+    )
     product_rows, first, second = _products_of_entries(jacobian[0], stiff_rows)
     pivot_a, pivot_b = (position[jacobian[1][indices]] for indices in (first, second))
     products = [product_rows, first, second, slots_of(np.minimum(pivot_a, pivot_b), np.maximum(pivot_a, pivot_b))]
@@ -319,6 +364,13 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
         patterns.append(np.array(rows, dtype=np.int64))
         rows_below[column] = set()
     return patterns
+
+
+@inlined
+def end_of_sections(program):
+    """Return the index at which the sections of a program end."""
+    begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
+    return begin + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 
 
 @inlined

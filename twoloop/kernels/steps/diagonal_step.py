@@ -263,8 +263,9 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         for m in w.independent:
             scale_q = max(scale_q, abs(Q[m]))
             scale_v = max(scale_v, abs(V[m]))
-        for m in w.dependent:
-            a[m] = F[m]
+        if f.form != STATIC:  # in the static form no coordinate is dependent
+            for m in w.dependent:
+                a[m] = F[m]
         code = _update_derivatives(f, w, options, memory, t, h, Q, V, F)
         if code != DONE:
             memory[at.HAS_JACOBIAN] = 0.0

@@ -15,21 +15,26 @@ X = T x also solves a system with a bordered matrix,
 
     [[M - z^2 K - z D, Cq^T], [Cq, 0]] [X; mu] = [M T r; 0].
 
-There are two kinds of storage; in the static form of large systems there is none, and another form takes over:
+There are three kinds of storage:
 
 - dense: J_q and J_v (n_dof, n_dof), from the tangents K and D if the system provides them, otherwise by differences of
   the right-hand side;
 - banded, if the system has a bandwidth b: K, D and the border, at a cost proportional to n_q. Without tangents, K and D
   are computed by differences, in 2 b + 1 groups of columns without common rows (Curtis, Powell and Reid 1974, doi
-  10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long.
+  10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
+- sparse, for large systems: all coordinates are treated as independent, and the bordered matrix, with the right-hand
+  side [M r; G r], has a fixed sparsity pattern. K and D are computed by differences in groups of columns. Then all
+  coordinates are displaced at once, and the change of the residual is compared with that predicted by K and D. If they
+  deviate, entries are missing, which were zero when the pattern was recorded: other storage is then needed.
 """
 
 import numpy as np
 
-from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.common import compiled, finite_vector, inlined
 from twoloop.kernels.data.indices import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
+from twoloop.kernels.evaluation.sparse_inner_loop import fill_jacobian_values
 from twoloop.kernels.linalg.band import (
     DGBTRF,
     DGBTRS,
@@ -42,6 +47,17 @@ from twoloop.kernels.linalg.band import (
 )
 from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.linalg.markowitz_lu import columns_of
+from twoloop.kernels.linalg.sparse_ldl import add_redundant_stiffness
+from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
+from twoloop.kernels.linalg.sparse_lu import load_matrix, tangent_entries_of
+from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
+from twoloop.kernels.linalg.symbolic_factorization import (
+    N_OF_MASS,
+    N_OFF_DIAGONAL,
+    N_PIVOTS,
+    jacobian_entries_of,
+    mass_entries_of,
+)
 from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.stages import (
     as_matrix,
@@ -502,17 +518,230 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
     _solve_and_keep_independents(w, b, matrix_storage(w, n, at.FILTER), pivots, DGBTRS, e_v)
 
 
-# --- functions for both kinds of storage, which the steps call
+# --- sparse storage, for all coordinates
+
+# largest difference between the predicted and the actual change of a residual, relative to the sum of the absolute
+# terms of the prediction, for a complete sparsity pattern
+MAX_DEVIATION = 0.2
+RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
+N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
+
+
+def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: int) -> int:
+    """Return the length of w.matrices for sparse storage, whose parts are described at the next three functions."""
+    n = int(program[N_PIVOTS])
+    n_tangents = int(program[N_OF_MASS]) - n_mass
+    n_factors = n + 2 * int(program[N_OFF_DIAGONAL])
+    return n_mass + n_jacobian + 2 * n_tangents + (N_SPARSE_VECTORS + 7) * n + (1 + 2 * n_systems) * n_factors
+
+
+@inlined
+def _sparse_derivative_views(f, w):
+    """Return views of w.matrices: entries of M, of G, of K and of D, a copy of w.is_independent, stiffness of rows."""
+    n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
+    begin_K = n_mass + n_jacobian
+    begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass
+    begin_counts = begin_D + begin_D - begin_K
+    numbers = w.matrices
+    return (
+        numbers[:n_mass],
+        numbers[n_mass:begin_K],
+        numbers[begin_K:begin_D],
+        numbers[begin_D:begin_counts],
+        numbers[begin_counts : begin_counts + n_rows],
+        numbers[begin_counts + n_rows : begin_counts + 2 * n_rows],
+    )
+
+
+@inlined
+def _sparse_scratch(f, w):
+    """Return scratch views of w.matrices: three vectors (n_q), pivot sizes (N = n_q + n_c), two complex vectors (N)."""
+    n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
+    begin += 2 * (mass_entries_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
+    n_q, numbers = w.Q.size, w.matrices
+    begin_sizes = begin + N_SPARSE_VECTORS * n
+    return (
+        numbers[begin : begin + n_q],
+        numbers[begin + n : begin + n + n_q],
+        numbers[begin + 2 * n : begin + 2 * n + n_q],
+        numbers[begin_sizes : begin_sizes + n],
+        numbers[begin_sizes + n : begin_sizes + 3 * n].view(np.complex128),
+        numbers[begin_sizes + 3 * n : begin_sizes + 5 * n].view(np.complex128),
+    )
+
+
+@inlined
+def _sparse_factor_view(f, w, k):
+    """Return a view of w.matrices, as real numbers: the factors for gamma0 (k = 0), or for the eigenvalue k - 1."""
+    n = f.newton_program[N_PIVOTS]
+    n_factors = n + 2 * f.newton_program[N_OFF_DIAGONAL]
+    begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
+    begin += 2 * (mass_entries_of(f.newton_program)[0].size - w.mass_values.size)
+    if k == 0:
+        return w.matrices[begin : begin + n_factors]
+    return w.matrices[begin + (2 * k - 1) * n_factors : begin + (2 * k + 1) * n_factors]
+
+
+@compiled
+def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
+    """Store Q - G^T w.lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
+
+    The entries of G are w.jacobian_values; if `renews_G` is true, w.jacobian_values are first evaluated at (t, q).
+    """
+    w.n_evaluations += 1
+    out[:] = 0.0
+    f.force(t, q, v, f.p, out)
+    if renews_G:
+        fill_jacobian_values(f, w, t, q)
+    largest = 0.0
+    for j in range(out.size):
+        largest = max(largest, abs(out[j]))
+    rows, columns, _ = jacobian_entries_of(f.newton_program)
+    for k in range(rows.size):
+        term = w.jacobian_values[k] * w.lam[rows[k]]
+        largest = max(largest, abs(term))
+        out[columns[k]] -= term
+    return largest
+
+
+@compiled
+def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
+    """Store the entries of K, or of D if `by_v`, computed by differences, in `entries`; return DONE or NOT_FINITE.
+
+    All columns of a group are computed at once. `base`: residual at (q, v); `residual` and `moved` (n_q): scratch.
+    """
+    rows, columns, begins = tangent_entries_of(f.newton_program)
+    base_point = v if by_v else q
+    for group in range(begins.size - 1):
+        copy(base_point, moved)
+        first, last = begins[group], begins[group + 1]
+        for k in range(first, last):
+            j = columns[k]
+            moved[j] = base_point[j] + RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
+        if by_v:
+            _fill_sparse_residual(f, w, t, q, moved, False, residual)
+        else:
+            _fill_sparse_residual(f, w, t, moved, v, True, residual)
+        for k in range(first, last):
+            i, j = rows[k], columns[k]
+            entries[k] = (residual[i] - base[i]) / (moved[j] - base_point[j])
+    return DONE if finite_vector(entries) else NOT_FINITE
+
+
+@compiled
+def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
+    """Return whether the `entries` of K or D explain the difference between the residuals `base` and `residual` (n_q).
+
+    `base` is the residual at `base_point` (q or v), `residual` that at `moved`; `largest` is the largest term of
+    a residual. `residual` and `predicted` (n_q) are overwritten.
+    """
+    rows, columns, _ = tangent_entries_of(f.newton_program)
+    predicted[:] = 0.0
+    for k in range(rows.size):
+        i, j = rows[k], columns[k]
+        term = entries[k] * (moved[j] - base_point[j])
+        residual[i] -= term
+        predicted[i] += abs(term)
+    largest_excess = 0.0
+    for i in range(base.size):
+        largest_excess = max(largest_excess, abs(residual[i] - base[i]) - MAX_DEVIATION * predicted[i])
+    return largest_excess <= RESIDUAL_ROUNDING * largest
+
+
+@compiled
+def _fill_sparse_tangents(f, w, memory, t, q, v):
+    """Store the entries of K and D at (t, q, v), the last evaluated state, in w.matrices; return a code.
+
+    The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
+    """
+    if f.newton_program.size == 0:
+        return NEEDS_DENSE
+    w.n_jacobians += 1
+    mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
+    base, residual, moved, pivot_sizes, _, _ = _sparse_scratch(f, w)
+    copy(w.mass_values, mass)
+    copy(w.jacobian_values, jacobian)
+    copy(w.is_independent, is_independent)
+    copy(w.solutions[w.solutions.size - is_independent.size :], stiffness)
+    largest = _fill_sparse_residual(f, w, t, q, v, False, base)
+    code = _fill_tangent_entries_by_differences(f, w, t, q, v, False, base, residual, moved, K)
+    if code != DONE:
+        return code
+    for j in range(q.size):
+        moved[j] = displace_unequally(q[j], j)
+    _fill_sparse_residual(f, w, t, moved, v, True, residual)
+    is_complete = _has_complete_pattern(f, base, residual, q, moved, largest, K, pivot_sizes[: q.size])
+    copy(jacobian, w.jacobian_values)
+    for j in range(q.size):
+        moved[j] = displace_unequally(v[j], j)
+    _fill_sparse_residual(f, w, t, q, moved, False, residual)
+    memory[at.HAS_DAMPING] = 0.0
+    for i in range(q.size):
+        if residual[i] != base[i]:
+            memory[at.HAS_DAMPING] = 1.0
+    if memory[at.HAS_DAMPING] == 0.0:
+        D[:] = 0.0
+        return DONE if is_complete else NEEDS_DENSE
+    code = _fill_tangent_entries_by_differences(f, w, t, q, v, True, base, residual, moved, D)
+    if code != DONE:
+        return code
+    for j in range(q.size):
+        moved[j] = displace_unequally(v[j], j)
+    _fill_sparse_residual(f, w, t, q, moved, False, residual)
+    is_complete = _has_complete_pattern(f, base, residual, v, moved, largest, D, pivot_sizes[: q.size]) and is_complete
+    return DONE if is_complete else NEEDS_DENSE
+
+
+@compiled
+def _factor_sparse_matrix(f, w, z, factors):
+    """Store the factors of the bordered matrix for z in `factors`, real or complex as z is; return a code."""
+    mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
+    _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
+    w.n_factorizations += 1
+    load_matrix(f.newton_program, mass, jacobian, K, D, z, stiffness, factors)
+    return DONE if factor_lu(f.newton_program, is_independent, factors, pivot_sizes) else SINGULAR
+
+
+@compiled
+def _fill_sparse_right_side(f, w, r, right):
+    """Store the right-hand side [M r; G r] of the bordered system in `right`, with M stiffened by redundant rows."""
+    mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
+    right[:] = 0.0
+    rows, columns, _ = mass_entries_of(f.newton_program)
+    for k in range(mass.size):
+        right[rows[k]] += mass[k] * r[columns[k]]
+    rows, columns, _ = jacobian_entries_of(f.newton_program)
+    for k in range(rows.size):
+        right[w.Q.size + rows[k]] += jacobian[k] * r[columns[k]]
+    add_redundant_stiffness(f.newton_program, jacobian, is_independent, stiffness, right, right)
+
+
+@compiled
+def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
+    """Replace e_v (n_q) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
+    _, _, K, _, _, _ = _sparse_derivative_views(f, w)
+    _, _, _, _, right, y = _sparse_scratch(f, w)
+    z, n = h * options[newton_options_index(s) + at.GAMMA0], y.size
+    x = right.view(np.float64)[:n]
+    _fill_sparse_right_side(f, w, e_v, x)
+    rows, columns, _ = tangent_entries_of(f.newton_program)
+    for k in range(rows.size):
+        x[rows[k]] += z * K[k] * e_q[columns[k]]
+    solve_lu(f.newton_program, _sparse_factor_view(f, w, 0), x, y.view(np.float64)[:n])
+    copy(x[: e_v.size], e_v)
+
+
+# --- functions for all kinds of storage, which the steps call
 
 
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v (dense storage) or K and D (banded) in w.matrices; return a code, NEEDS_DENSE without storage.
+    """Store J_q and J_v (dense storage) or K and D (else) in w.matrices; return a code.
 
     (t, q, v) is the last evaluated state, and a its accelerations.
     """
     if f.form == STATIC:
-        return NEEDS_DENSE
+        return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.bandwidth >= 0:
         return _fill_banded_tangents(f, w, memory, s, t, q, v)
     return _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a)
@@ -531,6 +760,8 @@ def _factor_system(f, w, memory, s, which, z, numbers, factorize, substitute):
 def factor_filter(f, w, options, memory, s, h):
     """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, with z = h gamma0; return a code."""
     z = h * options[newton_options_index(s) + at.GAMMA0]
+    if f.form == STATIC:
+        return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 0))
     return _factor_system(f, w, memory, s, 0, z, matrix_storage(w, w.Q.size, at.FILTER), DGBTRF, DGBTRS)
 
 
@@ -545,7 +776,10 @@ def factor_systems(f, w, options, memory, s, h):
         # if the first eigenvalue is real, it is gamma0, for which `factor_filter` has computed the factors
         if code == DONE and (k > 0 or n_real == 0):
             z = h * complex(options[offset], options[offset + 1])
-            code = _factor_system(f, w, memory, s, 1 + k, z, system_storage(w, w.Q.size, k), ZGBTRF, ZGBTRS)
+            if f.form == STATIC:
+                code = _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 1 + k).view(np.complex128))
+            else:
+                code = _factor_system(f, w, memory, s, 1 + k, z, system_storage(w, w.Q.size, k), ZGBTRF, ZGBTRS)
         offset += 2 + 4 * s
     memory[at.H_FACTORED] = h
     return code
@@ -562,6 +796,14 @@ def _solve_system(f, w, memory, s, which, numbers, substitute, X, x):
 
 
 @compiled
+def _solve_sparse_system(f, w, numbers, right, y, x):
+    """Replace x (n_q), real or complex, by the solution with the factors `numbers`; `right` and `y` are scratch."""
+    _fill_sparse_right_side(f, w, x, right)
+    solve_lu(f.newton_program, numbers, right, y)
+    copy(right[: x.size], x)
+
+
+@compiled
 def solve_system(f, w, options, memory, s, k, x):
     """Replace x[:n_dof], a complex right-hand side, by the solution for eigenvalue k of A, which may be real."""
     n = w.Q.size
@@ -569,9 +811,17 @@ def solve_system(f, w, options, memory, s, k, x):
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
-        _solve_system(f, w, memory, s, 0, matrix_storage(w, n, at.FILTER), DGBTRS, X, real_part)
+        if f.form == STATIC:
+            _, _, _, _, right, y = _sparse_scratch(f, w)
+            size, real_right, real_y = y.size, right.view(np.float64), y.view(np.float64)
+            _solve_sparse_system(f, w, _sparse_factor_view(f, w, 0), real_right[:size], real_y[:size], real_part)
+        else:
+            _solve_system(f, w, memory, s, 0, matrix_storage(w, n, at.FILTER), DGBTRS, X, real_part)
         for i in range(x.size):
             x[i] = real_part[i]
+    elif f.form == STATIC:
+        _, _, _, _, right, y = _sparse_scratch(f, w)
+        _solve_sparse_system(f, w, _sparse_factor_view(f, w, 1 + k).view(np.complex128), right, y, x)
     else:
         X = complex_vector(memory, s, n, count_systems(options, s), 1)
         _solve_system(f, w, memory, s, 1 + k, system_storage(w, n, k), ZGBTRS, X, x)
@@ -584,7 +834,9 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
     """
     m = w.independent.size
-    if f.bandwidth >= 0:
+    if f.form == STATIC:
+        _filter_error_sparse(f, w, options, s, h, e_q, e_v)
+    elif f.bandwidth >= 0:
         _filter_error_banded(f, w, options, memory, s, h, e_q, e_v)
     else:
         _filter_error_dense(w, options, memory, s, h, e_q[:m], e_v[:m])

@@ -1,0 +1,187 @@
+"""Factor the unsymmetric Newton matrix of a large system by a static program, and group the columns of K and D.
+
+    [M - z^2 K - z D  G^T]
+    [G                 0 ]  = L U
+
+The order of elimination is that of symbolic_factorization.py with couplings; pivots are single entries, chosen by the
+pattern alone. The program lists the entries of M first, then those of K and D. It ends with groups of columns of K and
+D: no two columns of a group have an entry in the same row, so that one displacement gives all columns of the group by
+differences (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.linalg.symbolic_factorization import (
+    N_COORDINATES,
+    N_OFF_DIAGONAL,
+    N_PIVOTS,
+    Entries,
+    Integers,
+    elimination_order,
+    end_of_sections,
+    factor_columns_of,
+    jacobian_entries_of,
+    mass_entries_of,
+    pivot_order_of,
+    program_in_order,
+    stiffening_products_of,
+    update_runs_of,
+)
+
+MIN_PIVOT = 1e-11  # smaller pivots, relative to the sum of their |terms|, may be rounding errors of zero
+
+
+def newton_program(
+    n_q: int,
+    n_rows: int,
+    mass: Entries,
+    jacobian: Entries,
+    tangents: Entries,
+    body_groups: Iterable[Sequence[int]],
+    stiff_rows: Sequence[int],
+) -> NDArray[np.int32] | None:
+    """Return the program that factors Newton's matrix; None if the program would have too many updates.
+
+    `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`.
+    """
+    groups = column_groups(tangents, n_q)[tangents[1]]
+    group_begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
+    order = elimination_order(n_q, n_rows, mass, jacobian, body_groups, stiff_rows, tangents)
+    entries = np.concatenate([mass[0], tangents[0]]), np.concatenate([mass[1], tangents[1]])
+    program = program_in_order(order, n_q, entries, jacobian, stiff_rows, unsymmetric=True)
+    return None if program is None else np.concatenate([program, group_begins]).astype(np.int32)
+
+
+def grouped_entries(tangents: Entries, n_q: int) -> Entries:
+    """Return the entries of K and D, sorted by the groups of their columns."""
+    sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
+    return tangents[0][sequence], tangents[1][sequence]
+
+
+def column_groups(entries: Entries, n_q: int) -> Integers:
+    """Return the index of the group of each column (n_q); the columns of a group have no entry in the same row."""
+    rows_of: list[list[int]] = [[] for _ in range(n_q)]
+    for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
+        rows_of[j].append(i)
+    groups = np.zeros(n_q, dtype=np.int64)
+    # groups of the columns with an entry in each row
+    groups_by_row: list[set[int]] = [set() for _ in range(n_q)]
+    for j, rows in enumerate(rows_of):
+        groups_in_rows = set().union(*(groups_by_row[i] for i in rows))
+        groups[j] = group = next(k for k in range(n_q) if k not in groups_in_rows)
+        for i in rows:
+            groups_by_row[i].add(group)
+    return groups
+
+
+@inlined
+def tangent_entries_of(program):
+    """Return the rows and the columns of the entries of K and D, and the index of the first entry of each column group.
+
+    The columns of a group are differenced together. The last index is the number of entries.
+    """
+    group_begins = program[end_of_sections(program) :]
+    rows, columns, _ = mass_entries_of(program)
+    n_mass = rows.size - group_begins[group_begins.size - 1]
+    return rows[n_mass:], columns[n_mass:], group_begins
+
+
+@compiled
+def load_matrix(program, mass, jacobian, K, D, z, stiffness, values):
+    """Store Newton's matrix for z (real or complex) in the slots in `values`, from the entries of M, G, K and D."""
+    for s in range(values.size):
+        values[s] = 0.0
+    n_off = program[N_OFF_DIAGONAL]
+    _, _, slots = mass_entries_of(program)
+    for k in range(mass.size):
+        values[slots[k]] += mass[k]
+    for k in range(K.size):
+        values[slots[mass.size + k]] -= z * (z * K[k] + D[k])
+    _, _, slots = jacobian_entries_of(program)
+    for k in range(slots.size):
+        values[slots[k]] += jacobian[k]
+        values[slots[k] + n_off] += jacobian[k]
+    product_rows, first, second, slots = stiffening_products_of(program)
+    for u in range(product_rows.size):
+        product = stiffness[product_rows[u]] * jacobian[first[u]] * jacobian[second[u]]
+        values[slots[u]] += product
+        if slots[u] >= program[N_PIVOTS]:
+            values[slots[u] + n_off] += product
+
+
+@compiled
+def factor(program, is_independent, values, sizes):
+    """Replace the matrix in `values` by its factors, 1/pivot on the diagonal; return False if a pivot is too small.
+
+    Factors of redundant rows (0 in `is_independent`) become 0, so that solutions do not use them. `sizes` is scratch.
+    """
+    n_q, n, n_off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF_DIAGONAL]
+    order, runs = pivot_order_of(program), update_runs_of(program)
+    begin, row_of = factor_columns_of(program)
+    for k in range(n):
+        sizes[k] = abs(values[k])
+    u = 0
+    for k in range(n):
+        first, last = n + begin[k], n + begin[k + 1]
+        if order[k] >= n_q and is_independent[order[k] - n_q] == 0.0:
+            values[k] = 0.0
+            for s in range(first, last):
+                values[s] = 0.0
+                values[s + n_off] = 0.0
+                slot = s + 1
+                while slot < last:
+                    slot += runs[u]
+                    u += 2
+            continue
+        if not abs(values[k]) > MIN_PIVOT * sizes[k]:  # also true for NaN
+            return False
+        inverse = 1.0 / values[k]
+        values[k] = inverse
+        for s in range(first, last):
+            lower, upper = values[s] * inverse, values[s + n_off] * inverse
+            target = row_of[s - n]
+            change = lower * values[s + n_off]
+            values[target] -= change
+            sizes[target] += abs(change)
+            slot = s + 1
+            while slot < last:
+                size, target = runs[u], runs[u + 1]
+                if upper != 0.0:
+                    target_run, source_run = values[target : target + size], values[slot : slot + size]
+                    for i in range(size):
+                        target_run[i] -= source_run[i] * upper
+                if lower != 0.0:
+                    target_run, source_run = (
+                        values[target + n_off : target + n_off + size],
+                        values[slot + n_off : slot + n_off + size],
+                    )
+                    for i in range(size):
+                        target_run[i] -= lower * source_run[i]
+                slot += size
+                u += 2
+            values[s] = lower
+    return True
+
+
+@compiled
+def solve(program, values, x, y):
+    """Replace the right-hand side x = [r, c] by the solution, with the factors `values`; y is scratch."""
+    n, n_off, order = program[N_PIVOTS], program[N_OFF_DIAGONAL], pivot_order_of(program)
+    begin, row_of = factor_columns_of(program)
+    for k in range(n):
+        y[k] = x[order[k]]
+    for k in range(n):
+        y_k = y[k]
+        for s in range(begin[k], begin[k + 1]):
+            y[row_of[s]] -= values[n + s] * y_k
+    for k in range(n - 1, -1, -1):
+        total = y[k]
+        for s in range(begin[k], begin[k + 1]):
+            total -= values[n + n_off + s] * y[row_of[s]]
+        y[k] = total * values[k]
+    for k in range(n):
+        x[order[k]] = y[k]
