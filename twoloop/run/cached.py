@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_vector
-from twoloop.checks.consistency import StartEvaluation, check_start
+from twoloop.checks.consistency import StartEvaluation, check_start, is_consistent
 from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import has_exact_derivatives, with_derived_callbacks
@@ -183,7 +183,7 @@ class CachedIntegrator:
         began = clock()
         try:
             n = self._start_and_advance(*start, False)
-            if n == loops.IN_DOUBT and self.evaluation.is_surely_consistent(0, t0, q0, v0):
+            if n == loops.IN_DOUBT and is_consistent(self.evaluation.system, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
         except Exception as error:  # raised by a callback: `IntegrationLoop` will handle it
             if raised_by_handler(error):
