@@ -6,7 +6,6 @@ import copy
 import inspect
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -217,9 +216,10 @@ class Integrator:
         """
         if self._sampled is None:
             raise ValueError("result has the samples since a start: call integrator.start(t0, q0, v0) first")
-        record = replace(self._sampled.record(), system=self._started_system, method=self._options["method"].name)
         atol = check_tolerance("atol", self._options["atol"], self.system.n_q)
-        return record_of(Result, vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
+        settings = {"method": self._options["method"].name, "rtol": float(self._options["rtol"]), "atol": atol}
+        fields = self._sampled.fields() | settings | {"system": self._started_system, "compiled": False}
+        return record_of(Result, fields)
 
     def _system_with(self, parameters: ArrayLike) -> ConstrainedSystem:
         system = self.system.with_parameters(parameters)

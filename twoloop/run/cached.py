@@ -61,8 +61,7 @@ from twoloop.run.record import (
 from twoloop.run.rerun import (
     FIRST_FORCE,
     checked_region_of,
-    compare_callbacks_at,
-    describe_changed_force,
+    compare_callbacks,
     find_nondeterminism,
     first_force,
 )
@@ -293,29 +292,17 @@ class CachedIntegrator:
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
     def _compare_callbacks(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
-        """Check callbacks at sampled states of the run outside the checked region; return whether they are correct.
+        """Return whether callbacks are correct at states of the run, see `compare_callbacks`."""
+        n = 2 * self.run.system.n_q
 
-        `inside`: whether all states are within the region. `due`: whether to check at all sampled states.
-        """
-        run, region, parameters = self.run, self.region, self.run.varied_parameters
-        if describe_changed_force(run) is not None:
-            return False
-        if run.compared_until[0] >= t1 and not due:
-            return True
-        all_states = due or (parameters is not None and not region.contains_parameters(parameters))
-        if all_states or not inside:
-            n, status = 2 * run.system.n_q, Status.REACHED_END
+        def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            states = sample.states()
-            if not all_states:  # with the extreme states of this run, the region contains all states of an equal run
-                states = np.concatenate([extreme_states(t, rows[:, :n]), states])
-            if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", all_states)[0] != status:
-                return False
-            if parameters is not None:
-                region.add_parameters(parameters)
-        run.compared_until[0] = t1
-        return True
+            # with the extreme states of this run, the checked region contains all states of an equal run
+            return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
+
+        checks = t1, self.check_derivatives, REACHED_END, "", due, inside
+        return compare_callbacks(self.run, states, *checks)[0] == REACHED_END
 
 
 def fields_of(

@@ -69,7 +69,7 @@ from twoloop.run.record import (
     statistics,
     step_fields,
 )
-from twoloop.run.rerun import compare_callbacks
+from twoloop.run.rerun import checked_region_of, compare_callbacks
 from twoloop.run.run import SMALL_SYSTEM, Buffers, Run
 from twoloop.run.signals import SignalHandlers, is_in_user_function, raised_by_handler
 from twoloop.run.singular_positions import TimedState, velocities_turned_last
@@ -429,7 +429,13 @@ class IntegrationLoop:
                 if recorder.end_state is not None:
                     self.sample.end_at(*recorder.end_state)
                     end = recorder.end_state[0]
-                status, message = compare_callbacks(run, self.sample, end, check_derivatives, status, message)
+                region = checked_region_of(run, check_derivatives)
+                due = region.is_comparison_due() or run.system.called_in_python
+                region.count_run()
+                states = self.sample.states()
+                status, message = compare_callbacks(
+                    run, lambda all_states: states, end, check_derivatives, status, message, due
+                )
             if self.is_final_attempt and status >= 0:
                 message += warn_of_missed_changes(run) + warn_of_passage_by_ordinary_steps(run)
             if status >= 0 and run.start_warning:
