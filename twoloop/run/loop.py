@@ -166,9 +166,9 @@ class IntegrationLoop:
         run: Run,
         t1: float,
         request: OutputRequest,
-        report: Callable[[float], object],
-        time_limit: float | None,
         interrupts: Interrupts,
+        report: Callable[[float], object] = lambda t: None,
+        time_limit: float | None = None,
         is_final_attempt: bool = True,
         start: Array | None = None,
         system: ConstrainedSystem | None = None,
@@ -499,10 +499,6 @@ class IntegrationLoop:
         if across:
             return np.full(len(steps), indices.ACROSS)
         return interval_kinds(run, steps)
-
-
-def ignore_progress(t: float) -> None:
-    """Do nothing: the `report` of a loop without a progress bar."""
 
 
 def _error_note(name: str, t: float, error: Exception) -> str:

@@ -260,7 +260,7 @@ class SampledRun:
         interrupts = Interrupts().install_handlers()
         try:
             output = OutputRequest(np.array([end]), ends_at_outputs=True)
-            record = IntegrationLoop(run, end, output, lambda t: None, None, interrupts).integrate_to_end(False)
+            record = IntegrationLoop(run, end, output, interrupts).integrate_to_end(False)
         finally:
             interrupts.restore_handlers()
         run.control[run.a.STORE_ALL], run.work.notes[indices.KINK_AFTER] = 0.0, np.inf
