@@ -6,6 +6,7 @@ import copy
 import inspect
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -230,12 +231,8 @@ class Integrator:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle the system and the options only: two integrators cannot share the arrays of a motion."""
-        return _create, (self.system, self._options)
+        return partial(Integrator, self.system, **self._options), ()
 
     def __repr__(self) -> str:
         method, rtol, atol = (self._options[name] for name in ("method", "rtol", "atol"))
         return f"<Integrator of {self.system.name!r}: {method.name}, rtol {rtol}, atol {atol}>"
-
-
-def _create(system: ConstrainedSystem, options: dict[str, Any]) -> Integrator:
-    return Integrator(system, **options)

@@ -24,6 +24,7 @@ from twoloop.generate.traced_values import Sample
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import LONGEST_UNSEEN
+from twoloop.kernels.steps.stages import load_step
 from twoloop.problem.events import SAMPLES
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import interpolator_of
@@ -32,7 +33,7 @@ from twoloop.run.fallbacks import (
     cross_singularity,
     crossing_kit,
     handle_crossing,
-    load_next_step,
+    renew_kit,
     requires_crossing,
     switch_method,
     warn_of_missed_changes,
@@ -62,7 +63,6 @@ from twoloop.run.record import (
     Statistics,
     Status,
     failure_link,
-    fields_of_run,
     interval_kinds,
     record_of,
     state_fields,
@@ -245,7 +245,7 @@ class IntegrationLoop:
                 _spare_buffers.pop(oldest, None)
         if self.request.between_steps:
             began = time.process_time()
-            recorder.finish()
+            recorder.search_intervals()
             self.cpu_time += time.process_time() - began
         if self.callback_error is not None and recorder.end_event is None:
             raise self.callback_error
@@ -363,7 +363,8 @@ class IntegrationLoop:
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.NEEDS_COMPILATION:
             began = time.monotonic()
-            load_next_step(run)
+            load_step(run.plan.second)  # compile, or load from disk, the second step of a pair of methods
+            renew_kit(run)
             self.deadline += time.monotonic() - began  # compilation does not count against time_limit
             self.kit, self.code = run.kit, a.PAUSED
         elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
@@ -447,7 +448,9 @@ class IntegrationLoop:
         if self.interrupts.n_signals or recorder.interrupted or (code == INTERRUPTED and recorder.end_event is None):
             status, message = Status.INTERRUPTED, describe_interrupt(time_reached, table)
         t_events, q_events, v_events = recorder.events()
-        fields = fields_of_run(run, t, table) | {name: store.array(name) for name in STEP_ARRAYS}
+        fields: dict[str, Any] = state_fields(run.system.n_q, t, table) | {k: store.array(k) for k in STEP_ARRAYS}
+        fields |= {"rank": run.rank, "redundant": run.redundant.copy()}  # copies of a run share this array
+        fields |= {"defect": run.defect(), "widest_gap": float(run.work.notes[indices.WIDEST_GAP])}
         fields |= message_of(run, message + failure_link(status), self.system)
         fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": self.system}
         fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}

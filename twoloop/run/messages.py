@@ -217,14 +217,6 @@ _FAILURE_REASONS = {
 }
 
 
-def _describe_jumps_and_crossings(run: "Run") -> str:
-    """Return a sentence about jumps of C_t or b, if any, and CROSSINGS_MARK if steps crossed singular positions."""
-    text = f" At t = {_format_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(
-        run.jumps
-    )
-    return text + (CROSSINGS_MARK if run.crossings else "")
-
-
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} with a function that computes the text when it is read.
 
@@ -286,8 +278,11 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
     """Return the status and the message of a run that ended with a code of `advance`, or with one of this module."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
-        arrival = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
-        return Status.REACHED_END, arrival + _describe_jumps_and_crossings(run) + warn_of_singular_end(run)
+        text = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
+        if run.jumps:
+            times = ", ".join(f"{jump:.4g}" for jump in run.jumps[:3]) + (", ..." if len(run.jumps) > 3 else "")
+            text += f" At t = {times} C_t or b jumps: velocities changed there as by an impulse."
+        return Status.REACHED_END, text + (CROSSINGS_MARK if run.crossings else "") + warn_of_singular_end(run)
     stopped = f"Stopped at t = {t:.10g}"
     failure_code = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:
@@ -395,9 +390,12 @@ def warn_of_singular_end(run: "Run") -> str:
         error_ratio = _velocity_error_ratio(run, t, q, v)
         if error_ratio <= indices.REPORTED_ERROR:
             return ""
+        excess = f"about {error_ratio:.1g} times what rtol and atol allow"
+        if not np.isfinite(error_ratio):
+            excess = "more than can be told"
         text = (
             f"the run ends where the constraints nearly lose rank ({_ratio_text(run, t, q)}): rounding of positions "
-            f"changes velocities there {_format_excess(error_ratio)}, and accelerations by more. "
+            f"changes velocities there by {excess}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
     return warn_user(text)
@@ -432,10 +430,6 @@ def _velocity_error_ratio(run: "Run", t: float, q: Array, v: Array) -> float:
     """Return the largest estimated error of velocities due to rounding of positions, divided by the tolerance."""
     allowed = run.tolerances[indices.ATOL :] + run.rtol * np.abs(v).max()
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
-
-
-def _format_excess(ratio: float) -> str:
-    return f"by about {ratio:.1g} times what rtol and atol allow" if np.isfinite(ratio) else "by more than can be told"
 
 
 def _ratio_text(run: "Run", t: float, q: Array) -> str:
@@ -489,7 +483,3 @@ def describe_not_finite(run: "Run") -> str:
             "(exp, tanh). Take 'auto' or 'DOP853', which evaluate the functions only"
         )
     return "the callbacks are finite at the start of the step, but not at a state within it"
-
-
-def _format_times(times: list[float]) -> str:
-    return ", ".join(f"{t:.4g}" for t in times[:3]) + (", ..." if len(times) > 3 else "")

@@ -68,7 +68,8 @@ def compare_callbacks(
     if len(chosen) > 0:
         if check_derivatives:
             status, message = _check_derivatives(run, chosen, first_state, status, message)
-        status, message = _check_traces(run, chosen, status, message)
+        if wrong := next(filter(None, (traced.difference(run.system, chosen) for traced in run.traced)), None):
+            status, message = Status.WRONG_TRACE, f"In the run {wrong}. {message}"
         if status == old_status and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
             difference = find_nondeterminism(run.system, chosen[:: 1 + len(chosen) // MAX_STATES_IN_PYTHON])
             if difference is not None:
@@ -170,15 +171,6 @@ def _change_text(name: str, t: float, entry: int, first_value: float, second_val
         f"t = {t:.10g} entry {entry} is {first_value:.9g}, and then {second_value:.9g}. It must "
         "depend on its arguments alone: steps are tried, rejected and sampled in advance"
     )
-
-
-def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[Status, str]:
-    """Return status and message, changed if a callback differs from its trace at one of the states [t, q, v]."""
-    for traced in run.traced:
-        difference = traced.difference(run.system, states)
-        if difference is not None:
-            return Status.WRONG_TRACE, f"In the run {difference}. {message}"
-    return status, message
 
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
