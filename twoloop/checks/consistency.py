@@ -281,25 +281,21 @@ class StartEvaluation:
         self.flags, self._evaluate = start_checks, entry_point(evaluate_start)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, results_size(system.n_q, system.n_c, system.n_a)
         self.system, values = system, np.zeros(size + n * n + 2 * n_rows * n)
-        self._room, mass, rows, pattern = np.split(values, np.cumsum([size, n * n, n_rows * n]))
+        room, mass, rows, pattern = np.split(values, np.cumsum([size, n * n, n_rows * n]))
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
         self.arrays = {
-            **{"start_values": values, "lam": np.ones(system.n_c), "room": self._room, "mass": self.mass},
+            **{"start_values": values, "lam": np.ones(system.n_c), "room": room, "mass": self.mass},
             **{"rows": self.rows, "shifts": shifts(n)[1:], "pattern": self.pattern, "roundings": ROUNDINGS},
         }
-        self.definite: bool | None = None  # whether an M that varies has an inverse; None: not certain, or constant
 
     def evaluate(self, t: float, q: Array, v: Array) -> int:
         """Evaluate the callbacks at a start; return the flags of kernels/evaluation/checks.py, or 0 on an exception."""
-        definite, indefinite = self.flags.DEFINITE, self.flags.INDEFINITE
         values, *arrays = self.arrays.values()
         values.fill(0.0)
         try:
-            bits: int = self._evaluate(self.system.kit, t, q, v, self.sizes(), *arrays)
+            return int(self._evaluate(self.system.kit, t, q, v, self.sizes(), *arrays))
         except Exception:  # a callback raised: the detailed checks call it again and give the message
             return 0
-        self.definite = bool(bits & definite) if bits & (definite | indefinite) else None
-        return bits
 
     def sizes(self) -> Array:
         """Return sizes of coordinates at earlier starts (see `Scales.keep`): lower limits for rounding errors."""
@@ -312,12 +308,13 @@ def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) 
     if system.called_in_python or system.entries:
         return False
     evaluation = StartEvaluation(system)
-    bits = evaluation.evaluate(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
-    if not bits & evaluation.flags.WELL_FORMED:
+    flags, state = evaluation.flags, (np.ascontiguousarray(x, dtype=np.float64) for x in (q, v))
+    bits = evaluation.evaluate(t, *state)
+    if not bits & flags.WELL_FORMED:
         return False
     place = (t, q.tobytes())
     system.remember_at("pattern", place, evaluation.pattern)
     system.remember_at("mass and rows", place, (evaluation.mass, evaluation.rows))
-    if evaluation.definite is not None:
-        system.remember_at("definite mass", place_of_mass(system, t, q), evaluation.definite)
-    return bool(bits & evaluation.flags.CONSISTENT)
+    if bits & (flags.DEFINITE | flags.INDEFINITE):  # neither if M is constant, or if rounding would decide
+        system.remember_at("definite mass", place_of_mass(system, t, q), bool(bits & flags.DEFINITE))
+    return bool(bits & flags.CONSISTENT)
