@@ -329,10 +329,12 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
             f"{stopped}: with the fixed step_size = {run.control[a.FIXED_STEP]:g} {reason}. Take a smaller "
             "step_size, or leave it out for step-size control.",
         )
+    least_ratio, words = least_inertia(run.system, t, run.state[: run.system.n_q])
+    massless = f"There {words}. " if least_ratio < MAX_SINGULAR_RATIO else ""
     return (
         Status.STEP_TOO_SMALL,
         f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
-        f"{_describe_near_singular(run, t1)}{_describe_near_massless(run)}Look for a discontinuity near this time, "
+        f"{_describe_near_singular(run, t1)}{massless}Look for a discontinuity near this time, "
         "loosen rtol and atol, or use coordinates of similar scale.",
     )
 
@@ -454,13 +456,6 @@ def _describe_near_singular(run: "Run", t1: float) -> str:
         f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
         f"{ratio:.1g} of the largest. No step led across: {_REMEDIES}.{_describe_near_end(run, t1)} "
     )
-
-
-def _describe_near_massless(run: "Run") -> str:
-    """Return a sentence if some allowed motion has almost no inertia at the last state, else ""."""
-    t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
-    ratio, words = least_inertia(run.system, t, q)
-    return f"There {words}. " if ratio < MAX_SINGULAR_RATIO else ""
 
 
 def describe_not_finite(run: "Run") -> str:
