@@ -257,7 +257,8 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
     if plan is not None:
         key += (plan.inner, plan.step, plan.first, plan.second, len(LOADED_STEPS))
         key += tuple(map(id, (*plan.own, plan.numbers, plan.own_numbers)))
-    if key not in kits:
+    entry = kits.get(key)
+    if entry is None:
         flags = flags.copy()
         flags[STRAIGHT] = plan is not None and plan.inner is not None
         functions, inner = system.functions._replace(flags=flags), inner_loop
@@ -267,9 +268,8 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
             steps = *_steps_of_plan(plan), inner_loop, plan.own, plan.numbers, plan.own_numbers
         if len(kits) == MAX_KITS:
             del kits[next(iter(kits))]
-        kits[key] = Kit(functions, inner, *steps), system.functions
-    kit = kits[key][0]
-    return _with_own_flags(kit) if flags[FORM] == AUGMENTED else kit  # a run may change these flags
+        entry = kits[key] = Kit(functions, inner, *steps), system.functions
+    return _with_own_flags(entry[0]) if flags[FORM] == AUGMENTED else entry[0]  # a run may change these flags
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
