@@ -7,7 +7,6 @@ from pathlib import Path
 from tests.bad_input.case import Case
 from tests.bad_input.cases import CASES
 from twoloop import Status
-from twoloop.run.record import MEANINGS
 
 PAGE = Path(__file__).parents[1] / "docs" / "errors.md"
 LONGEST = 400  # characters of a message
@@ -56,6 +55,25 @@ def cell(text: str) -> str:
     parts = text.replace("|", "\\|").split("`")
     parts[::2] = [part.replace("<", "&lt;").replace("*", "\\*") for part in parts[::2]]
     return "`".join(parts)
+
+
+MEANINGS: dict[Status, str] = {
+    Status.REACHED_END: "the end of t_span was reached",
+    Status.EVENT: "an event ended the run",
+    Status.STEP_TOO_SMALL: "the step size fell below the spacing of floating-point numbers",
+    Status.MAX_STEPS: "max_steps accepted steps were taken",
+    Status.NOT_CONVERGED: "a step of fixed size did not converge, or gamma by differences misses the tolerance",
+    Status.NOT_FINITE: "a callback returned a value that is not finite, or the state overflowed",
+    Status.RANK_LOST: "the constraint Jacobian lost rank: no choice of independent coordinates exists",
+    Status.SOLVER_FAILED: "a solver of another project failed, or reached the time limit of its adapter",
+    Status.INTERRUPTED: "the run was interrupted from the keyboard",
+    Status.STAGNATED: "the steps became so short that the end is out of reach",
+    Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong, or M not symmetric, at a state of the run",
+    Status.TIME_LIMIT: "the run reached its time_limit",
+    Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
+    Status.RATE_JUMPS: "constraint_rate or nonholonomic_rate jumps, and no impulse gives velocities that are allowed",
+    Status.WRONG_TRACE: "a callback gives other values than the operations that were recorded of it, or than before",
+}
 
 
 def statuses() -> list[str]:

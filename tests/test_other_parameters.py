@@ -11,8 +11,6 @@ from tests.problems import assert_same, quick, some_of
 from tests.problems import pendulum as bare_pendulum
 from tests.test_bounds import FAR
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, mechanisms, solve_dae
-from twoloop.checks.consistency import Violation, surely_consistent
-from twoloop.checks.scales import scales_of
 
 METHODS = ["auto", "Taylor", "DOP853", "Adams", "RadauIIA5", "BDF"]
 NAMES = ["four_bar", "redundant_slider_crank", "heavy_top", "knife_edge", "driven_crank", "n_four_bar"]
@@ -180,32 +178,6 @@ def test_an_integrator_takes_parameters_as_it_would_a_system(taken):
 
 
 # --- calls from other starts and with other parameters: what is kept between them hides no mistake
-@pytest.mark.parametrize(
-    "name",
-    quick(["redundant_slider_crank", "driven_crank", "n_four_bar", "rolling_disc", "spatial_four_bar", "bricard"], 2),
-)
-@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-def test_what_is_accepted_without_singular_values_is_accepted_by_them(name):
-    problem, random = getattr(mechanisms, name)(), np.random.default_rng(4)
-    system, n_sure, state = problem.system, 0, _state(problem)
-    for _ in range(120):
-        q, v = (x * (1.0 + 10.0 ** random.uniform(-15, -6) * random.standard_normal(len(x))) for x in state)
-        rows, C, rates = system.rows(0.0, q), system.constraint(0.0, q), system.rates(0.0, q)
-        if not surely_consistent(system, 0.0, q, v, system.mass(0.0, q), system.force(0.0, q, v), rows, C, rates):
-            continue
-        n_sure += 1
-        jacobian = system.jacobian(0.0, q)
-        Violation.of_position(system, 0.0, q, jacobian, scales_of(system, 0.0, q, jacobian)).refuse("q0")
-        Violation.of_velocity(system, 0.0, q, v, rows, scales_of(system, 0.0, q, rows)).refuse("v0")
-    assert 10 < n_sure < 120
-
-
-def _state(problem):
-    end = solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0)
-    q, v = consistent_state(problem.system, 0.2, end.q[:, -1], end.v[:, -1])
-    return (q, v) if problem.system.given.get("constraint_rate") is None else (problem.q0, problem.v0)
-
-
 @callback("force")
 def as_far_as_it_is_told(t, q, v, p, Q):
     Q[int(p[1] * FAR)] = -9.81 * p[0]

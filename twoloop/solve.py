@@ -232,7 +232,7 @@ def solve_dae(
                     deadline = time.monotonic() + time_limit
                 limit = None if deadline is None else max(0.0, deadline - time.monotonic())
                 last = left == 0 or folder is not None
-                loop = IntegrationLoop(run, t1, output, lambda t: show(t - t0), limit, interrupts, last)
+                loop = IntegrationLoop(run, t1, output, interrupts, lambda t: show(t - t0), limit, last)
                 record = loop.integrate_to_end(check_derivatives)
             keep_unused_workspace(run.work)
             if last or record.status < 0 or not may_have_missed_changes(run):

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.problems import called, entry
-from twoloop.checks.structure import least_solution
 from twoloop.generate.elimination import MIN_PIVOTS, RANK_TOL, SINGULAR_MASS, START_LIMITS
 from twoloop.kernels.lanes import layout
 from twoloop.kernels.lanes.layout import FINE, LANES, N_FIELDS
@@ -118,18 +117,6 @@ def test_singular_matrices_have_no_program(share):
 
 RANDOM = np.random.default_rng(12)
 ROWS = RANDOM.standard_normal((5, 8))
-DEPENDENT = np.vstack([ROWS[:2], ROWS[0] - 3.0 * ROWS[1], np.zeros(8), ROWS[2:], ROWS.sum(axis=0)])
-
-
-@pytest.mark.parametrize(
-    "rows", [ROWS, DEPENDENT, DEPENDENT.T, ROWS * 10.0 ** np.arange(-4, 1)[:, None], np.zeros((2, 8))], ids=str
-)
-def test_the_least_solution_is_that_of_the_pseudo_inverse(rows):
-    values = RANDOM.standard_normal(len(rows))
-    x, left = least_solution(rows, values)
-    expected = np.linalg.pinv(rows, rcond=1e-10) @ values
-    size = np.abs(expected).max(initial=1.0)
-    assert np.allclose(x, expected, atol=1e-9 * size) and np.allclose(left, values - rows @ expected, atol=1e-9 * size)
 
 
 def chosen(mass, G):

@@ -264,7 +264,9 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
     spacing = NEAR * math.ulp(max(abs(t0), abs(t1)))
     first, last = float(times[0]), float(times[-1])
     within = (first == t0 or first - t0 > spacing) and (last == t1 or t1 - last > spacing)
-    if not (within and _are_apart(times, spacing)):  # False for NaN, too
+    with np.errstate(invalid="ignore"):  # infinite times
+        are_apart = (times[1:] - times[:-1] > spacing).all()
+    if not (within and are_apart):  # False for NaN, too
         _check_each(times, t0, t1, spacing)
     if step_size is not None:
         ratio = (times - t0) / step_size
@@ -276,14 +278,6 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
                 f"{float(times[off][0])!r} is not one"
             )
     return times
-
-
-def _are_apart(times: Array, spacing: float) -> bool:
-    """Return whether each time is later than the one before by more than a spacing."""
-    if len(times) == 1:
-        return True
-    with np.errstate(invalid="ignore"):  # infinite times
-        return bool((times[1:] - times[:-1] > spacing).all())
 
 
 def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:

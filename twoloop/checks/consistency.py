@@ -9,14 +9,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import lapack
 
 from twoloop.checks.arguments import Array
 from twoloop.checks.callbacks import UNSYMMETRIC, check_bounds, unsymmetric_mass
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.scales import EPS, NONE, Scales, defined, generic_factors, scales_of, signs
 from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
-from twoloop.checks.structure import SINGULAR_MASS, least_solution, not_finite, pattern_of, place_of_mass, shifts
+from twoloop.checks.structure import SINGULAR_MASS, not_finite, pattern_of, place_of_mass, shifts
 from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
 
 
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
-SURE_SHARE = 0.1  # share of the accepted correction: below it a state is certainly consistent
 # relative: coordinates whose corrections exceed their limits by equal ratios are tied; the message names the first one
 TIED = 1e-6
 NEIGHBOURS = 4  # number of neighbouring positions at which constraints are evaluated to measure their rounding
@@ -33,52 +31,6 @@ MOST_NOISE = 1e-11
 # relative to the largest singular value of M in units of the inertia: smaller ones count as zero
 NO_INERTIA = 1e-12
 ROUNDING = 64.0  # allowed rounding error of the state, in spacings of floating-point numbers
-
-
-def surely_consistent(
-    system: ConstrainedSystem,
-    t: float,
-    q: Array,
-    v: Array,
-    mass: Array,
-    force: Array,
-    rows: Array,
-    C: Array,
-    rates: Array,
-) -> bool:
-    """Return whether `Violation` would certainly accept a state, without singular values.
-
-    The corrections are the same, but the limits are stricter: a share of the accepted correction, no allowance for
-    rounding, and a lower bound instead of the accelerations M^-1 Q.
-    """
-    scales = scales_of(system, t, q, rows)
-    fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
-    speeds = np.maximum(fastest, np.abs(rates) / scales.rows)
-    if lapack.dpotrf(mass)[1] == 0:
-        pull = float((np.abs(force) / (np.abs(mass) @ scales.columns)).max())
-        speeds = np.maximum(speeds, np.sqrt(scales.reach * pull))
-    if not _surely_small(rows, rows @ v + rates, scales, speeds):
-        return False
-    if system.n_a > 0:
-        if system.n_c == 0:
-            return True
-        rows = rows[: system.n_c]
-        scales = scales_of(system, t, q, rows)
-    consistent = _surely_small(rows, C, scales, scales.reach)
-    if consistent:
-        scales.keep(system, q, rows)
-    return consistent
-
-
-def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) -> bool:
-    """Return whether the correction for some values, and its residual, are far below the limits."""
-    solution = least_solution(scales.scaled(rows), values / scales.rows)
-    if solution is None:
-        return False
-    x, left = solution
-    allowed = SURE_SHARE * CONSISTENT * scales.by_coordinate(per_row, rows)
-    small = np.abs(scales.columns * x) <= allowed
-    return bool(small.all() and (np.abs(left) <= SURE_SHARE * CONSISTENT * per_row).all())
 
 
 def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
@@ -203,13 +155,12 @@ class Violation:
     def excess(self) -> float:
         """Return the largest ratio of a correction to its limit; at most 1 if the state is consistent."""
         parts = [(np.abs(self.correction), self.allowed), (self.left, self.allowed_left)]
-        return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
+        with np.errstate(divide="ignore"):
+            return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
 
     def refuse(self, name: str) -> None:
         """Raise unless the state is consistent."""
-        with np.errstate(divide="ignore"):
-            excess = self.excess
-        if excess <= 1.0:
+        if self.excess <= 1.0:
             return
         row = int(np.abs(self.values).argmax())
         raise ValueError(
@@ -230,6 +181,19 @@ class Violation:
             f"to put it right {of} {j} has to change by {abs(self.correction[j]):.3g}, and at most "
             f"{self.allowed[j]:.1g} is accepted. Project it with twoloop.consistent_state(system, t, q, v)"
         )
+
+
+def is_consistent(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
+    """Return whether a state at which all callbacks are finite is consistent, for limits see `Violation`."""
+    rows, C, rate = system.rows(t, q), system.constraint(t, q), system.rates(t, q)
+    jacobian, scales = rows[: system.n_c], scales_of(system, t, q, rows)
+    if not is_at_rounding(C, jacobian, q):
+        scales_of_c = scales if system.n_a == 0 else scales_of(system, t, q, jacobian)
+        if Violation.of_position(system, t, q, jacobian, scales_of_c).excess > 1.0:
+            return False
+        scales_of_c.keep(system, q, jacobian)
+    at_rounding = is_at_rounding(rows @ v + rate, rows, v, rate)
+    return at_rounding or Violation.of_velocity(system, t, q, v, rows, scales).excess <= 1.0
 
 
 ROUNDINGS = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # limits in the order in which the kernel reads them
@@ -317,38 +281,26 @@ class StartEvaluation:
         self.flags, self._evaluate = start_checks, entry_point(evaluate_start)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, results_size(system.n_q, system.n_c, system.n_a)
         self.system, values = system, np.zeros(size + n * n + 2 * n_rows * n)
-        self._room, mass, rows, pattern = np.split(values, np.cumsum([size, n * n, n_rows * n]))
+        room, mass, rows, pattern = np.split(values, np.cumsum([size, n * n, n_rows * n]))
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
         self.arrays = {
-            **{"start_values": values, "lam": np.ones(system.n_c), "room": self._room, "mass": self.mass},
+            **{"start_values": values, "lam": np.ones(system.n_c), "room": room, "mass": self.mass},
             **{"rows": self.rows, "shifts": shifts(n)[1:], "pattern": self.pattern, "roundings": ROUNDINGS},
         }
-        self.definite: bool | None = None  # whether an M that varies has an inverse; None: not certain, or constant
 
     def evaluate(self, t: float, q: Array, v: Array) -> int:
         """Evaluate the callbacks at a start; return the flags of kernels/evaluation/checks.py, or 0 on an exception."""
-        definite, indefinite = self.flags.DEFINITE, self.flags.INDEFINITE
         values, *arrays = self.arrays.values()
         values.fill(0.0)
         try:
-            bits: int = self._evaluate(self.system.kit, t, q, v, self.sizes(), *arrays)
+            return int(self._evaluate(self.system.kit, t, q, v, self.sizes(), *arrays))
         except Exception:  # a callback raised: the detailed checks call it again and give the message
             return 0
-        self.definite = bool(bits & definite) if bits & (definite | indefinite) else None
-        return bits
 
     def sizes(self) -> Array:
         """Return sizes of coordinates at earlier starts (see `Scales.keep`): lower limits for rounding errors."""
         sizes: Array = self.system.derived.get("sizes", NONE)
         return sizes
-
-    def is_surely_consistent(self, bits: int, t: float, q: Array, v: Array) -> bool:
-        """Return whether `Violation` would certainly accept the last state; `bits`: the flags of its evaluation."""
-        if bits & self.flags.CONSISTENT:
-            return True
-        n, n_c, n_rows = self.system.n_q, self.system.n_c, len(self.rows)
-        force, C, rates = np.split(self._room[: n + n_c + n_rows], (n, n + n_c))
-        return surely_consistent(self.system, t, q, v, self.mass, force, self.rows, C, rates)
 
 
 def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
@@ -356,12 +308,13 @@ def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) 
     if system.called_in_python or system.entries:
         return False
     evaluation = StartEvaluation(system)
-    bits = evaluation.evaluate(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
-    if not bits & evaluation.flags.WELL_FORMED:
+    flags, state = evaluation.flags, (np.ascontiguousarray(x, dtype=np.float64) for x in (q, v))
+    bits = evaluation.evaluate(t, *state)
+    if not bits & flags.WELL_FORMED:
         return False
     place = (t, q.tobytes())
     system.remember_at("pattern", place, evaluation.pattern)
     system.remember_at("mass and rows", place, (evaluation.mass, evaluation.rows))
-    if evaluation.definite is not None:
-        system.remember_at("definite mass", place_of_mass(system, t, q), evaluation.definite)
-    return evaluation.is_surely_consistent(bits, t, q, v)
+    if bits & (flags.DEFINITE | flags.INDEFINITE):  # neither if M is constant, or if rounding would decide
+        system.remember_at("definite mass", place_of_mass(system, t, q), bool(bits & flags.DEFINITE))
+    return bool(bits & flags.CONSISTENT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -36,23 +35,6 @@ SHOWN = 5  # largest number of dependent rows whose equations are written out
 MOST_TERMS, MOST_NAMED = 3, 8
 WEAK = 1e-9  # relative to the largest singular value: above it, a direction certainly belongs to the pseudo-inverse
 NO_DIRECTION = 1e-12  # relative to a row: a smaller remainder, after its dependent components are subtracted, is zero
-
-
-def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
-    """Solve rows x = values by the pseudo-inverse, for rows of length 1 or less; return x and the residual.
-
-    Returns None if a direction is so weak that it may not belong to the pseudo-inverse.
-    """
-    from twoloop.kernels.linalg import rank as independent
-
-    n_rows, n_q = rows.shape
-    max_rank, kept, x, left = min(n_rows, n_q) + 1, np.zeros(n_rows, dtype=np.int64), np.zeros(n_q), values.copy()
-    basis, factors, shares = np.zeros((max_rank, n_q)), np.zeros((max_rank, max_rank)), np.zeros((n_rows, max_rank))
-    gram, parts = np.zeros((n_rows, n_rows)), np.zeros((2, n_rows))
-    room = basis, factors, kept, shares, gram, parts
-    n = entry_point(independent.least_norm_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
-    inverse = entry_point(independent.norm_of_inverse)(factors, n, parts[0])
-    return (x, left) if WEAK * math.sqrt(n_rows) * inverse < 1.0 else None
 
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:

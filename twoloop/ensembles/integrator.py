@@ -6,7 +6,7 @@ import copy
 import inspect
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -217,9 +217,10 @@ class Integrator:
         """
         if self._sampled is None:
             raise ValueError("result has the samples since a start: call integrator.start(t0, q0, v0) first")
-        record = replace(self._sampled.record(), system=self._started_system, method=self._options["method"].name)
         atol = check_tolerance("atol", self._options["atol"], self.system.n_q)
-        return record_of(Result, vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
+        settings = {"method": self._options["method"].name, "rtol": float(self._options["rtol"]), "atol": atol}
+        fields = self._sampled.fields() | settings | {"system": self._started_system, "compiled": False}
+        return record_of(Result, fields)
 
     def _system_with(self, parameters: ArrayLike) -> ConstrainedSystem:
         system = self.system.with_parameters(parameters)
@@ -230,12 +231,8 @@ class Integrator:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle the system and the options only: two integrators cannot share the arrays of a motion."""
-        return _create, (self.system, self._options)
+        return partial(Integrator, self.system, **self._options), ()
 
     def __repr__(self) -> str:
         method, rtol, atol = (self._options[name] for name in ("method", "rtol", "atol"))
         return f"<Integrator of {self.system.name!r}: {method.name}, rtol {rtol}, atol {atol}>"
-
-
-def _create(system: ConstrainedSystem, options: dict[str, Any]) -> Integrator:
-    return Integrator(system, **options)

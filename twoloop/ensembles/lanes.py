@@ -120,7 +120,7 @@ class LaneMethod:
     order: int  # argument `order` of the generated functions
     evaluations: int  # number of evaluations in an attempt that the kernel does not count, without the one at its end
     options: Array  # numbers that the step kernel reads
-    step: Callable[[], Any]  # returns the step kernel
+    step: Any  # the step kernel
     memory: Callable[[LaneCode], int]  # returns the size of the kernel's memory for given code, in vectors
     # for an explicit method with generated code: A, b, c and the weights of two error estimates
     tableau: tuple[Array, Array, Array, Array, Array] | None = None
@@ -164,46 +164,33 @@ def lane_methods(
 
 
 def _taylor(rtol: float, atol: float) -> LaneMethod:
-    def step() -> Any:
-        from twoloop.kernels.lanes.control import step_by_series
-
-        return step_by_series
+    from twoloop.kernels.lanes.control import step_by_series
 
     order = order_in_lanes(rtol, atol) + 1
-    return LaneMethod("Taylor", True, order, order - 1, np.zeros(0), step, lambda code: code.series_size(order))
+    return LaneMethod(
+        "Taylor", True, order, order - 1, np.zeros(0), step_by_series, lambda code: code.series_size(order)
+    )
 
 
 def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
-    def step() -> Any:
-        from twoloop.kernels.lanes.control import step_by_dop853
+    from twoloop.kernels.lanes.control import memory_size, step_by_dop853
 
-        return step_by_dop853
-
-    def memory(code: LaneCode) -> int:
-        from twoloop.kernels.lanes.control import memory_size
-
-        return memory_size(len(dop853.B), n)
-
+    memory = memory_size(len(dop853.B), n)
     weights = dop853.A, dop853.B, dop853.C, dop853.E5, COARSE_SHARE * dop853.E3
     stages, options = len(dop853.B), _options(PRESETS["DOP853"], n, rtol, atol)
-    return LaneMethod("DOP853", False, 8, stages - 1, options, step, memory, weights, LONGEST_GAP)
+    return LaneMethod("DOP853", False, 8, stages - 1, options, step_by_dop853, lambda _: memory, weights, LONGEST_GAP)
 
 
 def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:
-    def step() -> Any:
-        from twoloop.kernels.lanes.newton import step_by_newton
-
-        return step_by_newton
-
-    def memory(code: LaneCode) -> int:
-        from twoloop.kernels.lanes.newton import memory_size
-
-        return memory_size(radau.stages, n)
+    from twoloop.kernels.lanes.newton import memory_size, step_by_newton
 
     radau = radau_iia(N_STAGES[name])
+    memory = memory_size(radau.stages, n)
     method = RungeKutta(radau, outer="newton", tested=tested)
     n_for_derivatives = 2 * n + 1
-    return LaneMethod(name, False, radau.order, n_for_derivatives, _options(method, n, rtol, atol), step, memory)
+    return LaneMethod(
+        name, False, radau.order, n_for_derivatives, _options(method, n, rtol, atol), step_by_newton, lambda _: memory
+    )
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
@@ -317,7 +304,7 @@ class LaneRuns:
         run_parameters = self.generated.coefficients_for(starts.parameters[numbers])
         begin = layout.array_offsets(n, n_rows, code.n_numbers)[-1]
         workspace = aligned_zeros(begin + method.memory(code), layout.LANES)
-        kit = layout.LaneKit(self.generated.functions, method.step())
+        kit = layout.LaneKit(self.generated.functions, method.step)
         redundant = bool(code.equations.redundant_rows.conditions)
         settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.n_gaps, rtol], atol, code.numbers.values])

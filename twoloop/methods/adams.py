@@ -52,10 +52,7 @@ class Adams:
     """
 
     name: ClassVar[str] = "Adams"
-
-    def takes_code(self, fixed: bool) -> bool:
-        """Return whether the steps of this method can run with generated code."""
-        return True
+    takes_code: ClassVar[bool] = True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the Plan of a run of n_q coordinates; the first steps need a variable size to reach their order."""

@@ -147,6 +147,7 @@ class Auto:
     """
 
     name: ClassVar[str] = "auto"
+    takes_code: ClassVar[bool] = True
     tested: ClassVar[str] = "positions"  # quantities that the error estimate of implicit steps counts
     few: Method
     many: Method
@@ -192,10 +193,6 @@ class Auto:
         if tolerance < SERIES_TOLERANCE:
             return operations <= (MAX_OPERATIONS if n_q >= FEW_COORDINATES else MAX_OPERATIONS_FEW)
         return operations <= MAX_OPERATIONS_FEW and n_q >= MANY_COORDINATES
-
-    def takes_code(self, fixed: bool) -> bool:
-        """Return whether the steps of this method can run with generated code: not fixed steps, which are implicit."""
-        return not fixed
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""

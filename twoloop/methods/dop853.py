@@ -139,7 +139,8 @@ class DOP853:
         """Return the name of the method for messages and tables."""
         return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
 
-    def takes_code(self, fixed: bool) -> bool:
+    @property
+    def takes_code(self) -> bool:
         """Return whether the steps of this method can run with generated code."""
         return self.stages == "free"
 

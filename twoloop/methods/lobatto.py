@@ -52,6 +52,7 @@ class Lobatto16:
     True
     """
 
+    takes_code: ClassVar[bool] = True
     needs_code: ClassVar[bool] = True
     name: ClassVar[str] = "Lobatto16"
     code: GeneratedCode | None = None  # generated for one system; solve_dae sets it
@@ -67,10 +68,6 @@ class Lobatto16:
                 "Take method='auto'"
             )
         return replace(self, code=code, narrow=may_be_steep(system, force_was_traced=True))
-
-    def takes_code(self, fixed: bool) -> bool:
-        """Return whether the steps of this method can run with generated code."""
-        return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""

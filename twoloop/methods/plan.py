@@ -89,9 +89,8 @@ class Plan:
 
 
 def takes_code(method: Any, fixed: bool) -> bool:
-    """Return whether the steps of a method can run with generated code."""
-    takes = getattr(method, "takes_code", None)
-    return takes is not None and bool(takes(fixed))
+    """Return whether the steps of a method, or those of its method for fixed steps, can run with generated code."""
+    return bool(getattr(getattr(method, "fixed", method) if fixed else method, "takes_code", False))
 
 
 def needs_code(method: Any) -> bool:

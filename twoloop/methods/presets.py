@@ -155,27 +155,19 @@ def plans_for(
     code: GeneratedCode | None,
     check: Check,
 ) -> Plans:
-    """Return the plan of the steps of a run, and the plans for the solution within steps; both are cached.
-
-    Raises ValueError if the method cannot run the system.
-    """
+    """Return the plans of the steps of a run and within steps, cached; raise ValueError if the method cannot run it."""
     method_key, pivot_choice = identity(method), None if code is None else code.shared.equations.choice
-    key, methods = (method_key, rtol, atol, fixed, pivot_choice), system.remembered("methods", dict)
+    key = method_key, rtol, atol, fixed, pivot_choice
     cached: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
     plans = None if method_key is None else cached.get(key)
     if plans is None:
-        # the prepared method does not depend on tolerances
-        prepared = None if method_key is None else methods.get((method_key, pivot_choice))
-        if prepared is None:
-            prepared = method.for_system(system, code, check) if hasattr(method, "for_system") else method
+        prepared = method.for_system(system, code, check) if hasattr(method, "for_system") else method
         plans = _make_plans(system, prepared, rtol, atol, fixed, code)
         is_final = code is not None or _has_series(prepared) == _has_series(method)
         if method_key is not None and is_final and all(each.is_trusted for each in plans[0].traced):
             while len(cached) >= MAX_PLANS:  # a loop, because other threads may add plans
                 cached.pop(next(iter(cached.copy())), None)
             cached[key] = plans
-            if len(methods) < MAX_PLANS:
-                methods[method_key, pivot_choice] = prepared
     plan, interiors = plans
     return plan.fresh(), interiors
 

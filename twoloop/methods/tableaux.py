@@ -130,12 +130,7 @@ def _check_stages(s: int, minimum: int, family: str) -> None:
 
 
 def gauss(s: int) -> Tableau:
-    """Return the Gauss tableau with s stages: order 2s, symplectic and symmetric.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If s is not an integer of at least 1.
+    """Return the Gauss tableau with s >= 1 stages: order 2s, symplectic and symmetric.
 
     Examples
     --------
@@ -151,12 +146,7 @@ def gauss(s: int) -> Tableau:
 
 
 def radau_iia(s: int) -> Tableau:
-    """Return the Radau IIA tableau with s stages: order 2s - 1, stiffly accurate, L-stable, not symplectic.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If s is not an integer of at least 1.
+    """Return the Radau IIA tableau with s >= 1 stages: order 2s - 1, stiffly accurate, L-stable, not symplectic.
 
     Examples
     --------
@@ -172,15 +162,10 @@ def radau_iia(s: int) -> Tableau:
 
 
 def sun_radau_iib(s: int) -> Tableau:
-    """Return Sun's symplectic Radau II ("IIB") tableau with s stages: order 2s - 1; s = 3 is Table 1 of the paper.
+    """Return Sun's symplectic Radau II ("IIB") tableau with s >= 1 stages: order 2s - 1; s = 3 is Table 1 of the paper.
 
     Its stability function is that of Gauss: |R(iy)| = 1 and R(infinity) = +-1, no damping. With s = 1 it is the
     implicit midpoint rule, of order 2.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If s is not an integer of at least 1.
 
     Examples
     --------
@@ -196,12 +181,7 @@ def sun_radau_iib(s: int) -> Tableau:
 
 
 def lobatto_iiie(s: int) -> Tableau:
-    """Return the Lobatto IIIE tableau with s stages: order 2s - 2, symplectic and symmetric.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If s is not an integer of at least 2.
+    """Return the Lobatto IIIE tableau with s >= 2 stages: order 2s - 2, symplectic and symmetric.
 
     Examples
     --------

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,7 @@ class Taylor:
     True
     """
 
+    takes_code: ClassVar[bool] = True
     order: int | None = None
     program: SeriesProgram | None = None  # program of one system; solve_dae sets it
 
@@ -108,10 +109,6 @@ class Taylor:
                 f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
             ) from error
         return replace(self, program=program)
-
-    def takes_code(self, fixed: bool) -> bool:
-        """Return whether the steps of this method can run with generated code."""
-        return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 from types import FunctionType
-from typing import Any, Protocol
+from typing import Any
 from weakref import WeakSet
 
 import numpy as np
@@ -18,18 +18,6 @@ PRECISION = 4.0 * float(np.finfo(float).eps)  # relative precision of the time o
 MAX_ITERATIONS = 3000
 
 _checked: WeakSet[FunctionType] = WeakSet()  # functions whose arguments were checked, which takes 9 µs
-
-
-class States(Protocol):
-    """Interface of interpolants of a run, whose states are rows [q, v]."""
-
-    def at(self, times: Array) -> Array:
-        """Return the rows at sorted times."""
-        ...
-
-    def within(self, t: float) -> Callable[[float], Array]:
-        """Return an interpolant of the step that contains t: a function of time that returns the row."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -118,8 +106,15 @@ class EventSearch:
         self._values = [event(t0, q[0], v[0]) for event, (q, v) in copies]
         self._at_start = True
 
-    def search(self, states: States, ends: Array) -> None:
-        """Search the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event."""
+    def search(
+        self, states: Callable[[Array], Array], row_function: Callable[[float], Callable[[float], Array]], ends: Array
+    ) -> None:
+        """Search the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event.
+
+        `states(times)` returns the rows [q, v] at sorted times, and `row_function(t)` a function of time that returns
+        the row, for the step that contains t.
+        """
+        self._states, self._row_function = states, row_function
         if len(ends) < 2 or self.ended is not None:
             return
         # evaluate all samples of many steps in one call of the dense solution, which is several times faster
@@ -130,13 +125,13 @@ class EventSearch:
             np.repeat(per_step, counts) for per_step in (ends[:-1], counts, steps, first[:-1])
         )
         times = np.append(start_times + (np.arange(first[-1]) - first_samples) / n_parts * durations, ends[-1])
-        rows = states.at(times)
+        rows = states(times)
         if not self._rates:
-            self._in_steps(states, times, rows, ends[1:].tolist())
+            self._in_steps(times, rows, ends[1:].tolist())
             return
         for k, end in enumerate(ends[1:].tolist()):
             samples = slice(first[k], first[k + 1] + 1)
-            self._in_steps(states, *self._with_turns(states, times[samples], rows[samples]), [end])
+            self._in_steps(*self._with_turns(times[samples], rows[samples]), [end])
             if self.ended is not None:
                 return
 
@@ -145,25 +140,25 @@ class EventSearch:
         if self.ended is None:
             self.found = [[(t, row) for t, row in events if t <= self.reached] for events in self.found]
 
-    def _with_turns(self, states: States, times: Array, rows: Array) -> tuple[Array, Array]:
+    def _with_turns(self, times: Array, rows: Array) -> tuple[Array, Array]:
         """Return times and rows with samples added where a gap is smallest: it may be closed only between samples."""
         states_at = zip(times.tolist(), *np.split(rows, 2, axis=1), strict=True)
         values = np.array([[rate(*state) for rate in self._rates] for state in states_at])
         turns = [
-            _root(self._rates[j], states, (float(times[k]), float(times[k + 1])), (values[k, j], values[k + 1, j]))[0]
+            self._root(self._rates[j], (float(times[k]), float(times[k + 1])), (values[k, j], values[k + 1, j]))[0]
             for k, j in np.argwhere((values[:-1] < 0.0) & (values[1:] > 0.0))
         ]
         if not turns:
             return times, rows
         turning_times = np.unique(turns)
         indices = np.searchsorted(times, turning_times)
-        return np.insert(times, indices, turning_times), np.insert(rows, indices, states.at(turning_times), axis=0)
+        return np.insert(times, indices, turning_times), np.insert(rows, indices, self._states(turning_times), axis=0)
 
     def _copies(self, rows: Array) -> list[tuple[list[Array], list[Array]]]:
         """Return copies of coordinates and velocities for each event, which may write to them."""
         return [(list(rows[:, : self._n_q].copy()), list(rows[:, self._n_q :].copy())) for _ in self.events]
 
-    def _in_steps(self, states: States, times: Array, rows: Array, ends: list[float]) -> None:
+    def _in_steps(self, times: Array, rows: Array, ends: list[float]) -> None:
         """Search for events between samples (times and rows) of the steps that end at `ends`; record them."""
         t, copies, steps = times.tolist(), self._copies(rows), iter(ends)
         end = next(steps)
@@ -175,7 +170,7 @@ class EventSearch:
                     active.append((event, (g, g_new)))
             self._values, self._at_start = values, False
             if active:
-                roots = [(*_root(event, states, (t[k - 1], t[k]), signs), event) for event, signs in active]
+                roots = [(*self._root(event, (t[k - 1], t[k]), signs), event) for event, signs in active]
                 self._record(sorted(roots, key=lambda root: root[0]))
                 if self.ended is not None:
                     return
@@ -192,27 +187,26 @@ class EventSearch:
             if len(occurrences) >= event.terminal and self.ended is None:
                 self.ended = (event, t)
 
+    def _root(
+        self, event: Callable[..., float], ends: tuple[float, float], values: tuple[float, float]
+    ) -> tuple[float, Array]:
+        """Return the time between `ends` at which an event is zero, and the row; `values`: the event at `ends`."""
+        from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
 
-def _root(
-    event: Callable[..., float], states: States, ends: tuple[float, float], values: tuple[float, float]
-) -> tuple[float, Array]:
-    """Return the time between `ends` at which an event is zero, and the row [q, v]; `values`: the event at `ends`."""
-    from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
+        values_at_ends = dict(zip(ends, values, strict=True))
+        for t, end_value in values_at_ends.items():
+            if end_value == 0.0:
+                return t, self._states(np.array([t]))[0]
+        row = self._row_function(ends[0])
 
-    values_at_ends = dict(zip(ends, values, strict=True))
-    for t, end_value in values_at_ends.items():
-        if end_value == 0.0:
-            return t, states.at(np.array([t]))[0]
-    row = states.within(ends[0])
+        def value(t: float) -> float:
+            if t in values_at_ends:
+                return values_at_ends[t]
+            q, v = np.split(row(t), 2)
+            return event(t, q, v)
 
-    def value(t: float) -> float:
-        if t in values_at_ends:
-            return values_at_ends[t]
-        q, v = np.split(row(t), 2)
-        return event(t, q, v)
-
-    t = float(brentq(value, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MAX_ITERATIONS))
-    return t, row(t)
+        t = float(brentq(value, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MAX_ITERATIONS))
+        return t, row(t)
 
 
 def crosses(direction: float, g: float, g_new: float) -> bool:

@@ -195,7 +195,6 @@ class ConstrainedSystem:
                 f"bandwidth needs a constant mass matrix; given bandwidth={bandwidth} for a mass that may change"
             )
         self.given = given_callbacks(callbacks, self.n_c, self.n_a)
-        self.scattered: frozenset[str] = frozenset()  # dense kinds computed from values of entries
         for kind, function in self.given.items():
             entry = KINDS[kind]
             if not isinstance(function, Dispatcher) or entry.signature.args not in function.overloads:
@@ -206,7 +205,11 @@ class ConstrainedSystem:
                 )
         enclosed = FrozenValues(self.given)
         self.enclosed = enclosed if enclosed.any else None
-        self._scatter()
+        missing = [kind for kind in self.entries if kind not in self.given]
+        dense = {kind: dense_callback(kind, self.given[VALUES_OF[kind]], self.entries[kind]) for kind in missing}
+        self.scattered = frozenset(dense)  # dense kinds computed from values of entries
+        callbacks = self.given | dense
+        self.given = {kind: callbacks[kind] for kind in KINDS if kind in callbacks}
         flags = np.zeros(N_FLAGS, dtype=np.int64)
         flags[CONSTANT_MASS] = self.constant_mass
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
@@ -236,14 +239,6 @@ class ConstrainedSystem:
     def n_jacobian_values(self) -> int:
         """Return the number of entries of C_q that `jacobian_values` returns."""
         return len(self.entries["jacobian"][0]) if "jacobian" in self.entries else 0
-
-    def _scatter(self) -> None:
-        """Add dense callbacks computed from values of entries, where no dense ones are given."""
-        missing = [kind for kind in self.entries if kind not in self.given]
-        dense = {kind: dense_callback(kind, self.given[VALUES_OF[kind]], self.entries[kind]) for kind in missing}
-        callbacks = self.given | dense
-        self.given = {kind: callbacks[kind] for kind in KINDS if kind in callbacks}
-        self.scattered = frozenset(dense)
 
     def __repr__(self) -> str:
         return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"

@@ -105,8 +105,48 @@ class Certificate:
         return self.message
 
 
-def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certificate:
-    """Return the certificate of a result, see `Result.certify`."""
+def certify(result: Record, rtol: float | None = None, atol: ArrayLike | None = None) -> Certificate:
+    """Verify the run by reintegration with another method and other steps, and measure its errors.
+
+    Every interval of the run is integrated again from its stored initial state, with the same callbacks, a tenth
+    of the tolerance and steps of at most 1/200 of the run, by `DOP853` or, where the run was stiff, seven-stage
+    Radau IIA. The final state is compared with the one stored. A step that missed a force, or an altered state,
+    deviates by far more than the tolerance. A second run, with a hundredth of the tolerance, starts from the first
+    state and lands on every stored time: it measures what small errors add up to. Accelerations, multipliers,
+    events, times, steps and status are compared with the equations and with one another.
+
+    The cost is about that of three runs with `DOP853` that land on all stored times, at least 5,000 evaluations.
+
+    Parameters
+    ----------
+    rtol : float, optional
+    atol : float or array_like (n_q,), optional
+        Tolerances of a step, for positions and velocities. None: those of the run. Required for results of other
+        solvers.
+
+    Returns
+    -------
+    Certificate
+        `.defect` of the steps and `.error` of the states relative to the tolerance, `.t`, `.gap`, `.limit`,
+        `.unseen`, `.faults`, `.passed`, `.message`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is invalid, or the result has no tolerances, fewer than two times, or no system.
+
+    Warns
+    -----
+    CertificateWarning
+        If the defect is above the limit; if the error is, and the growth of errors does not explain it; or if
+        fields contradict the equations.
+
+    Notes
+    -----
+    The certificate does not prove that the model is right, nor anything about features shorter than `gap`. Where
+    an error of a tolerance at the start grows beyond the limit, as in chaotic motion, the steps are verified, but
+    not the states: the run passes in part.
+    """
     with SignalHandlers(ctrl_c=True) as handlers:
         return _certify(result, rtol, atol, handlers)
 
@@ -139,7 +179,7 @@ def _certify(result: Record, rtol: float | None, atol: ArrayLike | None, handler
     certificate = Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, "", error, faults)
     certificate = replace(certificate, message=_message(certificate, is_wrong, result))
     if is_wrong or faults:
-        warnings.warn(certificate.message, CertificateWarning, stacklevel=4)
+        warnings.warn(certificate.message, CertificateWarning, stacklevel=3)
     return certificate
 
 

@@ -50,8 +50,30 @@ class Reaction:
     unique: bool
 
 
-def reaction(result: Record, name: str) -> Reaction:
-    """Return the reaction of a named joint, see `Result.reactions`."""
+def reactions(result: Record, name: str) -> Reaction:
+    """Return force and torque of a joint on its body at the times `t`.
+
+    They are equivalent to the generalised reaction -C_q^T lam (or -A^T mu) of the rows of the joint and act on the
+    body named by the joint, with components along the axes of space; e.g. a bob hanging from a link is pulled
+    upwards. The other body gets the opposite. Where rows are linearly dependent, the multipliers, and hence the
+    reactions of single joints, may not be unique: see `Reaction.unique`.
+
+    Parameters
+    ----------
+    name : str
+        Name of a joint of the system (`problem.joints` of a ready mechanism).
+
+    Returns
+    -------
+    Reaction
+        `.force` (2 or 3, n_t), N, and `.torque` (n_t,) or (3, n_t), N m, about `.point` (2 or 3, n_t), m;
+        `.unique`.
+
+    Raises
+    ------
+    ValueError
+        If there is no joint of this name, the system has no joints, or the result was read without its system.
+    """
     check_text("name", name)
     if result.system is None or not result.system.joints:
         raise ValueError(

@@ -5,17 +5,11 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import ArrayLike
 
 from twoloop.checks.arguments import check_path
 from twoloop.methods.presets import PRESETS
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.result.certificate import Certificate, certify
-from twoloop.result.reactions import Reaction, reaction
-from twoloop.result.storage import read_fields, save
-from twoloop.result.views import animate, plot, to_dataframe
+from twoloop.result import certificate, reactions, storage, views
 from twoloop.run.record import Record
 
 SOFTWARE = """@software{twoloop,
@@ -128,159 +122,12 @@ class Result(Record):
     ['x (m) of bar 1', 'y (m) of bar 1']
     """
 
-    def to_dataframe(self) -> Any:
-        """Return the run as a pandas table with one row per time.
-
-        Returns
-        -------
-        pandas.DataFrame
-            Indexed by "t (s)". Columns: coordinates by name, such as "x of crank (m)", their velocities "x of crank,
-            velocity (m/s)" and accelerations, the multipliers lam0, lam1, ..., "energy (J)" if it is known, and in
-            models of bodies the joint coordinates "angle of hinge (rad)", counted over turns, and "angle of hinge, rate
-            (rad/s)". An angle in space is NaN from where stored times are too far apart to count its turns.
-
-        Raises
-        ------
-        ImportError
-            If pandas is not installed.
-        """
-        return to_dataframe(self)
-
-    def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """Plot the coordinates, the energy and the violation of the constraints over time; needs no display.
-
-        One panel per unit of the coordinates, and of the joint coordinates of a model of bodies; the energy, minus its
-        initial value if it is an invariant; the largest violation of the position and of the velocity constraints at
-        each time of `t`. Unknown quantities are omitted.
-
-        Parameters
-        ----------
-        path : str or path, optional
-            File to which the figure is saved, in the matplotlib format given by its suffix.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed.
-        ValueError
-            If the result has no stored times.
-        """
-        return plot(self, path)
-
-    def animate(self, path: str | os.PathLike[str], seconds: float | None = None) -> Path:
-        """Write an animation of the mechanism from its problem's `drawing`; needs no display.
-
-        Between the stored times the motion is that of `sol`, or without it a polynomial through q, v and a, which
-        requires sufficiently dense times with `t_eval`.
-
-        Parameters
-        ----------
-        path : str or path
-            A file with suffix .html (a self-contained page, in which a spatial mechanism can be rotated with the
-            mouse), .gif (needs Pillow) or .mp4 (needs Pillow and the program ffmpeg).
-        seconds : float, optional
-            Duration of the animation. None: that of the run, limited to 3 to 12 s.
-
-        Returns
-        -------
-        pathlib.Path
-            The file.
-
-        Raises
-        ------
-        ImportError, RuntimeError
-            If Pillow or ffmpeg is required but missing.
-        TypeError, ValueError
-            If an argument is invalid, there is no drawing, or the run has fewer than two times.
-        """
-        return animate(self, path, seconds)
-
-    def reactions(self, name: str) -> Reaction:
-        """Return force and torque of a joint on its body at the times `t`.
-
-        They are equivalent to the generalised reaction -C_q^T lam (or -A^T mu) of the rows of the joint and act on the
-        body named by the joint, with components along the axes of space; e.g. a bob hanging from a link is pulled
-        upwards. The other body gets the opposite. Where rows are linearly dependent, the multipliers, and hence the
-        reactions of single joints, may not be unique: see `Reaction.unique`.
-
-        Parameters
-        ----------
-        name : str
-            Name of a joint of the system (`problem.joints` of a ready mechanism).
-
-        Returns
-        -------
-        Reaction
-            `.force` (2 or 3, n_t), N, and `.torque` (n_t,) or (3, n_t), N m, about `.point` (2 or 3, n_t), m;
-            `.unique`.
-
-        Raises
-        ------
-        ValueError
-            If there is no joint of this name, the system has no joints, or the result was read without its system.
-        """
-        return reaction(self, name)
-
-    def certify(self, rtol: float | None = None, atol: ArrayLike | None = None) -> Certificate:
-        """Verify the run by reintegration with another method and other steps, and measure its errors.
-
-        Every interval of the run is integrated again from its stored initial state, with the same callbacks, a tenth
-        of the tolerance and steps of at most 1/200 of the run, by `DOP853` or, where the run was stiff, seven-stage
-        Radau IIA. The final state is compared with the one stored. A step that missed a force, or an altered state,
-        deviates by far more than the tolerance. A second run, with a hundredth of the tolerance, starts from the first
-        state and lands on every stored time: it measures what small errors add up to. Accelerations, multipliers,
-        events, times, steps and status are compared with the equations and with one another.
-
-        The cost is about that of three runs with `DOP853` that land on all stored times, at least 5,000 evaluations.
-
-        Parameters
-        ----------
-        rtol : float, optional
-        atol : float or array_like (n_q,), optional
-            Tolerances of a step, for positions and velocities. None: those of the run. Required for results of other
-            solvers.
-
-        Returns
-        -------
-        Certificate
-            `.defect` of the steps and `.error` of the states relative to the tolerance, `.t`, `.gap`, `.limit`,
-            `.unseen`, `.faults`, `.passed`, `.message`.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is invalid, or the result has no tolerances, fewer than two times, or no system.
-
-        Warns
-        -----
-        CertificateWarning
-            If the defect is above the limit; if the error is, and the growth of errors does not explain it; or if
-            fields contradict the equations.
-
-        Notes
-        -----
-        The certificate does not prove that the model is right, nor anything about features shorter than `gap`. Where
-        an error of a tolerance at the start grows beyond the limit, as in chaotic motion, the steps are verified, but
-        not the states: the run passes in part.
-        """
-        return certify(self, rtol, atol)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result to a file in NumPy's npz format, without pickle; `twoloop.load` reads it.
-
-        The file takes 8 (1 + 3 n_q + n_c + n_a) bytes per time of `t`. A dense solution takes another 8 (2 + 3 n_q)
-        bytes per step, and 8 (1 + 3 n_q) per state within steps for methods that need these (see `DenseSolution`).
-
-        Parameters
-        ----------
-        path : str or path
-            File to write; an existing file is replaced.
-        """
-        save(self, path)
+    to_dataframe = views.to_dataframe
+    plot = views.plot
+    animate = views.animate
+    reactions = reactions.reactions
+    certify = certificate.certify
+    save = storage.save
 
 
 def citation(result: Result) -> str:
@@ -372,4 +219,4 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
     """
     if system is not None:
         check_system(system)
-    return Result(**read_fields(check_path(path), system))
+    return Result(**storage.read_fields(check_path(path), system))

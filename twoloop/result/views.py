@@ -19,7 +19,21 @@ from twoloop.run.record import Record
 
 
 def to_dataframe(result: Record) -> Any:
-    """Return a table with one row per stored time, see `Result.to_dataframe`."""
+    """Return the run as a pandas table with one row per time.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Indexed by "t (s)". Columns: coordinates by name, such as "x of crank (m)", their velocities "x of crank,
+        velocity (m/s)" and accelerations, the multipliers lam0, lam1, ..., "energy (J)" if it is known, and in
+        models of bodies the joint coordinates "angle of hinge (rad)", counted over turns, and "angle of hinge, rate
+        (rad/s)". An angle in space is NaN from where stored times are too far apart to count its turns.
+
+    Raises
+    ------
+    ImportError
+        If pandas is not installed.
+    """
     pandas = needed("pandas", "pandas", "to_dataframe")
     coordinates = result.coordinates
     columns = dict(zip(coordinates, result.q, strict=True))
@@ -44,8 +58,29 @@ PANEL_WIDTH, PANEL_HEIGHT = 8.0, 2.2  # inches
 MAX_LEGEND = 12  # largest number of coordinates in a legend
 
 
-def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
-    """Return a figure of a result, see `Result.plot`."""
+def plot(result: Record, path: str | os.PathLike[str] | None = None) -> Any:
+    """Plot the coordinates, the energy and the violation of the constraints over time; needs no display.
+
+    One panel per unit of the coordinates, and of the joint coordinates of a model of bodies; the energy, minus its
+    initial value if it is an invariant; the largest violation of the position and of the velocity constraints at
+    each time of `t`. Unknown quantities are omitted.
+
+    Parameters
+    ----------
+    path : str or path, optional
+        File to which the figure is saved, in the matplotlib format given by its suffix.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    ValueError
+        If the result has no stored times.
+    """
     file = None if path is None else check_path(path)
     if result.t.size == 0:
         raise ValueError(f"plot needs a result with output; this one has none: {result.message}")
@@ -141,8 +176,32 @@ class Scene:
     joints: list[int]  # points drawn as circles
 
 
-def animate(result: Record, path: str | os.PathLike[str], seconds: float | None) -> Path:
-    """Write an animation, see `Result.animate`."""
+def animate(result: Record, path: str | os.PathLike[str], seconds: float | None = None) -> Path:
+    """Write an animation of the mechanism from its problem's `drawing`; needs no display.
+
+    Between the stored times the motion is that of `sol`, or without it a polynomial through q, v and a, which
+    requires sufficiently dense times with `t_eval`.
+
+    Parameters
+    ----------
+    path : str or path
+        A file with suffix .html (a self-contained page, in which a spatial mechanism can be rotated with the
+        mouse), .gif (needs Pillow) or .mp4 (needs Pillow and the program ffmpeg).
+    seconds : float, optional
+        Duration of the animation. None: that of the run, limited to 3 to 12 s.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    ImportError, RuntimeError
+        If Pillow or ffmpeg is required but missing.
+    TypeError, ValueError
+        If an argument is invalid, there is no drawing, or the run has fewer than two times.
+    """
     path = check_path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"path must end in {', '.join(SUFFIXES)}; given {str(path)!r}")

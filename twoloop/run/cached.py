@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_vector
-from twoloop.checks.consistency import StartEvaluation, check_start
+from twoloop.checks.consistency import StartEvaluation, check_start, is_consistent
 from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import has_exact_derivatives, with_derived_callbacks
@@ -42,7 +42,7 @@ from twoloop.methods.presets import code_for, identity, may_have_code, plans_for
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import DenseSolution, OutputInterpolation, StateTable, interpolator_of
 from twoloop.run.fallbacks import REPEAT_BELOW, gap_for_repetition, may_have_missed_changes
-from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, ignore_progress
+from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts
 from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
 from twoloop.run.parametric import ParametricRun, SharedSetup
@@ -61,8 +61,7 @@ from twoloop.run.record import (
 from twoloop.run.rerun import (
     FIRST_FORCE,
     checked_region_of,
-    compare_callbacks_at,
-    describe_changed_force,
+    compare_callbacks,
     find_nondeterminism,
     first_force,
 )
@@ -116,7 +115,9 @@ class CachedIntegrator:
         self.parametric = None if shared is None else ParametricRun(shared, run)
         self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
-        run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (n_attempts := first_chunk_size(run))
+        # largest number of attempted steps, which is the largest number of states, in the first chunk
+        n_attempts = max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
+        run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, n_attempts
         checked = system if self.parametric is None else self.parametric.system
         # skips: number of next calls that do not use the integrator, because a callback raised an exception
         self.evaluation, self.loops, self.skips = StartEvaluation(checked), cached_run(), 0
@@ -132,11 +133,6 @@ class CachedIntegrator:
         self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether generated code is called
         self.independent_rows = self.arrays.start_rows.tobytes()  # bytes of the indices of independent rows
         self.redundancy = {self.independent_rows: (run.redundant, run.rows_warning)}
-
-    @staticmethod
-    def can_start(run: Run) -> bool:
-        """Return whether compiled code can start this run: compiled callbacks, dense algebra, and no warning."""
-        return run.static_form is None and not run.start_warning and not run.system.called_in_python
 
     @staticmethod
     def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
@@ -183,7 +179,7 @@ class CachedIntegrator:
         began = clock()
         try:
             n = self._start_and_advance(*start, False)
-            if n == loops.IN_DOUBT and self.evaluation.is_surely_consistent(0, t0, q0, v0):
+            if n == loops.IN_DOUBT and is_consistent(self.evaluation.system, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
         except Exception as error:  # raised by a callback: `IntegrationLoop` will handle it
             if raised_by_handler(error):
@@ -242,8 +238,8 @@ class CachedIntegrator:
                 return None
         if report[loops.END_CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.NOTHING_TO_CHECK]:
             self.loop_used = True
-            arguments = output, ignore_progress, time_limit, interrupts, False
-            loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
+            options = {"time_limit": time_limit, "is_final_attempt": False, "start": rows[0], "system": system}
+            loop = IntegrationLoop(run, t1, output, interrupts, **options)
             loop.add_first_chunk(int(report[loops.END_CODE]), t[1:], rows[1:], steps, self.cpu_time)
             record = loop.integrate_to_end(self.check_derivatives)
             if record.status >= 0 and may_have_missed_changes(run):
@@ -293,29 +289,17 @@ class CachedIntegrator:
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
     def _compare_callbacks(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
-        """Check callbacks at sampled states of the run outside the checked region; return whether they are correct.
+        """Return whether callbacks are correct at states of the run, see `compare_callbacks`."""
+        n = 2 * self.run.system.n_q
 
-        `inside`: whether all states are within the region. `due`: whether to check at all sampled states.
-        """
-        run, region, parameters = self.run, self.region, self.run.varied_parameters
-        if describe_changed_force(run) is not None:
-            return False
-        if run.compared_until[0] >= t1 and not due:
-            return True
-        all_states = due or (parameters is not None and not region.contains_parameters(parameters))
-        if all_states or not inside:
-            n, status = 2 * run.system.n_q, Status.REACHED_END
+        def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            states = sample.states()
-            if not all_states:  # with the extreme states of this run, the region contains all states of an equal run
-                states = np.concatenate([extreme_states(t, rows[:, :n]), states])
-            if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", all_states)[0] != status:
-                return False
-            if parameters is not None:
-                region.add_parameters(parameters)
-        run.compared_until[0] = t1
-        return True
+            # with the extreme states of this run, the checked region contains all states of an equal run
+            return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
+
+        checks = t1, self.check_derivatives, REACHED_END, "", due, inside
+        return compare_callbacks(self.run, states, *checks)[0] == REACHED_END
 
 
 def fields_of(
@@ -358,11 +342,6 @@ def _deferred_field(
 
 
 RECHECK_PIVOT = 0.1  # `set_up` checks a start if its smallest pivot, relative to that at the first start, is smaller
-
-
-def first_chunk_size(run: Run) -> int:
-    """Return the largest number of attempted steps, which is the largest number of states, in the first chunk."""
-    return max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
 
 
 def arrays_of(
@@ -559,7 +538,8 @@ def _new_entry(run: Run, code: GeneratedCode | None, t1: float, options: Options
         run.static_form is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
     )
     start = t0, q0.tobytes(), v0.tobytes()
-    idle: list[CachedIntegrator] | None = [] if for_other_starts and CachedIntegrator.can_start(run) else None
+    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # in compiled code
+    idle: list[CachedIntegrator] | None = [] if can_start else None
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 
 

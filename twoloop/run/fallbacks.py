@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
-from twoloop.kernels.steps.stages import load_step
 from twoloop.methods.plan import Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import warn_user
@@ -139,7 +138,7 @@ def switch_method(run: Run) -> None:
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` never changes, and needs no copy
-    _renew_kit(run)
+    renew_kit(run)
     run.substituted = True
     run.write_step_control(run.plan)
     run.limit_steps()
@@ -148,13 +147,7 @@ def switch_method(run: Run) -> None:
     run.clock[: run.a.N_PAST] = 0.0
 
 
-def load_next_step(run: Run) -> None:
-    """Compile, or load from disk, the second step of a pair of methods, and renew the run's kit."""
-    load_step(run.plan.second)
-    _renew_kit(run)
-
-
-def _renew_kit(run: Run) -> None:
+def renew_kit(run: Run) -> None:
     """Replace the kit of a run by one that calls the steps of the run's current plan."""
     if run.static_form is None:
         run.kit = kit_for_plan(run.system, run.kit.flags, run.plan)

@@ -24,6 +24,7 @@ from twoloop.generate.traced_values import Sample
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import LONGEST_UNSEEN
+from twoloop.kernels.steps.stages import load_step
 from twoloop.problem.events import SAMPLES
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import interpolator_of
@@ -32,7 +33,7 @@ from twoloop.run.fallbacks import (
     cross_singularity,
     crossing_kit,
     handle_crossing,
-    load_next_step,
+    renew_kit,
     requires_crossing,
     switch_method,
     warn_of_missed_changes,
@@ -62,14 +63,13 @@ from twoloop.run.record import (
     Statistics,
     Status,
     failure_link,
-    fields_of_run,
     interval_kinds,
     record_of,
     state_fields,
     statistics,
     step_fields,
 )
-from twoloop.run.rerun import compare_callbacks
+from twoloop.run.rerun import checked_region_of, compare_callbacks
 from twoloop.run.run import SMALL_SYSTEM, Buffers, Run
 from twoloop.run.signals import SignalHandlers, is_in_user_function, raised_by_handler
 from twoloop.run.singular_positions import TimedState, velocities_turned_last
@@ -166,9 +166,9 @@ class IntegrationLoop:
         run: Run,
         t1: float,
         request: OutputRequest,
-        report: Callable[[float], object],
-        time_limit: float | None,
         interrupts: Interrupts,
+        report: Callable[[float], object] = lambda t: None,
+        time_limit: float | None = None,
         is_final_attempt: bool = True,
         start: Array | None = None,
         system: ConstrainedSystem | None = None,
@@ -245,7 +245,7 @@ class IntegrationLoop:
                 _spare_buffers.pop(oldest, None)
         if self.request.between_steps:
             began = time.process_time()
-            recorder.finish()
+            recorder.search_intervals()
             self.cpu_time += time.process_time() - began
         if self.callback_error is not None and recorder.end_event is None:
             raise self.callback_error
@@ -363,7 +363,8 @@ class IntegrationLoop:
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.NEEDS_COMPILATION:
             began = time.monotonic()
-            load_next_step(run)
+            load_step(run.plan.second)  # compile, or load from disk, the second step of a pair of methods
+            renew_kit(run)
             self.deadline += time.monotonic() - began  # compilation does not count against time_limit
             self.kit, self.code = run.kit, a.PAUSED
         elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
@@ -429,7 +430,13 @@ class IntegrationLoop:
                 if recorder.end_state is not None:
                     self.sample.end_at(*recorder.end_state)
                     end = recorder.end_state[0]
-                status, message = compare_callbacks(run, self.sample, end, check_derivatives, status, message)
+                region = checked_region_of(run, check_derivatives)
+                due = region.is_comparison_due() or run.system.called_in_python
+                region.count_run()
+                states = self.sample.states()
+                status, message = compare_callbacks(
+                    run, lambda all_states: states, end, check_derivatives, status, message, due
+                )
             if self.is_final_attempt and status >= 0:
                 message += warn_of_missed_changes(run) + warn_of_passage_by_ordinary_steps(run)
             if status >= 0 and run.start_warning:
@@ -441,7 +448,9 @@ class IntegrationLoop:
         if self.interrupts.n_signals or recorder.interrupted or (code == INTERRUPTED and recorder.end_event is None):
             status, message = Status.INTERRUPTED, describe_interrupt(time_reached, table)
         t_events, q_events, v_events = recorder.events()
-        fields = fields_of_run(run, t, table) | {name: store.array(name) for name in STEP_ARRAYS}
+        fields: dict[str, Any] = state_fields(run.system.n_q, t, table) | {k: store.array(k) for k in STEP_ARRAYS}
+        fields |= {"rank": run.rank, "redundant": run.redundant.copy()}  # copies of a run share this array
+        fields |= {"defect": run.defect(), "widest_gap": float(run.work.notes[indices.WIDEST_GAP])}
         fields |= message_of(run, message + failure_link(status), self.system)
         fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": self.system}
         fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}
@@ -493,10 +502,6 @@ class IntegrationLoop:
         if across:
             return np.full(len(steps), indices.ACROSS)
         return interval_kinds(run, steps)
-
-
-def ignore_progress(t: float) -> None:
-    """Do nothing: the `report` of a loop without a progress bar."""
 
 
 def _error_note(name: str, t: float, error: Exception) -> str:

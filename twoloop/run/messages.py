@@ -217,14 +217,6 @@ _FAILURE_REASONS = {
 }
 
 
-def _describe_jumps_and_crossings(run: "Run") -> str:
-    """Return a sentence about jumps of C_t or b, if any, and CROSSINGS_MARK if steps crossed singular positions."""
-    text = f" At t = {_format_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(
-        run.jumps
-    )
-    return text + (CROSSINGS_MARK if run.crossings else "")
-
-
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} with a function that computes the text when it is read.
 
@@ -286,8 +278,11 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
     """Return the status and the message of a run that ended with a code of `advance`, or with one of this module."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
-        arrival = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
-        return Status.REACHED_END, arrival + _describe_jumps_and_crossings(run) + warn_of_singular_end(run)
+        text = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
+        if run.jumps:
+            times = ", ".join(f"{jump:.4g}" for jump in run.jumps[:3]) + (", ..." if len(run.jumps) > 3 else "")
+            text += f" At t = {times} C_t or b jumps: velocities changed there as by an impulse."
+        return Status.REACHED_END, text + (CROSSINGS_MARK if run.crossings else "") + warn_of_singular_end(run)
     stopped = f"Stopped at t = {t:.10g}"
     failure_code = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:
@@ -334,10 +329,12 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
             f"{stopped}: with the fixed step_size = {run.control[a.FIXED_STEP]:g} {reason}. Take a smaller "
             "step_size, or leave it out for step-size control.",
         )
+    least_ratio, words = least_inertia(run.system, t, run.state[: run.system.n_q])
+    massless = f"There {words}. " if least_ratio < MAX_SINGULAR_RATIO else ""
     return (
         Status.STEP_TOO_SMALL,
         f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
-        f"{_describe_near_singular(run, t1)}{_describe_near_massless(run)}Look for a discontinuity near this time, "
+        f"{_describe_near_singular(run, t1)}{massless}Look for a discontinuity near this time, "
         "loosen rtol and atol, or use coordinates of similar scale.",
     )
 
@@ -395,9 +392,12 @@ def warn_of_singular_end(run: "Run") -> str:
         error_ratio = _velocity_error_ratio(run, t, q, v)
         if error_ratio <= indices.REPORTED_ERROR:
             return ""
+        excess = f"about {error_ratio:.1g} times what rtol and atol allow"
+        if not np.isfinite(error_ratio):
+            excess = "more than can be told"
         text = (
             f"the run ends where the constraints nearly lose rank ({_ratio_text(run, t, q)}): rounding of positions "
-            f"changes velocities there {_format_excess(error_ratio)}, and accelerations by more. "
+            f"changes velocities there by {excess}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
     return warn_user(text)
@@ -434,10 +434,6 @@ def _velocity_error_ratio(run: "Run", t: float, q: Array, v: Array) -> float:
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
 
-def _format_excess(ratio: float) -> str:
-    return f"by about {ratio:.1g} times what rtol and atol allow" if np.isfinite(ratio) else "by more than can be told"
-
-
 def _ratio_text(run: "Run", t: float, q: Array) -> str:
     ratio = singular_ratio(run.system, t, q, run.rank)
     return f"the smallest singular value of the constraint Jacobian is {ratio:.1g} of the largest"
@@ -462,13 +458,6 @@ def _describe_near_singular(run: "Run", t1: float) -> str:
     )
 
 
-def _describe_near_massless(run: "Run") -> str:
-    """Return a sentence if some allowed motion has almost no inertia at the last state, else ""."""
-    t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
-    ratio, words = least_inertia(run.system, t, q)
-    return f"There {words}. " if ratio < MAX_SINGULAR_RATIO else ""
-
-
 def describe_not_finite(run: "Run") -> str:
     """Return words that name the callback that returned a value that is not finite, or that say where to look."""
     kind, fault_time = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
@@ -489,7 +478,3 @@ def describe_not_finite(run: "Run") -> str:
             "(exp, tanh). Take 'auto' or 'DOP853', which evaluate the functions only"
         )
     return "the callbacks are finite at the start of the step, but not at a state within it"
-
-
-def _format_times(times: list[float]) -> str:
-    return ", ".join(f"{t:.4g}" for t in times[:3]) + (", ..." if len(times) > 3 else "")

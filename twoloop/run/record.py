@@ -5,9 +5,9 @@ A `Recorder` collects events, and states at accepted steps or output times; a st
 
 import pickle
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
 from enum import IntEnum
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -144,19 +144,6 @@ class OutputRequest(NamedTuple):
         return self.interpolated_times is not None or self.dense or self.events is not None
 
 
-class _TableInterpolation(NamedTuple):
-    """Interpolation in a table of states, with the methods that `EventSearch` calls."""
-
-    interpolator: Interpolator
-    table: StateTable
-
-    def at(self, times: Array) -> Array:
-        return self.interpolator.states(self.table, times)
-
-    def within(self, t: float) -> Callable[[float], Array]:
-        return self.interpolator.row_function(self.table, t)
-
-
 class Recorder:
     """Recorder of the states of accepted steps, chunk by chunk.
 
@@ -200,7 +187,7 @@ class Recorder:
         self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
         self._kinds = np.concatenate([self._kinds, kinds])
         if len(self._t) > self._max_pending:
-            self._search_intervals(len(self._t) - WINDOW)
+            self.search_intervals(len(self._t) - WINDOW)
 
     def correct_last_state(self, t: float, row: Array) -> None:
         """If the last state is at t, replace its [q, v, a] by `row`, so that later interpolations use `row`."""
@@ -231,10 +218,6 @@ class Recorder:
         self.request.store.add("t", t)
         self.request.store.add("states", self._with_accelerations(t, rows) if self.request.store.append_only else rows)
 
-    def finish(self) -> None:
-        """At the end of the run, search the remaining intervals for events, and interpolate at their output times."""
-        self._search_intervals(len(self._t) - 1)
-
     @property
     def end_state(self) -> tuple[float, Array] | None:
         """Time and row [q, v] of the event that ended the run, or None."""
@@ -253,8 +236,9 @@ class Recorder:
         """Event that ended the run, and its time, or None."""
         return None if self.search is None else self.search.ended
 
-    def _search_intervals(self, end: int) -> None:
-        """Search the intervals before the state with index `end` for events; store states at output times in them."""
+    def search_intervals(self, end: int | None = None) -> None:
+        """Search intervals for events, and store states at output times in them; `end`: index of the last state."""
+        end = len(self._t) - 1 if end is None else end
         interpolator = self.interpolator
         if interpolator is None or self.end_event is not None or self.interrupted:
             return
@@ -264,7 +248,8 @@ class Recorder:
         node_times = self._t[self._next_interval : end + 1]
         if self.search is not None:
             try:
-                self.search.search(_TableInterpolation(interpolator, table), node_times)
+                states, row_function = partial(interpolator.states, table), partial(interpolator.row_function, table)
+                self.search.search(states, row_function, node_times)
             except KeyboardInterrupt:
                 self.interrupted = True
                 self.search.break_off()
@@ -362,25 +347,6 @@ class Status(IntEnum):
     ROWS_CONTRADICT = -11
     RATE_JUMPS = -12
     WRONG_TRACE = -13
-
-
-MEANINGS: dict[Status, str] = {
-    Status.REACHED_END: "the end of t_span was reached",
-    Status.EVENT: "an event ended the run",
-    Status.STEP_TOO_SMALL: "the step size fell below the spacing of floating-point numbers",
-    Status.MAX_STEPS: "max_steps accepted steps were taken",
-    Status.NOT_CONVERGED: "a step of fixed size did not converge, or gamma by differences misses the tolerance",
-    Status.NOT_FINITE: "a callback returned a value that is not finite, or the state overflowed",
-    Status.RANK_LOST: "the constraint Jacobian lost rank: no choice of independent coordinates exists",
-    Status.SOLVER_FAILED: "a solver of another project failed, or reached the time limit of its adapter",
-    Status.INTERRUPTED: "the run was interrupted from the keyboard",
-    Status.STAGNATED: "the steps became so short that the end is out of reach",
-    Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong, or M not symmetric, at a state of the run",
-    Status.TIME_LIMIT: "the run reached its time_limit",
-    Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
-    Status.RATE_JUMPS: "constraint_rate or nonholonomic_rate jumps, and no impulse gives velocities that are allowed",
-    Status.WRONG_TRACE: "a callback gives other values than the operations that were recorded of it, or than before",
-}
 
 
 def failure_link(status: Status) -> str:
@@ -576,17 +542,6 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
 def statistics(counters: Integers, cpu: float) -> Statistics:
     """Return the Statistics of a run, given the array of counters of its workspace, and its CPU time, s."""
     return Statistics(**dict(zip(COUNT_NAMES, GET_COUNTS(counters.tolist()), strict=True)), cpu_time=cpu)
-
-
-def fields_of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
-    """Return the trajectory, ranks, defect and `widest_gap` as fields of a record; `table`: rows [q, v, a, lam]."""
-    return {
-        **state_fields(run.system.n_q, t, table),
-        "rank": run.rank,
-        "redundant": run.redundant.copy(),  # copies of a run share this array
-        "defect": run.defect(),
-        "widest_gap": float(run.work.notes[indices.WIDEST_GAP]),
-    }
 
 
 def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import run_inconsistency
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
-from twoloop.generate.traced_values import CLEAR_DIFFERENCE, MAX_STATES_IN_PYTHON, CheckedRegion, Sample
+from twoloop.generate.traced_values import CLEAR_DIFFERENCE, MAX_STATES_IN_PYTHON, CheckedRegion
 from twoloop.kernels.data import indices
 from twoloop.methods import dop853
 from twoloop.methods.dop853 import DOP853
@@ -30,31 +31,6 @@ FIRST_FORCE = "first force"  # cache key under which the value of a compiled, un
 N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
 
-def compare_callbacks(
-    run: Run, sample: Sample, end: float, check_derivatives: bool, status: Status, message: str
-) -> tuple[Status, str]:
-    """Return status and message of a run that ended at `end`, changed if callbacks are wrong at states of `sample`.
-
-    Compiled callbacks are mostly not compared again in the region where they were compared before (`CheckedRegion`).
-    """
-    if changed := describe_changed_force(run):
-        return Status.WRONG_TRACE, f"{changed} {message}"
-    region = checked_region_of(run, check_derivatives)
-    parameters = run.varied_parameters
-    all_states = region.is_comparison_due() or run.system.called_in_python
-    all_states = all_states or (parameters is not None and not region.contains_parameters(parameters))
-    region.count_run()
-    if not all_states and end <= run.compared_until[0]:
-        return status, message
-    old_status = status
-    status, message = compare_callbacks_at(run, region, sample.states(), check_derivatives, status, message, all_states)
-    if status == old_status:
-        run.compared_until[0] = end
-        if parameters is not None:
-            region.add_parameters(parameters)
-    return status, message
-
-
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
     """Return the region in which runs of the system, with the same traces and checks, have compared callbacks."""
     if run.region is not None:
@@ -63,33 +39,46 @@ def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
     return run.system.remembered(("territory", key), CheckedRegion)  # type: ignore[no-any-return]
 
 
-def compare_callbacks_at(
+def compare_callbacks(
     run: Run,
-    region: CheckedRegion,
-    states: Array,
+    states: Callable[[bool], Array],
+    end: float,
     check_derivatives: bool,
     status: Status,
     message: str,
-    all_states: bool = False,
+    due: bool,
+    inside: bool = False,
 ) -> tuple[Status, str]:
-    """Compare callbacks at states [t, q, v], latest first; return status and message, changed if a callback is wrong.
+    """Return status and message of a run that ended at `end`, changed if callbacks are wrong at states of the run.
 
-    `all_states`: compare at all states, not only at those outside `region`. If callbacks agree, extend the region.
+    Unless `due`, callbacks are not compared again in the region where they were compared before (`CheckedRegion`), in
+    which the whole run may be (`inside`). `states(all_states)` returns states [t, q, v], latest first.
     """
-    first_state = states[-1]
+    if changed := describe_changed_force(run):
+        return Status.WRONG_TRACE, f"{changed} {message}"
+    region, parameters, old_status = checked_region_of(run, check_derivatives), run.varied_parameters, status
+    all_states = due or (parameters is not None and not region.contains_parameters(parameters))
+    if not all_states and (inside or end <= run.compared_until[0]):
+        run.compared_until[0] = max(run.compared_until[0], end)
+        return status, message
+    chosen = states(all_states)
+    first_state = chosen[-1]
     if not all_states:
-        states = region.states_outside(states)
-    old_status = status
-    if len(states) > 0:
+        chosen = region.states_outside(chosen)
+    if len(chosen) > 0:
         if check_derivatives:
-            status, message = _check_derivatives(run, states, first_state, status, message)
-        status, message = _check_traces(run, states, status, message)
+            status, message = _check_derivatives(run, chosen, first_state, status, message)
+        if wrong := next(filter(None, (traced.difference(run.system, chosen) for traced in run.traced)), None):
+            status, message = Status.WRONG_TRACE, f"In the run {wrong}. {message}"
         if status == old_status and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
-            difference = find_nondeterminism(run.system, states[:: 1 + len(states) // MAX_STATES_IN_PYTHON])
+            difference = find_nondeterminism(run.system, chosen[:: 1 + len(chosen) // MAX_STATES_IN_PYTHON])
             if difference is not None:
                 status, message = Status.WRONG_TRACE, f"In the run {difference}. {message}"
     if status == old_status:
-        region.add(states)
+        region.add(chosen)
+        run.compared_until[0] = end
+        if parameters is not None:
+            region.add_parameters(parameters)
     return status, message
 
 
@@ -182,15 +171,6 @@ def _change_text(name: str, t: float, entry: int, first_value: float, second_val
         f"t = {t:.10g} entry {entry} is {first_value:.9g}, and then {second_value:.9g}. It must "
         "depend on its arguments alone: steps are tried, rejected and sampled in advance"
     )
-
-
-def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[Status, str]:
-    """Return status and message, changed if a callback differs from its trace at one of the states [t, q, v]."""
-    for traced in run.traced:
-        difference = traced.difference(run.system, states)
-        if difference is not None:
-            return Status.WRONG_TRACE, f"In the run {difference}. {message}"
-    return status, message
 
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`

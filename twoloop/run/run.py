@@ -337,7 +337,11 @@ class Run:
             return np.zeros(0, dtype=np.int64), ""
         independent_rows = set(self.work.rows_v.tolist())
         redundant = [i for i in range(n_rows) if i not in independent_rows]
-        rows = self._rows_at_start()
+        system, q = self.system, self.state[: self.system.n_q]
+        if system.called_in_python or system.entries:
+            rows = system.sparse_rows(self.t0, q)
+        else:
+            rows = mass_and_rows(system, self.t0, q)[1]
         violated = self.violated_rows(rows).tolist()
         if violated:
             raise ValueError(
@@ -368,13 +372,6 @@ class Run:
         if residual.max() <= CONTRADICTION:  # CONTRADICTION is the smallest tolerance of a row
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTION * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
-
-    def _rows_at_start(self) -> Rows:
-        """Return [C_q; A] at the start, dense or sparse."""
-        system, q = self.system, self.state[: self.system.n_q]
-        if system.called_in_python or system.entries:
-            return system.sparse_rows(self.t0, q)
-        return mass_and_rows(system, self.t0, q)[1]
 
     def _describe_rows(self, all_rows: Rows, rows: list[int]) -> str:
         """Describe in words how the rows of `all_rows` with the indices `rows` depend on the other rows."""

@@ -26,7 +26,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.fallbacks import MAX_REPETITIONS, gap_for_repetition, may_have_missed_changes, warn_of_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
-from twoloop.run.record import OutputRequest, Record, Status, statistics
+from twoloop.run.record import DEFAULTS, OutputRequest, Status, state_fields, statistics
 from twoloop.run.run import Run
 from twoloop.run.signals import signals_of
 from twoloop.run.singular_start import branch_at
@@ -209,25 +209,20 @@ class SampledRun:
         self.times.append(t)
         self._n_steps, self._step_failed = len(self.steps), False
 
-    def record(self) -> Record:
-        """Return the record of the states at all samples so far."""
-        run, a, n = self.run, self.run.a, self.run.system.n_q
-        table = np.array(self.rows)
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of the result of the states at all samples so far."""
+        run, a = self.run, self.run.a
         steps = np.concatenate([np.empty((0, a.N_STEP_COLUMNS)), *self.steps[: self._n_steps]])
-        return Record(
-            *(np.array(self.times), table[:, :n].T, table[:, n : 2 * n].T, table[:, 2 * n : 3 * n].T),
-            lam=table[:, 3 * n :].T,
-            h=steps[:, a.H],
-            status=Status.REACHED_END,
-            message=f"Stepped to t = {self.t:g} in {len(self.times) - 1} samples.",
-            stats=statistics(run.work.counters, self.cpu_time),
-            rank=run.rank,
-            redundant=run.redundant.copy(),
-            untested=steps[:, a.JACOBIANS] > 0.0,
-            widest_gap=float(run.work.notes[indices.WIDEST_GAP]),
-            system=self.system,
-            changes=CHANGED_PARAMETERS,
-        )
+        fields: dict[str, Any] = {"h": steps[:, a.H], "untested": steps[:, a.JACOBIANS] > 0.0}
+        fields |= state_fields(run.system.n_q, np.array(self.times), np.array(self.rows))
+        fields |= {
+            "rank": run.rank,
+            "redundant": run.redundant.copy(),
+            "stats": statistics(run.work.counters, self.cpu_time),
+        }
+        message = f"Stepped to t = {self.t:g} in {len(self.times) - 1} samples."
+        fields |= {"status": Status.REACHED_END, "message": message, "changes": CHANGED_PARAMETERS}
+        return DEFAULTS | fields | {"widest_gap": float(run.work.notes[indices.WIDEST_GAP])}
 
     def _restart(self, t: float) -> None:
         """Compute the accelerations at t with the new parameters, and restart the method without past steps."""
@@ -265,7 +260,7 @@ class SampledRun:
         interrupts = Interrupts().install_handlers()
         try:
             output = OutputRequest(np.array([end]), ends_at_outputs=True)
-            record = IntegrationLoop(run, end, output, lambda t: None, None, interrupts).integrate_to_end(False)
+            record = IntegrationLoop(run, end, output, interrupts).integrate_to_end(False)
         finally:
             interrupts.restore_handlers()
         run.control[run.a.STORE_ALL], run.work.notes[indices.KINK_AFTER] = 0.0, np.inf

@@ -187,7 +187,9 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
     bodies = _coordinates_of_bodies(system, mass)
     stiff_rows = _stiff_rows(system, t0, q0, mass, jacobian, bodies)
     program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff_rows)
-    if program is None or program[N_UPDATES] > MAX_STATIC_SHARE * _dense_cost(system.n_q, system.n_c):
+    # number of multiplications that one evaluation by a dense Schur complement takes, about
+    dense_cost = 0.5 * system.n_c * system.n_c * (system.n_q + system.n_c / 3.0)
+    if program is None or program[N_UPDATES] > MAX_STATIC_SHARE * dense_cost:
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF_DIAGONAL] + 1)
     static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
@@ -261,11 +263,6 @@ def _is_sparse(n_q: int, n_entries: int) -> bool:
     return n_entries <= MAX_STATIC_SHARE * n_q * n_q + 24 * n_q
 
 
-def _dense_cost(n_q: int, n_c: int) -> float:
-    """Return the estimated number of multiplications that one evaluation by a dense Schur complement takes."""
-    return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
-
-
 def _nonzero_entries(pattern: Array) -> Entries:
     rows, columns = np.nonzero(pattern)
     return rows.astype(np.int64), columns.astype(np.int64)
@@ -293,22 +290,9 @@ def kit_of(
     system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
 ) -> Kit:
     """Return a kit of a system: callbacks, flags that choose the linear algebra, and the step functions of `plan`."""
-    from twoloop.kernels.evaluation.inner_loop import inner_loop
-
     if static is not None:
         return _static_kit(system, plan, static)
-    flags = _flags_for_start(system, t0, q0)
-    if plan is not None:
-        return kit_for_plan(system, flags, plan)
-
-    def create() -> tuple[Kit, Any]:
-        functions = system.functions
-        return Kit(functions._replace(flags=flags.copy()), inner_loop), functions
-
-    if flags[FORM] == AUGMENTED:  # a run may change these flags
-        return create()[0]
-    cached: tuple[Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), create)
-    return cached[0]
+    return kit_for_plan(system, _flags_for_start(system, t0, q0), plan)
 
 
 def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
@@ -363,26 +347,29 @@ def is_diagonal(mass: Array) -> bool:
     return np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
 
 
-def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
+def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> Kit:
     """Return the kit with these flags and the steps of a plan, from the system's cache if possible; else cache it."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
-    numbers = (plan.numbers, plan.own_numbers)
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # ids in the key stay unique, as the cached kits keep the objects with these ids alive
-    plan_functions = (plan.inner, plan.step, plan.first, plan.second)
-    key = (id(system.functions), flags.tobytes(), *plan_functions, len(LOADED_STEPS), *map(id, (*plan.own, *numbers)))
-    run_changes_flags = flags[FORM] == AUGMENTED  # a run may change these flags
-    if key in kits:
-        return _with_own_flags(kits[key][0]) if run_changes_flags else kits[key][0]
-    flags = flags.copy()
-    flags[STRAIGHT] = plan.inner is not None
-    functions = system.functions._replace(flags=flags)
-    kit = Kit(functions, plan.inner or inner_loop, *_steps_of_plan(plan), inner_loop, plan.own, *numbers)
-    if len(kits) == MAX_KITS:
-        del kits[next(iter(kits))]
-    kits[key] = kit, system.functions
-    return _with_own_flags(kit) if run_changes_flags else kit
+    key: tuple[Any, ...] = id(system.functions), flags.tobytes()
+    if plan is not None:
+        key += (plan.inner, plan.step, plan.first, plan.second, len(LOADED_STEPS))
+        key += tuple(map(id, (*plan.own, plan.numbers, plan.own_numbers)))
+    entry = kits.get(key)
+    if entry is None:
+        flags = flags.copy()
+        flags[STRAIGHT] = plan is not None and plan.inner is not None
+        functions, inner = system.functions._replace(flags=flags), inner_loop
+        steps: tuple[Any, ...] = ()
+        if plan is not None:
+            inner = plan.inner or inner_loop
+            steps = *_steps_of_plan(plan), inner_loop, plan.own, plan.numbers, plan.own_numbers
+        if len(kits) == MAX_KITS:
+            del kits[next(iter(kits))]
+        entry = kits[key] = Kit(functions, inner, *steps), system.functions
+    return _with_own_flags(entry[0]) if flags[FORM] == AUGMENTED else entry[0]  # a run may change these flags
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
@@ -440,18 +427,12 @@ def prepare_workspace(
     """Reset a workspace, which another run may have used, for a run from q0; return the workspace."""
     arrays = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting_arrays(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
-    if static is not None:
-        _set_constants(work, system, static, q0)
-        return work
-    if flags[BANDWIDTH] >= 0:
+    if static is not None:  # arrays that are constant during a run
+        work.pattern[:], work.mass_pattern[:] = static.pattern, static.mass_pattern
+        work.dependent[:] = work.independent[:] = np.arange(system.n_q)
+        work.is_independent[:] = 1.0
+        if system.constant_mass and "mass" not in system.entries:
+            work.mass_values[:] = system.mass(0.0, q0)[static.mass]
+    elif flags[BANDWIDTH] >= 0:
         work.lapack[:] = lapack_addresses()
     return work
-
-
-def _set_constants(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
-    """Fill the arrays of a workspace that are constant during a run in the static form."""
-    work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
-    work.dependent[:] = work.independent[:] = np.arange(system.n_q)
-    work.is_independent[:] = 1.0
-    if system.constant_mass and "mass" not in system.entries:
-        work.mass_values[:] = system.mass(0.0, q0)[form.mass]

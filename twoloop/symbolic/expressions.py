@@ -442,18 +442,15 @@ def _evaluate(expressions: list[Expr], printer: _Printer) -> tuple[list[str], li
     shared, reduced = sympy.cse(expressions, symbols=sympy.numbered_symbols("x", cls=Symbol), order="none", list=True)
     used = set().union(*(expression.free_symbols for expression in [*reduced, *(value for _, value in shared)]), set())
     loads = [
-        f"{symbol} = {symbol.name[: -len(number)]}[{number}]"
-        for symbol in sorted(used, key=_name_and_number)
-        if (number := _number(symbol)) and symbol.name[0] != "x"
+        f"{name}{number} = {name}[{number}]"
+        for name, number in sorted(map(_name_and_number, used))
+        if number >= 0 and name != "x"
     ]
     lines = [f"{symbol} = {printer.doprint(value)}" for symbol, value in shared]
     return loads + lines, [printer.doprint(expression) for expression in reduced]
 
 
-def _number(symbol: Symbol) -> str:
-    return symbol.name.lstrip("abcdefghijklmnopqrstuvwxyz")
-
-
 def _name_and_number(symbol: Symbol) -> tuple[str, int]:
-    number = _number(symbol)
-    return symbol.name[: len(symbol.name) - len(number)], int(number or 0)
+    """Split a symbol such as q3; -1 stands for no number."""
+    name = symbol.name.rstrip("0123456789")
+    return name, int(symbol.name[len(name) :] or -1)

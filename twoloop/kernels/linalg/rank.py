@@ -128,43 +128,6 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
     return True
 
 
-@kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def least_norm_solution(rows, values, min_sine, basis, factors, kept, coefficients, gram, parts, x):
-    """Store in `x` the vector of least norm for which rows @ x is nearest to `values`; return the rank of `rows`.
-
-    `x` must be zero on entry; `values` is overwritten with the residuals. If y and b are the values of independent and
-    other rows, and S the coefficients of independent rows in the other rows, then the independent rows times x are
-    y + S^T z, with (I + S S^T) z = b - S y. `basis` to `parts` are scratch; for `min_sine` see `select_rows`.
-    """
-    n, n_others = select_rows(rows, min_sine, basis, factors, kept), 0
-    y, z = parts[0], parts[1]
-    for i in range(len(rows)):
-        if i - n_others < n and kept[i - n_others] == i:
-            y[i - n_others] = values[i]
-            continue
-        _fill_coefficients(n, basis, factors, rows[i], coefficients[n_others])
-        z[n_others] = values[i]
-        n_others += 1
-    for i in range(n_others):
-        for k in range(n):
-            z[i] -= coefficients[i, k] * y[k]
-        for j in range(n_others):
-            gram[i, j] = _dot(coefficients[i], coefficients[j]) + (1.0 if i == j else 0.0)
-    ldl_factor(gram[:n_others, :n_others])
-    ldl_solve(gram[:n_others, :n_others], z[:n_others])
-    for k in range(n):
-        for i in range(n_others):
-            y[k] += coefficients[i, k] * z[i]
-        for j in range(k):
-            y[k] -= factors[k, j] * y[j]
-        y[k] /= factors[k, k]
-        for j in range(x.size):
-            x[j] += y[k] * basis[k, j]
-    for i in range(len(rows)):
-        values[i] -= _dot(rows[i], x)
-    return n
-
-
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
 def singular_values_exceed(rows, ratio, gram):
     """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one, s.
