@@ -15,8 +15,6 @@ from twoloop.bodies.loads import function_rows
 from twoloop.bodies.parameter_layout import (
     ALONG,
     ANGLE_DRIVE,
-    AXIAL_FORCE,
-    AXIAL_TORQUE,
     PERPENDICULAR,
     POINT,
     TORSION_SPRING,
@@ -383,35 +381,15 @@ class SpatialModel(SpatialCouplings):
     def _no_rotation(self) -> Array:
         return np.eye(3)
 
-    def _axis(self, joint: ModelJoint) -> Array:
-        return joint.axes[0]
-
-    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+    def _turn_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         axis_a, axis_b = joint.axes
-        if joint.kind == "prismatic":
-            along = Numbers(tuple(axis_a))
-            return JointRow(ALONG, 1, joint.a, joint.b, joint.point_a, joint.point_b, along, motion)
         first, second = perpendiculars(axis_a)
-        zero = relative(joint.a, axis_a, joint.b, axis_b).T @ first
-        return JointRow(
-            ANGLE_DRIVE, 1, joint.a, joint.b, Numbers((*first, *second)), Numbers(tuple(zero)), None, motion
-        )
+        zero = Numbers(tuple(relative(joint.a, axis_a, joint.b, axis_b).T @ first))
+        return JointRow(ANGLE_DRIVE, 1, joint.a, joint.b, Numbers((*first, *second)), zero, None, motion)
 
     def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
         axis, start = Numbers(tuple(joint.axes[0])), Numbers(tuple(self._zero(joint)))
         return Force(name, TORSION_SPRING, joint.a, joint.b, axis, start, numbers, joint=joint)
-
-    def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
-        function, more = self._function(name, f, 1, unit)
-        axis = Numbers(tuple(joint.axes[0]))
-        if joint.kind == "revolute":
-            return Force(name, AXIAL_TORQUE, joint.a, joint.b, axis, None, more, function, joint=joint)
-        return Force(name, AXIAL_FORCE, joint.a, joint.b, axis, joint.point_b, more, function, joint=joint)
-
-    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers | None) -> Force:
-        axis = Numbers(tuple(joint.axes[0]))
-        places = axis, joint.point_b, numbers
-        return Force(name, kind, joint.a, joint.b, *places, point_on_first=joint.point_a, joint=joint)
 
     def _check_moments(self, name: str, moments: Array) -> None:
         _moments(f"inertia of {name}", moments[TENSOR].reshape(3, 3))
