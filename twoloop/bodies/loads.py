@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from twoloop.bodies.collection import add, documented
 from twoloop.bodies.coordinates import Coordinates, JointCoordinate
 from twoloop.bodies.frames import point_of, vector_of
@@ -431,7 +429,7 @@ def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
 
 @dataclass(frozen=True, eq=False)
 class PlaneGap:
-    """Measure the distance of a point of one body from a plane of another, m."""
+    """Measure the distance of a point of one body from a plane of another, or its displacement along it, m."""
 
     body: Body
     place: Array
@@ -444,16 +442,6 @@ class PlaneGap:
         plane = self.other.number
         point, foot = point_of(q, self.body.number, self.place), point_of(q, plane, self.foot)
         return sum(n * (x - y) for n, x, y in zip(vector_of(q, plane, self.normal), point, foot, strict=True))
-
-
-@dataclass(frozen=True, eq=False)
-class PlaneSlide(PlaneGap):
-    """Measure the displacement of a point of one body along a line of another, m."""
-
-    def __call__(self, t: Any, q: Any) -> Any:
-        """Return the displacement, for numbers or symbols."""
-        x, y = self.normal
-        return PlaneGap(self.body, self.place, self.other, self.foot, np.array([y, -x]))(t, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -507,11 +495,11 @@ class Stops(Loads):
         self._different("stop", body_a, body_b)
         name = self._new_name("stop", name, body_a, body_b)
         point, foot = self._point("at", at, body_a), self._point("foot", foot, body_b)
-        geometry = point, body_b, foot, self._direction("normal", normal, body_b)
+        gap = PlaneGap(body_a, point, body_b, foot, self._direction("normal", normal, body_b))
         if check_not_negative("friction", friction) and self.dimension == 3:
             raise ValueError(f"friction of {name!r} must be zero, as stops rub in the plane only; given {friction!r}")
-        slide = PlaneSlide(body_a, *geometry) if friction else None
-        return add(self.stops, Stop(PlaneGap(body_a, *geometry), restitution, name, friction, slide))
+        slide = replace(gap, normal=gap.normal[::-1] * (1.0, -1.0)) if friction else None  # along the plane
+        return add(self.stops, Stop(gap, restitution, name, friction, slide))
 
     def limit(
         self,

@@ -40,7 +40,8 @@ class LoadedFriction:
     def __init__(self, callbacks: Any, tables: Tables, redundant: bool):
         self._fill_force, self._loaded, self._redundant = callbacks.fill_force, tables.loaded, redundant
         self._dimension = len(tables.gravity)
-        self._numbers = [tables.place(force) + np.arange(_size(force)) for force in tables.loaded]
+        places = [(tables.place(force), len(force.more.values)) for force in tables.loaded if force.more is not None]
+        self._numbers = [place + np.arange(size) for place, size in places]
         self._rows = [self._carrying(force, tables) for force in tables.loaded]
         first = int(tables.p[tables.p.size - HEAD + FORCES]) + FORCE_WIDTH * len(tables.forces)
         # rows of the unit motors, after those of the forces
@@ -55,7 +56,9 @@ class LoadedFriction:
     def of(self, q: Array, v: Array, p: Array, Q: Array, M: Array, G: Array, gamma: Array) -> Array:
         """Return the contribution to Q, (n_q,)."""
         W = np.array([self._along(k, q, p) for k in range(len(self._loaded))])
-        c = np.array([_slope(p[at], rate) for at, rate in zip(self._numbers, W @ v, strict=True)])
+        # coefficient times radius of the hinge times tanh; the numbers begin with constant friction and speed
+        pairs = zip((p[at] for at in self._numbers), W @ v, strict=True)
+        c = np.array([own[2:].prod() * np.tanh(rate / own[1]) for own, rate in pairs])
         if not c.any():
             return np.zeros(len(q))
         n, m = len(q), len(G)
@@ -85,16 +88,6 @@ class LoadedFriction:
             return lam
         axis = np.array(vector_of(q, joint.a.number, joint.axes[0]))
         return np.asarray(lam - np.outer(axis, axis @ lam))
-
-
-def _size(force: Force) -> int:
-    assert force.more is not None
-    return len(force.more.values)
-
-
-def _slope(numbers: Array, rate: float) -> float:
-    """Return coefficient times hinge radius times tanh; numbers begin with constant friction and speed."""
-    return float(numbers[2:].prod() * np.tanh(rate / numbers[1]))
 
 
 def _friction(c: Array, loads: list[Array]) -> Array:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.bodies.collection import Points, add, documented
-from twoloop.bodies.frames import angle_of, point_of, vector_of
+from twoloop.bodies.coordinates import Displacement, PlanarAngle
+from twoloop.bodies.frames import vector_of
 from twoloop.bodies.functions import Function, RateFunction
 from twoloop.bodies.loads import Row, listed
 from twoloop.bodies.model_problem import Model
@@ -57,13 +58,12 @@ class Couplings(Model):
             raise ValueError("wheel must be a body that moves; given the ground")
         check_positive("radius", radius)
         direction = self._direction("axis", axis, body_a)
-        angle, foot = float(np.arctan2(*direction[::-1])), np.array(points[0].values)
-        zero, joint = np.zeros(2), ModelJoint(name, "rolling", body_a, body_b, (), *points)
-        turned = self.coordinate_of(joint, "angle", lambda numbers: np.array(numbers.values))
-        rows = [
-            lambda q: _along(q, body_a, angle + 0.5 * np.pi, foot, body_b, zero),
-            lambda q: _along(q, body_a, angle, foot, body_b, zero) + radius * turned.position(q),
-        ]
+        head = name, "displacement", body_a.number, body_b.number
+        x, y = direction.tolist()
+        across, along = (Displacement(*head, axis, points[0].values, (0.0, 0.0)) for axis in ((-y, x), (x, y)))
+        turned = PlanarAngle(name, "angle", *head[2:], float(body_b.rotation - body_a.rotation))
+        rows = [across.position, lambda q: along.position(q) + radius * turned.position(q)]
+        joint = ModelJoint(name, "rolling", body_a, body_b, (), *points)
         return self._coupled(name, "rolling", joint, rows, joint)
 
     def skate(self, body: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
@@ -94,13 +94,6 @@ class Couplings(Model):
         function = RateFunction(f"skate {name!r}", across, columns)
         row = JointRow(RATE_FUNCTION, 1, self.ground, on, *points, places, function)
         return add(self.joints, ModelJoint(name, "skate", self.ground, on, (row,), *points))
-
-
-def _along(q: Any, a: Body, angle: float, point_a: Any, b: Body, point_b: Any) -> Any:
-    """Return the displacement of a point of b from a point of a along a direction of a."""
-    (x, y), (u, w) = point_of(q, a.number, point_a), point_of(q, b.number, point_b)
-    total = angle_of(q, a.number) + angle
-    return np.cos(total) * (u - x) + np.sin(total) * (w - y)
 
 
 @documented
@@ -184,11 +177,8 @@ class PlanarModel(Couplings):
 
         Parameters
         ----------
-        name : str
         start, end : array_like (2,)
             m.
-        mass : float
-            kg.
         **motion
             `velocity` and `angular_velocity`, as for `body`.
         """
@@ -204,15 +194,8 @@ class PlanarModel(Couplings):
 
         Parameters
         ----------
-        name : str
         size : array_like (2,)
             Its edges along the axes of the body, m.
-        mass : float
-            kg.
-        position : array_like (2,)
-            Of the centre, m.
-        **pose
-            `angle`, `velocity` and `angular_velocity`, as for `body`.
         """
         edges = check_vector(f"size of {name!r}", size, 2)
         check_positive(f"mass of {name!r}", mass)
@@ -221,20 +204,7 @@ class PlanarModel(Couplings):
         return self.body(name, mass=mass, inertia=mass * float(edges @ edges) / 12.0, position=position, **pose)
 
     def disc(self, name: str, radius: float, *, mass: float, position: ArrayLike, **pose: Any) -> Body:
-        """Add a uniform disc.
-
-        Parameters
-        ----------
-        name : str
-        radius : float
-            m.
-        mass : float
-            kg.
-        position : array_like (2,)
-            Of the centre, m.
-        **pose
-            `angle`, `velocity` and `angular_velocity`, as for `body`.
-        """
+        """Add a uniform disc."""
         check_positive(f"radius of {name!r}", radius)
         check_positive(f"mass of {name!r}", mass)
         return self.body(name, mass=mass, inertia=0.5 * mass * radius**2, position=position, **pose)

@@ -164,13 +164,8 @@ class SpatialModel(SpatialCouplings):
 
         Parameters
         ----------
-        name : str
         start, end : array_like (3,)
             m.
-        radius : float
-            m.
-        mass : float
-            kg.
         **motion
             `velocity` and `angular_velocity`, as for `body`.
         """
@@ -189,15 +184,8 @@ class SpatialModel(SpatialCouplings):
 
         Parameters
         ----------
-        name : str
         size : array_like (3,)
             Its edges along the axes of the body, m.
-        mass : float
-            kg.
-        position : array_like (3,)
-            Of the centre, m.
-        **pose
-            `rotation`, `velocity` and `angular_velocity`, as for `body`.
         """
         squares = check_vector(f"size of {name!r}", size, 3) ** 2
         check_positive(f"mass of {name!r}", mass)
@@ -206,20 +194,7 @@ class SpatialModel(SpatialCouplings):
         return self.body(name, mass=mass, inertia=mass * (squares.sum() - squares) / 12.0, position=position, **pose)
 
     def sphere(self, name: str, radius: float, *, mass: float, position: ArrayLike, **pose: Any) -> Body:
-        """Add a uniform ball.
-
-        Parameters
-        ----------
-        name : str
-        radius : float
-            m.
-        mass : float
-            kg.
-        position : array_like (3,)
-            Of the centre, m.
-        **pose
-            `rotation`, `velocity` and `angular_velocity`, as for `body`.
-        """
+        """Add a uniform ball."""
         check_positive(f"radius of {name!r}", radius)
         check_positive(f"mass of {name!r}", mass)
         return self.body(name, mass=mass, inertia=np.full(3, 0.4 * mass * radius**2), position=position, **pose)
