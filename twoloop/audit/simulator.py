@@ -117,18 +117,9 @@ class AuditedRun(NamedTuple):
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from twoloop.audit import audit_simulator
-    >>> from twoloop.bodies import SpatialModel
-    >>> model = SpatialModel(name="pendulum")
-    >>> rod = model.rod("rod", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
-    >>> pin = model.revolute("ground", rod, at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
-    >>> problem = model.problem((0.0, 0.2))
-    >>> def simulate(problem, times, step):
-    ...     return np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
-    >>> audit = audit_simulator(simulate, problem, step=0.01, error=1e-3)
-    >>> run = audit.runs[0]
-    >>> float(run.step), run.n_steps
+    >>> from twoloop.audit import AuditedRun
+    >>> run = AuditedRun(step=0.004, n_steps=50, error=2e-3, gap=1e-4, cpu_s=0.01)
+    >>> run.step, run.n_steps
     (0.004, 50)
     """
 
@@ -159,18 +150,11 @@ class Audit:
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from twoloop.audit import audit_simulator
-    >>> from twoloop.bodies import SpatialModel
-    >>> model = SpatialModel(name="pendulum")
-    >>> rod = model.rod("rod", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
-    >>> pin = model.revolute("ground", rod, at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
-    >>> problem = model.problem((0.0, 0.2))
-    >>> def simulate(problem, times, step):
-    ...     return np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
-    >>> audit = audit_simulator(simulate, problem, step=0.01, error=1e-3)
-    >>> audit.label, audit.error
-    ('simulator', 0.001)
+    >>> from twoloop.audit import Audit, AuditedRun
+    >>> runs = tuple(AuditedRun(step, round(1.0 / step), 10.0 * step**2, 1e-4, 0.01) for step in (0.02, 0.01, 0.005))
+    >>> audit = Audit("simulator", t_end=1.0, error=2e-3, apart=1e-9, runs=runs, order=2.0, floor=None)
+    >>> audit.reaching.step
+    0.01
     """
 
     label: str

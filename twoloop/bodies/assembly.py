@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack, null_space
 
 from twoloop.bodies.collection import Collection
-from twoloop.bodies.loads import TurnGap
+from twoloop.bodies.loads import CoordinateGap
 from twoloop.bodies.tables import TENSOR, Tables
 from twoloop.checks.arguments import Array
 from twoloop.checks.scales import TURNS, generic_factors, scales_of, typical_sizes, units
@@ -327,7 +327,8 @@ def _turns(model: Collection, tables: Tables, start: Array) -> Iterator[str]:
     angles = {name: value for name, value in tables.values.items() if name.endswith("(rad)")}
     if model.dimension == 2:
         angles |= {f"angle of {body.name} (rad)": start[body.coordinates[2]] for body in model.bodies}
-    angles |= {f"{each.name} (rad)": each.gap.limit for each in model.stops if isinstance(each.gap, TurnGap)}
+    limits = ((each.name, each.gap) for each in model.stops if isinstance(each.gap, CoordinateGap))
+    angles |= {f"{name} (rad)": gap.limit for name, gap in limits if gap.coordinate.unit == "rad"}
     for name, value in angles.items():
         if abs(value) > TURN:
             yield f"{name[:-6]} is {value:.6g} rad, more than a turn: angles are in rad, not in degrees."

@@ -23,7 +23,6 @@ from twoloop.bodies.geometry import (
     move_row,
     numbers,
     plus,
-    push_row,
     put_point_rows,
     rate_of,
     times,
@@ -68,75 +67,98 @@ def direction(q, p, w, kind, i, at, results, first_result):
 
 
 @merged
-def bend(w, spin, n, n_rate, n_bias, b, b_rate, b_bias):
-    """Return the second derivative of n . b without the accelerations, for a vector n of a body."""
-    if w == PLANAR:
-        return dot(n, b_bias) + 2.0 * spin * (n[0] * b_rate[1] - n[1] * b_rate[0]) - spin * spin * dot(n, b)
-    return dot(n_bias, b) + 2.0 * dot(n_rate, b_rate) + dot(n, b_bias)
+def put_row(q, v, p, w, results, k, C, Cq, Qd, first, c_i, c_j):
+    """Evaluate row k of the table of joints in those of C, C_q and gamma that are not None.
 
-
-@merged
-def put_constraint(q, p, w, results, k, C):
-    """Evaluate C of joint row k."""
-    kind, row, i, at_i, j, at_j, more, first_result = joint_at(p, k)
+    Most rows are n . d = m: n is a direction of body i, d the vector from a point of i to one of j, or a direction of
+    j, and m the motion. `first`: the row in C_q; c_i and c_j: the columns where the coordinates of the bodies begin.
+    """
+    kind, row, i, at_i, j, at_j, more, motion = joint_at(p, k)
+    if kind == layout.RATE_FUNCTION:
+        return
     if kind == layout.ROW_FUNCTION:
-        C[row] = results[first_result]
-    elif kind == layout.ANGLE:
-        C[row] = angle_of(q, j) - angle_of(q, i) - p[more] - result(results, first_result, 0)
-    elif kind in (layout.PERPENDICULAR, layout.ANGLE_DRIVE):
-        _, n = direction(q, p, w, kind, i, at_i, results, first_result)
-        C[row] = dot(n, vector(q, w, j, numbers(p, w, at_j)))
-    elif kind != layout.RATE_FUNCTION:
-        end_i = plus(centre(q, w, i), vector(q, w, i, numbers(p, w, at_i)))
-        d = minus(plus(centre(q, w, j), vector(q, w, j, numbers(p, w, at_j))), end_i)
-        if kind == layout.POINT:
-            C[row], C[row + 1] = d[0], d[1]
-            if w != PLANAR:
-                C[row + 2] = d[2]
-        elif kind == layout.LENGTH:
-            C[row] = 0.5 * (dot(d, d) - p[more] * p[more])
-        else:
-            _, n = direction(q, p, w, kind, i, more, results, first_result)
-            C[row] = dot(n, d) - result(results, first_result, 0)
-
-
-@merged
-def put_rows(q, p, w, results, k, Cq, row, c_i, c_j):
-    """Evaluate the rows of C_q of joint row k, from `row` on; c_i and c_j: columns where its bodies begin."""
-    kind, _, i, at_i, j, at_j, more, first_result = joint_at(p, k)
-    if kind == layout.ROW_FUNCTION:
-        fill_entries(p, more, results, first_result + 3, Cq[row])
-    elif kind == layout.ANGLE:
-        if i >= 0:
-            Cq[row, c_i + 2] = -1.0
-        if j >= 0:
-            Cq[row, c_j + 2] = 1.0
-    elif kind in (layout.PERPENDICULAR, layout.ANGLE_DRIVE):
-        a, n = direction(q, p, w, kind, i, at_i, results, first_result)
-        b = numbers(p, w, at_j)
-        arm = vector(q, w, j, b)
-        turn_row(q, Cq[row], w, j, c_j, b, arm, n)
-        turn_row(q, Cq[row], w, i, c_i, a, n, arm)
-    elif kind != layout.RATE_FUNCTION:
-        a, b = numbers(p, w, at_i), numbers(p, w, at_j)
-        arm_i, arm_j = vector(q, w, i, a), vector(q, w, j, b)
-        if kind == layout.POINT:
-            put_point_rows(q, Cq, row, w, i, c_i, a, arm_i, -1.0)
-            put_point_rows(q, Cq, row, w, j, c_j, b, arm_j, 1.0)
-            return
+        if C is not None:
+            C[row] = results[motion]
+        if Cq is not None:
+            fill_entries(p, more, results, motion + 3, Cq[first])
+        if Qd is not None:
+            Qd[row] = results[motion + 2]
+        return
+    if kind == layout.ANGLE:
+        if C is not None:
+            C[row] = angle_of(q, j) - angle_of(q, i) - p[more] - result(results, motion, 0)
+        if Cq is not None:
+            if i >= 0:
+                Cq[first, c_i + 2] = -1.0
+            if j >= 0:
+                Cq[first, c_j + 2] = 1.0
+        if Qd is not None:
+            Qd[row] = result(results, motion, 2)
+        return
+    joins_points = kind not in (layout.PERPENDICULAR, layout.ANGLE_DRIVE)
+    a, b = (0.0, 0.0, 0.0), numbers(p, w, at_j)
+    arm_i, arm_j = a, vector(q, w, j, b)
+    d = arm_j
+    if joins_points:
+        a = numbers(p, w, at_i)
+        arm_i = vector(q, w, i, a)
         d = minus(plus(centre(q, w, j), arm_j), plus(centre(q, w, i), arm_i))
+    if kind == layout.POINT:
+        if C is not None:
+            for x in range(2 if w == PLANAR else 3):
+                C[row + x] = d[x]
+        if Cq is not None:
+            put_point_rows(q, Cq, first, w, i, c_i, a, arm_i, -1.0)
+            put_point_rows(q, Cq, first, w, j, c_j, b, arm_j, 1.0)
+        if Qd is not None:
+            bias = minus(bias_of(v, w, j, b, arm_j), bias_of(v, w, i, a, arm_i))
+            for x in range(2 if w == PLANAR else 3):
+                Qd[row + x] = -bias[x]
+        return
+    if kind == layout.LENGTH:
+        local, n = a, d
+    else:
+        local, n = direction(q, p, w, kind, i, more if joins_points else at_i, results, motion)
+    if C is not None:
         if kind == layout.LENGTH:
-            push_row(q, Cq[row], w, i, c_i, a, arm_i, times(-1.0, d))
-            push_row(q, Cq[row], w, j, c_j, b, arm_j, d)
-            return
-        local, n = direction(q, p, w, kind, i, more, results, first_result)
-        push_row(q, Cq[row], w, j, c_j, b, arm_j, n)
-        move_row(Cq[row], w, c_i, times(-1.0, n))
-        if w == PLANAR:  # the point and the direction turn by the same angle
-            turn_row(q, Cq[row], w, i, c_i, local, n, plus(arm_i, d))
+            C[row] = 0.5 * (dot(d, d) - p[more] * p[more])
+        elif kind == layout.ANGLE_DRIVE:
+            C[row] = dot(n, d)
         else:
-            turn_row(q, Cq[row], w, i, c_i, a, arm_i, times(-1.0, n))
-            turn_row(q, Cq[row], w, i, c_i, local, n, d)
+            C[row] = dot(n, d) - result(results, motion, 0)
+    if Cq is not None:
+        turn_row(q, Cq[first], w, j, c_j, b, arm_j, n)
+        if joins_points:
+            move_row(Cq[first], w, c_j, n)
+            move_row(Cq[first], w, c_i, times(-1.0, n))
+        if w == PLANAR and kind != layout.LENGTH:  # the point and the direction turn by the same angle
+            turn_row(q, Cq[first], w, i, c_i, local, n, plus(arm_i, d))
+        else:
+            if joins_points:
+                turn_row(q, Cq[first], w, i, c_i, a, arm_i, times(-1.0, n))
+            if kind != layout.LENGTH:
+                turn_row(q, Cq[first], w, i, c_i, local, n, d)
+    if Qd is not None:
+        rate, bias = rate_of(q, v, w, j, b, arm_j), bias_of(v, w, j, b, arm_j)
+        if joins_points:
+            rate = minus(plus(centre(v, w, j), rate), plus(centre(v, w, i), rate_of(q, v, w, i, a, arm_i)))
+            bias = minus(bias, bias_of(v, w, i, a, arm_i))
+        if kind == layout.LENGTH:
+            Qd[row] = -(dot(rate, rate) + dot(d, bias))
+            return
+        n_rate, n_bias = rate_of(q, v, w, i, local, n), bias_of(v, w, i, local, n)
+        bend = result(results, motion, 2)
+        if kind == layout.ANGLE_DRIVE:  # the direction also moves relative to body i
+            _, moving, faster = driven_direction(p, at_i, results, motion)
+            slope = vector(q, w, i, moving)
+            n_bias = plus(n_bias, times(2.0, rate_of(q, v, w, i, moving, slope)))
+            n_rate, n_bias, bend = plus(n_rate, slope), plus(n_bias, vector(q, w, i, faster)), 0.0
+        if w == PLANAR:
+            turn = angle_of(v, i)
+            total = dot(n, bias) + 2.0 * turn * (n[0] * rate[1] - n[1] * rate[0]) - turn * turn * dot(n, d)
+        else:
+            total = dot(n_bias, d) + 2.0 * dot(n_rate, rate) + dot(n, bias)
+        Qd[row] = bend - total
 
 
 @merged
@@ -150,108 +172,26 @@ def put_rate(q, p, w, results, k, Ct):
         Ct[row] = -results[first_result + 1]  # zero for ROW_FUNCTION rows
 
 
-@merged
-def put_gamma(q, v, p, w, results, k, Qd):
-    """Evaluate the right-hand side of C_q a = gamma of joint row k."""
-    kind, row, i, at_i, j, at_j, more, first_result = joint_at(p, k)
-    spin = angle_of(v, i) if w == PLANAR else 0.0
-    if kind == layout.ROW_FUNCTION:
-        Qd[row] = results[first_result + 2]
-    elif kind == layout.ANGLE:
-        Qd[row] = result(results, first_result, 2)
-    elif kind in (layout.PERPENDICULAR, layout.ANGLE_DRIVE):
-        a, n = direction(q, p, w, kind, i, at_i, results, first_result)
-        b = numbers(p, w, at_j)
-        arm = vector(q, w, j, b)
-        n_rate, n_bias = rate_of(q, v, w, i, a, n), bias_of(v, w, i, a, n)
-        if kind == layout.ANGLE_DRIVE:  # the direction also moves relative to body i
-            _, rate, faster = driven_direction(p, at_i, results, first_result)
-            moving = vector(q, w, i, rate)
-            n_bias = plus(n_bias, times(2.0, rate_of(q, v, w, i, rate, moving)))
-            n_rate, n_bias = plus(n_rate, moving), plus(n_bias, vector(q, w, i, faster))
-        Qd[row] = -bend(w, spin, n, n_rate, n_bias, arm, rate_of(q, v, w, j, b, arm), bias_of(v, w, j, b, arm))
-    elif kind != layout.RATE_FUNCTION:
-        a, b = numbers(p, w, at_i), numbers(p, w, at_j)
-        arm_i, arm_j = vector(q, w, i, a), vector(q, w, j, b)
-        bias = minus(bias_of(v, w, j, b, arm_j), bias_of(v, w, i, a, arm_i))
-        if kind == layout.POINT:
-            Qd[row], Qd[row + 1] = -bias[0], -bias[1]
-            if w != PLANAR:
-                Qd[row + 2] = -bias[2]
-            return
-        d = minus(plus(centre(q, w, j), arm_j), plus(centre(q, w, i), arm_i))
-        end_rate = plus(centre(v, w, i), rate_of(q, v, w, i, a, arm_i))
-        rate = minus(plus(centre(v, w, j), rate_of(q, v, w, j, b, arm_j)), end_rate)
-        if kind == layout.LENGTH:
-            Qd[row] = -(dot(rate, rate) + dot(d, bias))
-            return
-        local, n = direction(q, p, w, kind, i, more, results, first_result)
-        n_rate, n_bias = rate_of(q, v, w, i, local, n), bias_of(v, w, i, local, n)
-        Qd[row] = result(results, first_result, 2) - bend(w, spin, n, n_rate, n_bias, d, rate, bias)
-
-
 @helper
-def fill_constraint(q, p, results, C):
-    """Evaluate C."""
+def fill_rows(q, v, p, results, C, Cq, Ct, Qd):
+    """Evaluate those of C, C_q, C_t and gamma that are not None; `results`: those of the program of motions."""
     w = coordinates_of(p)
     if w != PLANAR:
         for body in range(n_bodies(p)):
-            k = 7 * body + 3
-            C[body] = 0.5 * (q[k] * q[k] + q[k + 1] * q[k + 1] + q[k + 2] * q[k + 2] + q[k + 3] * q[k + 3] - 1.0)
-    for k in joint_places(p):
-        put_constraint(q, p, w, results, k, C)
-
-
-@helper
-def fill_jacobian(q, p, results, Cq):
-    """Evaluate C_q; `results`: those of the program of motions."""
-    w = coordinates_of(p)
-    if w != PLANAR:
-        for body in range(n_bodies(p)):
+            length = speed = 0.0
             for k in range(7 * body + 3, 7 * body + 7):
-                Cq[body, k] = q[k]
+                length, speed = length + q[k] * q[k], speed + v[k] * v[k]
+                if Cq is not None:
+                    Cq[body, k] = q[k]
+            if C is not None:
+                C[body] = 0.5 * (length - 1.0)
+            if Qd is not None:
+                Qd[body] = -speed
     for k in joint_places(p):
         _, row, i, _, j, _, _, _ = joint_at(p, k)
-        put_rows(q, p, w, results, k, Cq, row, w * i, w * j)
-
-
-@helper
-def fill_rate(q, p, results, Ct):
-    """Evaluate C_t."""
-    for k in joint_places(p):
-        put_rate(q, p, coordinates_of(p), results, k, Ct)
-
-
-@helper
-def fill_gamma(q, v, p, results, Qd):
-    """Evaluate the right-hand side of C_q a = gamma."""
-    w = coordinates_of(p)
-    if w != PLANAR:
-        for body in range(n_bodies(p)):
-            k = 7 * body + 3
-            Qd[body] = -(v[k] * v[k] + v[k + 1] * v[k + 1] + v[k + 2] * v[k + 2] + v[k + 3] * v[k + 3])
-    for k in joint_places(p):
-        put_gamma(q, v, p, w, results, k, Qd)
-
-
-@helper
-def fill_kinematics(q, v, p, results, C, Cq, Ct, Qd):
-    """Evaluate C, C_q, C_t and gamma of a model in the plane together."""
-    for k in joint_places(p):
-        kind, row, i, at_i, j, at_j, _, _ = joint_at(p, k)
-        if kind == layout.POINT:  # most joints are pins: each of their sines is needed once
-            a, b = numbers(p, PLANAR, at_i), numbers(p, PLANAR, at_j)
-            arm_i, arm_j = vector(q, PLANAR, i, a), vector(q, PLANAR, j, b)
-            d = minus(plus(centre(q, PLANAR, j), arm_j), plus(centre(q, PLANAR, i), arm_i))
-            bias = minus(bias_of(v, PLANAR, j, b, arm_j), bias_of(v, PLANAR, i, a, arm_i))
-            C[row], C[row + 1], Qd[row], Qd[row + 1] = d[0], d[1], -bias[0], -bias[1]
-            put_point_rows(q, Cq, row, PLANAR, i, 3 * i, a, arm_i, -1.0)
-            put_point_rows(q, Cq, row, PLANAR, j, 3 * j, b, arm_j, 1.0)
-        else:
-            put_constraint(q, p, PLANAR, results, k, C)
-            put_rows(q, p, PLANAR, results, k, Cq, row, 3 * i, 3 * j)
-            put_rate(q, p, PLANAR, results, k, Ct)
-            put_gamma(q, v, p, PLANAR, results, k, Qd)
+        put_row(q, v, p, w, results, k, C, Cq, Qd, row, w * i, w * j)
+        if Ct is not None:
+            put_rate(q, p, w, results, k, Ct)
 
 
 @helper
@@ -288,7 +228,8 @@ def fill_values(q, p, results, values):
             n_i, n_j = (w - skipped if i >= 0 else 0), (w - skipped if j >= 0 else 0)
             end = begin + n_rows * (n_i + n_j)
             rows = values[begin:end].reshape(n_rows, n_i + n_j)
-            put_rows(q, p, w, results, k, rows, 0, -skipped if i >= 0 else -w, n_i - skipped if j >= 0 else -w)
+            c_i, c_j = (-skipped if i >= 0 else -w), (n_i - skipped if j >= 0 else -w)
+            put_row(q, q, p, w, results, k, None, rows, None, 0, c_i, c_j)
             begin = end
 
 
@@ -338,12 +279,12 @@ def force(t, q, v, p, Q):
 
 @callback("constraint", allocates=False)
 def constraint(t, q, p, C):
-    fill_constraint(q, p, p, C)
+    fill_rows(q, q, p, p, C, None, None, None)
 
 
 @callback("jacobian", allocates=False)
 def jacobian(t, q, p, Cq):
-    fill_jacobian(q, p, p, Cq)
+    fill_rows(q, q, p, p, None, Cq, None, None)
 
 
 @callback("jacobian_values", allocates=False)
@@ -353,9 +294,9 @@ def jacobian_values(t, q, p, values):
 
 @callback("gamma", allocates=False)
 def gamma(t, q, v, p, Qd):
-    fill_gamma(q, v, p, p, Qd)
+    fill_rows(q, v, p, p, None, None, None, Qd)
 
 
 @callback("kinematics", allocates=False)
 def kinematics(t, q, v, p, C, Cq, Ct, Qd):
-    fill_kinematics(q, v, p, p, C, Cq, Ct, Qd)
+    fill_rows(q, v, p, p, C, Cq, Ct, Qd)

@@ -28,6 +28,10 @@ from twoloop.problem.description import Stop
 
 # sections that many methods share, by the parameter that they describe
 SHARED = {
+    "name": "name : str\n",
+    "mass": "mass : float\n    kg.\n",
+    "radius": "radius : float\n    m.\n",
+    "position": "position : array_like (2 or 3,)\n    Of the centre, m.\n",
     "a": "a, b : Body or str\n    The bodies, or their names.\n",
     "at": (
         "at : array_like (2 or 3,) or (BodyPoint, BodyPoint)\n    A point of the joint, in space in the position "
@@ -38,6 +42,7 @@ SHARED = {
         "position given; or a direction of a and one of b.\n"
     ),
 }
+POSE = "**pose\n    `angle` (in space `rotation`), `velocity` and `angular_velocity`, as for `body`.\n"
 NAME = "name : str, optional\n    Used in messages and results. None: made of the kind and the bodies.\n"
 PARAMETERS, RETURNS, RAISED = (f"{title}\n{'-' * len(title)}\n" for title in ("Parameters", "Returns", "Raises"))
 RAISES = f"{RAISED}TypeError, ValueError\n    If an argument is invalid, or the name is taken."
@@ -50,14 +55,16 @@ def documented(cls: Any) -> Any:
         if not text or not inspect.isfunction(method) or method.__name__.startswith("_") or RETURNS in text:
             continue
         given, returned = inspect.signature(method).parameters, method.__annotations__["return"]
+        names = [each.name for each in given.values() if each.default is not None]
         shared = "".join(
-            part for name, part in SHARED.items() if name in given and not re.search(rf"(?m)^{name}\b", text)
+            part for name, part in SHARED.items() if name in names and not re.search(rf"(?m)^{name}\b", text)
         )
         if returned == "None" or not (shared or PARAMETERS in text):
             continue
         text, raised, cause = text.partition(RAISED)
         head, _, own = text.partition(PARAMETERS)
         named = NAME if "name" in given and given["name"].default is None else ""
+        named += POSE if "pose" in given else ""
         parameters = f"{PARAMETERS}{shared}{f'{own.rstrip()}{chr(10)}' if own else ''}{named}"
         method.__doc__ = (
             f"{head.rstrip()}\n\n{parameters}\n{RETURNS}{returned}\n\n{raised + cause if raised else RAISES}"
@@ -307,11 +314,6 @@ class Collection:
 
         Parameters
         ----------
-        name : str
-        mass : float
-            kg.
-        position : array_like (2,) or (3,)
-            m.
         velocity : array_like (2,) or (3,), optional
             Initial velocity, m/s. None: determined by the other velocities.
 

@@ -134,7 +134,7 @@ class SpatialAngle(JointCoordinate):
     axis: tuple[float, ...]
     zero: tuple[float, ...]
 
-    def _half(self, q: Any) -> tuple[Any, Any]:
+    def half(self, q: Any) -> tuple[Any, Any]:
         """Return multiples of cosine and sine of half the angle."""
         conjugate = (self.zero[0], *(-x for x in self.zero[1:]))
         relative = euler_product(parameters_of(q, self.a, -1.0), parameters_of(q, self.b))
@@ -143,7 +143,7 @@ class SpatialAngle(JointCoordinate):
 
     def position(self, q: Any) -> Any:
         """Return the angle."""
-        c, s = self._half(q)
+        c, s = self.half(q)
         if getattr(q, "ndim", 1) == 2:
             return np.unwrap(2.0 * np.arctan2(s, c), period=2.0 * TURN)
         size = np.sqrt(c * c + s * s)
@@ -159,7 +159,7 @@ class SpatialAngle(JointCoordinate):
 
     def history(self, result: Any) -> Array:
         """Return the angles along a run."""
-        c, s = self._half(result.q)
+        c, s = self.half(result.q)
         angle, rate, h = 2.0 * np.arctan2(s, c), self.rate(result.q, result.v), np.diff(result.t)
         bend = np.nan_to_num(
             self.rate(result.q, result.a)
@@ -258,7 +258,11 @@ class Coordinates(Collection):
             return Displacement(*head, moved.axis, point_a, point_b, TURN / joint.pitch, start)
         if self.dimension == 2:
             return PlanarAngle(*head, float(joint.b.rotation - joint.a.rotation))
-        return SpatialAngle(*head, tuple(joint.axes[0].tolist()), tuple(self._zero(joint).tolist()))
+        return self._hinge(joint)
+
+    def _axis(self, joint: ModelJoint) -> Numbers | None:
+        """Return the numbers of the axis of a joint in the axes of a; None for a hinge in the plane."""
+        return joint.rows[0].more if self.dimension == 2 else Numbers(tuple(joint.axes[0]))
 
     def _axis_of(self, joint: ModelJoint, values: Callable[[Numbers], Array]) -> Array:
         """Return the axis of a joint that slides, in the axes of a."""
@@ -267,6 +271,11 @@ class Coordinates(Collection):
         assert joint.rows[0].more is not None
         (angle,) = values(joint.rows[0].more)
         return np.array([np.cos(angle), np.sin(angle)])
+
+    def _hinge(self, joint: ModelJoint) -> SpatialAngle:
+        """Return the angle of a joint that turns in space."""
+        head = joint.name, "angle", joint.a.number, joint.b.number
+        return SpatialAngle(*head, tuple(joint.axes[0].tolist()), tuple(self._zero(joint).tolist()))
 
     def _zero(self, joint: ModelJoint) -> Array:
         """Return the relative Euler parameters of a hinge in space in the position given."""

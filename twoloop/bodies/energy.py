@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies import parameter_layout as layout
-from twoloop.bodies.frames import angle_of, on_grid, point_of, vector_of
-from twoloop.bodies.rotation_rates import euler_product, parameters_of
+from twoloop.bodies.frames import point_of
 from twoloop.checks.arguments import Array, check_columns
+
+ROTORS = layout.HINGE_ROTOR, layout.SLIDE_ROTOR
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +52,10 @@ class ModelEnergy:
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Evaluate the energies of one state, or of many given as columns."""
-        flat, flat_v = np.asarray(q), v
+        flat, flat_v = np.asarray(q), np.asarray(v)
         n_q = self._n * (3 if self.dimension == 2 else 7)
         check_columns("q", flat, n_q)
-        check_columns("v", np.asarray(v), n_q)
-
-        def between(i: int, at_i: int, j: int, at_j: int) -> Any:
-            point_i, point_j = (self.p[k : k + self.dimension] for k in (at_i, at_j))
-            return on_grid(flat, point_of(flat, j, point_j)) - on_grid(flat, point_of(flat, i, point_i))
-
+        check_columns("v", flat_v, n_q)
         q, v = (np.asarray(x).reshape(self._n, -1, *np.shape(x)[1:]) for x in (q, v))
         size = layout.PLANAR_BODY if self.dimension == 2 else layout.SPATIAL_BODY
         bodies = self.p[self.dimension : self.dimension + size * self._n].reshape(-1, size)
@@ -76,22 +72,19 @@ class ModelEnergy:
                 half_spin.py_func(*np.moveaxis(q[:, 3:], 1, 0), *np.moveaxis(v[:, 3:], 1, 0)), axis=1
             )
             total += 0.5 * np.einsum("ijk,ij...,ik...->...", J, spins, spins)
-        for kind, i, at_i, j, at_j, more, first_result, on_first in self._forces:
+        for force in self._forces:
+            kind, i, at_i, j, at_j, more, first_result, _ = force
             if first_result >= 0:  # no potential is known
                 continue
-            if kind in (layout.HINGE_ROTOR, layout.SLIDE_ROTOR):
-                total += 0.5 * self.p[more] * self._rate(flat, np.asarray(flat_v), kind, i, at_i, j, at_j) ** 2
+            if kind in ROTORS:
+                total += 0.5 * self.p[more] * self._coordinate(force).rate(flat, flat_v) ** 2
             elif kind in (layout.SPRING, layout.ZERO_LENGTH_SPRING):
-                length = np.sqrt((between(i, at_i, j, at_j) ** 2).sum(axis=0))
+                points = ((i, at_i), (j, at_j))
+                ends = (point_of(flat, body, self.p[at : at + self.dimension]) for body, at in points)
+                length = np.sqrt(sum((x - y) ** 2 for x, y in zip(*ends, strict=True)))
                 total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == layout.SPRING else 0.0)) ** 2
-            elif kind == layout.TORSION_SPRING:
-                total += 0.5 * self.p[more] * (self._turned(flat, i, j, at_i, at_j) - self.p[more + 2]) ** 2
-            elif kind == layout.AXIAL_SPRING:
-                axis = self.p[at_i : at_i + 3]
-                if self.dimension == 2:
-                    axis = np.array([np.cos(axis[0]), np.sin(axis[0])])
-                slid = (on_grid(flat, vector_of(flat, i, axis)) * between(i, on_first, j, at_j)).sum(axis=0)
-                total += 0.5 * self.p[more] * (slid - self.p[more + 2]) ** 2
+            elif kind in (layout.TORSION_SPRING, layout.AXIAL_SPRING):
+                total += 0.5 * self.p[more] * (self._coordinate(force).position(flat) - self.p[more + 2]) ** 2
         return total + sum(potential(flat) for potential in self.potentials)
 
     @property
@@ -105,38 +98,16 @@ class ModelEnergy:
         table = self.p[first : first + layout.FORCE_WIDTH * n].reshape(-1, layout.FORCE_WIDTH).astype(int)
         return table.tolist()
 
-    def _rate(self, q: Array, v: Array, kind: int, i: int, at_i: int, j: int, at_j: int) -> Any:
-        """Return the rate of a joint with a rotor."""
-        if self.dimension == 2:
-            return angle_of(v, j) - angle_of(v, i)
-        from twoloop.bodies.rotation import half_spin  # compiled on import
+    def _coordinate(self, force: list[int]) -> Any:
+        """Return the coordinate of the joint in which a spring or a rotor acts."""
+        from twoloop.bodies.coordinates import Displacement, PlanarAngle, SpatialAngle  # slow to import
 
-        def spin(body: int) -> Any:
-            if body < 0:
-                return np.zeros((3, *q.shape[1:]))
-            e, u = (x[7 * body + 3 : 7 * body + 7] for x in (q, v))
-            return 2.0 * on_grid(q, vector_of(q, body, half_spin.py_func(*e, *u)))
-
-        def cross(a: Any, b: Any) -> Any:
-            return np.cross(a, b, axis=0)
-
-        axis = on_grid(q, vector_of(q, i, self.p[at_i : at_i + 3]))
-        spins = spin(i), spin(j)
-        if kind == layout.HINGE_ROTOR:
-            return (axis * (spins[1] - spins[0])).sum(axis=0)
-        arm = on_grid(q, vector_of(q, j, self.p[at_j : at_j + 3]))
-        still = np.zeros((3, *q.shape[1:]))
-        (x_i, u_i), (x_j, u_j) = (
-            (still, still) if body < 0 else (q[7 * body : 7 * body + 3], v[7 * body : 7 * body + 3]) for body in (i, j)
-        )
-        speed = u_j + cross(spins[1], arm) - u_i - cross(spins[0], x_j + arm - x_i)
-        return (axis * speed).sum(axis=0)
-
-    def _turned(self, q: Array, i: int, j: int, axis: int, zero: int) -> Any:
-        if self.dimension == 2:
-            return angle_of(q, j) - angle_of(q, i)
-        relative = euler_product(parameters_of(q, i, -1.0), parameters_of(q, j))
-        start = self.p[zero : zero + 4]
-        c, *parts = euler_product(relative, (start[0], *-start[1:]))
-        s = sum(x * part for x, part in zip(self.p[axis : axis + 3], parts, strict=True))
-        return 4.0 * np.arctan(s / (c + np.sqrt(c * c + s * s)))
+        kind, i, at_i, j, at_j, _, _, on_first = force
+        turns, d = kind in (layout.TORSION_SPRING, layout.HINGE_ROTOR), self.dimension
+        if turns and d == 2:
+            return PlanarAngle("", "angle", i, j, 0.0)
+        axis = self.p[at_i : at_i + 3] if d == 3 else np.array([np.cos(self.p[at_i]), np.sin(self.p[at_i])])
+        if turns:
+            return SpatialAngle("", "angle", i, j, tuple(axis), tuple(self.p[at_j : at_j + 4]))
+        point_a = self.p[on_first : on_first + d] if on_first >= 0 else np.zeros(d)  # the rate is that of any point
+        return Displacement("", "displacement", i, j, tuple(axis), tuple(point_a), tuple(self.p[at_j : at_j + d]))

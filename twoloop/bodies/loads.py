@@ -7,15 +7,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from twoloop.bodies.collection import add, documented
 from twoloop.bodies.coordinates import Coordinates, JointCoordinate
-from twoloop.bodies.frames import angle_of, point_of, vector_of
+from twoloop.bodies.frames import point_of, vector_of
 from twoloop.bodies.functions import Function, RowFunction, SpringFunction, motion_function, spring_function
 from twoloop.bodies.parameter_layout import (
+    ALONG,
+    AXIAL_FORCE,
     AXIAL_FRICTION,
     AXIAL_SPRING,
+    AXIAL_TORQUE,
     FORCE,
     HINGE_FRICTION,
     HINGE_ROTOR,
@@ -36,18 +37,30 @@ Row = Callable[[Any], Any]  # of the coordinates; zero where the constraint hold
 class Loads(Coordinates):
     """Adds springs, forces, motors and drives to a model."""
 
-    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+    def _turn_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+        """Return the row by which the angle of a hinge is a motion."""
         raise NotImplementedError
 
     def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
         raise NotImplementedError
 
+    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+        """Return the row by which the angle of a hinge or the displacement of a slide is a motion."""
+        if joint.kind == "revolute":
+            return self._turn_row(joint, motion)
+        return JointRow(ALONG, 1, joint.a, joint.b, joint.point_a, joint.point_b, self._axis(joint), motion)
+
     def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
-        raise NotImplementedError
+        """Return a torque about the axis of a revolute joint, or a force along that of a prismatic joint."""
+        function, more = self._function(name, f, 1, unit)
+        turning = TORQUE if self.dimension == 2 else AXIAL_TORQUE
+        kind, point_b = (turning, None) if joint.kind == "revolute" else (AXIAL_FORCE, joint.point_b)
+        return Force(name, kind, joint.a, joint.b, self._axis(joint), point_b, more, function, joint=joint)
 
     def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers | None) -> Force:
         """Return a force along the axis of a prismatic joint; for friction also the torque of a revolute joint."""
-        raise NotImplementedError
+        ends = joint.a, joint.b, self._axis(joint), joint.point_b
+        return Force(name, kind, *ends, numbers, point_on_first=joint.point_a, joint=joint)
 
     def spring(
         self,
@@ -216,10 +229,7 @@ class Loads(Coordinates):
             check_positive("radius", radius)
             names, values = [*names, f"radius of {name} (m)"], [*values, float(radius)]
         numbers = Numbers(tuple(values), tuple(names))
-        return add(
-            self.forces,
-            replace(self._along(name, HINGE_FRICTION if turns else AXIAL_FRICTION, rubbed, numbers), joint=rubbed),
-        )
+        return add(self.forces, self._along(name, HINGE_FRICTION if turns else AXIAL_FRICTION, rubbed, numbers))
 
     def dry_friction(
         self, joint: ModelJoint | str, f: float, *, static: float | None = None, name: str | None = None
@@ -419,7 +429,7 @@ def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
 
 @dataclass(frozen=True, eq=False)
 class PlaneGap:
-    """Measure the distance of a point of one body from a plane of another, m."""
+    """Measure the distance of a point of one body from a plane of another, or its displacement along it, m."""
 
     body: Body
     place: Array
@@ -435,31 +445,8 @@ class PlaneGap:
 
 
 @dataclass(frozen=True, eq=False)
-class PlaneSlide(PlaneGap):
-    """Measure the displacement of a point of one body along a line of another, m."""
-
-    def __call__(self, t: Any, q: Any) -> Any:
-        """Return the displacement, for numbers or symbols."""
-        x, y = self.normal
-        return PlaneGap(self.body, self.place, self.other, self.foot, np.array([y, -x]))(t, q)
-
-
-@dataclass(frozen=True, eq=False)
-class TurnGap:
-    """Measure the angle between a planar hinge and its limit, rad."""
-
-    joint: ModelJoint
-    limit: float
-    sign: float
-
-    def __call__(self, t: Any, q: Any) -> Any:
-        """Return the remaining angle, for numbers or symbols."""
-        return self.sign * (hinge_angle(q, self.joint) - self.limit)
-
-
-@dataclass(frozen=True, eq=False)
 class CoordinateGap:
-    """Measure the angle or displacement between a joint in space and its limit, rad or m."""
+    """Measure the angle or displacement between a joint and its limit, rad or m."""
 
     coordinate: JointCoordinate
     limit: float
@@ -468,11 +455,6 @@ class CoordinateGap:
     def __call__(self, t: Any, q: Any) -> Any:
         """Return what remains, for numbers or symbols."""
         return self.sign * (self.coordinate.position(q) - self.limit)
-
-
-def hinge_angle(q: Any, joint: ModelJoint) -> Any:
-    """Return the rotation of b relative to a in a planar joint since the position given."""
-    return angle_of(q, joint.b.number) - angle_of(q, joint.a.number) - (joint.b.rotation - joint.a.rotation)
 
 
 @documented
@@ -513,11 +495,11 @@ class Stops(Loads):
         self._different("stop", body_a, body_b)
         name = self._new_name("stop", name, body_a, body_b)
         point, foot = self._point("at", at, body_a), self._point("foot", foot, body_b)
-        geometry = point, body_b, foot, self._direction("normal", normal, body_b)
+        gap = PlaneGap(body_a, point, body_b, foot, self._direction("normal", normal, body_b))
         if check_not_negative("friction", friction) and self.dimension == 3:
             raise ValueError(f"friction of {name!r} must be zero, as stops rub in the plane only; given {friction!r}")
-        slide = PlaneSlide(body_a, *geometry) if friction else None
-        return add(self.stops, Stop(PlaneGap(body_a, *geometry), restitution, name, friction, slide))
+        slide = replace(gap, normal=gap.normal[::-1] * (1.0, -1.0)) if friction else None  # along the plane
+        return add(self.stops, Stop(gap, restitution, name, friction, slide))
 
     def limit(
         self,
@@ -569,21 +551,18 @@ class Stops(Loads):
                 self.limits.append(((limited.name, which), sign, stops[-1]))
         return tuple(stops)
 
-    def _gap(self, joint: ModelJoint, which: str, limit: float, sign: float) -> Any:
-        if joint.kind == "revolute" and self.dimension == 2:
-            return TurnGap(joint, limit, sign)
-        if joint.kind != "prismatic":
-            return CoordinateGap(self.joint_coordinate(joint, which), limit, sign)
-        axis = self._axis(joint)
-        point = (
-            joint.b.in_space(np.array(joint.point_b.values)) if joint.b.number >= 0 else np.array(joint.point_b.values)
-        )
-        foot = joint.a.local_point(point) + limit * axis
-        return PlaneGap(joint.b, np.array(joint.point_b.values), joint.a, foot, sign * axis)
+    def _gap(self, joint: ModelJoint, which: str, limit: float, sign: float) -> CoordinateGap:
+        coordinate = self.joint_coordinate(joint, which)
+        if joint.kind == "prismatic":
+            self._keep_axis(joint)
+            limit += float(coordinate.position(self._start()))
+        return CoordinateGap(coordinate, limit, sign)
 
-    def _axis(self, joint: ModelJoint) -> Array:
-        """Return the axis of a prismatic joint in the axes of a."""
-        raise NotImplementedError
+    def _keep_axis(self, joint: ModelJoint) -> None:
+        """Record that the axis of a slide cannot change, where it is a parameter of the model."""
+        axis = self._axis(joint)
+        if axis is not None and axis.names:
+            self.taken.append(axis)
 
 
 @documented
@@ -632,8 +611,7 @@ class Gears(Stops):
         name = self._new_name(f"rack of {joint_1.name} and {joint_2.name}", name)
         slid = self.joint_coordinate(joint_2)
         start = slid.position(self._start())
-        if self.dimension == 2:
-            self._axis(joint_2)  # is taken as it is
+        self._keep_axis(joint_2)
         row = self._wound_row(joint_1, lambda q: slid.position(q) - start, factor)
         return self._coupled(name, "rack", joint_2, [row], joint_1)
 

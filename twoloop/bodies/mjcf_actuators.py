@@ -316,7 +316,9 @@ class TendonsAndActuators:
             return
         if k or c:
             self._law(joint, k, c, -zero, self.reader.free(None, f"gains of {own_name}"))
-        self.model.motor(joint.joint, _torque(command, gear[0] * gain[0], gear[0] * bias[0]), name=own_name)
+        factor, constant = gear[0] * gain[0], gear[0] * bias[0]
+        torque = _Commanded(command, factor, constant) if callable(command) else factor * command + constant
+        self.model.motor(joint.joint, torque, name=own_name)
 
     def _target(self, given: dict[str, str], gear: float) -> Tendon | SitePath | None:
         """Return the joint or tendon on which an actuator acts, as a tendon whose length and rate it feels."""
@@ -435,11 +437,6 @@ def tree_inertia(parts: list[Part], joints: list[FileJoint]) -> Array:
                 carrier = carrier.parent
             M += lump.mass * linear.T @ linear + angular.T @ lump.J @ angular
     return M
-
-
-def _torque(command: float | Callable[[Any], Any], factor: float, constant: float) -> Any:
-    """Return the force of an actuator: a number, or a function of t."""
-    return _Commanded(command, factor, constant) if callable(command) else factor * command + constant
 
 
 class _Commanded:

@@ -286,14 +286,12 @@ class _Reader:
                 part.lumps.append(lump.transformed(pose))
                 if gravcomp and lump.mass:
                     self.gravcomp.append((part, part.lumps[-1], gravcomp))
-                shaped = any(each.tag == "geom" and self._is_ellipsoid(each, name) for each, _, name in contents)
+                geoms = [self.attributes(each, name) for each, _, name in contents if each.tag == "geom"]
+                shaped = any(each.get("fluidshape") == "ellipsoid" for each in geoms)
                 if shaped and (self.medium.density or self.medium.viscosity):
                     self.ignored.append(f"forces of the medium on the ellipsoids of {name_of(element)}")
                 elif lump.mass:
                     self.wetted.append((part, part.lumps[-1]))
-
-    def _is_ellipsoid(self, geom: Element, childclass: str) -> bool:
-        return self.attributes(geom, childclass).get("fluidshape") == "ellipsoid"
 
     def _contents(self, element: Element, childclass: str) -> list[tuple[Element, Pose, str]]:
         """Return the children of a body and of its frames, each with the pose of its frame and its class."""

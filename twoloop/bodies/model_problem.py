@@ -306,7 +306,8 @@ class Model(Ropes):
         others = [each for each in coordinates if (each.joint, each.which) not in held]
         joints = tuple(each for each in self.joints if each.kind != "drive")
         targets = np.array([values[each.joint, each.which] for each in chosen])
-        return Request(self.name, tuple(chosen), targets, tuple(others), joints, self._turning())
+        turning = np.tile(np.arange(len(self.coordinate_names)) >= self.dimension, len(self.bodies))
+        return Request(self.name, tuple(chosen), targets, tuple(others), joints, turning)
 
     def assemble(
         self,
@@ -450,10 +451,6 @@ class Model(Ropes):
         copied.stops, copied.dry, copied.taken = list(self.stops), list(self.dry), list(self.taken)
         copied.limits = list(self.limits)
         return copied
-
-    def _turning(self) -> NDArray[np.bool_]:
-        """Return which coordinates are rotations, (n_q,)."""
-        return np.tile(np.arange(len(self.coordinate_names)) >= self.dimension, len(self.bodies))
 
     def _first_row(self) -> int:
         """Return the number of rows before those of the joints."""

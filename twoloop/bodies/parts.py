@@ -48,7 +48,6 @@ class Body:
     >>> from twoloop.bodies import PlanarModel
     >>> model = PlanarModel(name="pendulum")
     >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
-    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
     >>> bob.name, bob.coordinates
     ('bob', (0, 1, 2))
     """
@@ -174,7 +173,6 @@ class Force:
     >>> from twoloop.bodies import PlanarModel
     >>> model = PlanarModel(name="pendulum")
     >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
-    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
     >>> spring = model.spring("ground", (1.0, 1.0), bob, (0.0, 0.0), stiffness=100.0, length=1.0, name="spring")
     >>> spring.name
     'spring'

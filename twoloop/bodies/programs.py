@@ -1,11 +1,7 @@
 """Evaluate the callbacks of models with motions, rows or forces that are functions, whose programs stand in p."""
 
 from twoloop.bodies.callbacks import (
-    fill_constraint,
-    fill_gamma,
-    fill_jacobian,
-    fill_kinematics,
-    fill_rate,
+    fill_rows,
     fill_values,
     motion_results,
 )
@@ -21,12 +17,12 @@ def force(t, q, v, p, Q):
 
 @callback("constraint")
 def constraint(t, q, p, C):
-    fill_constraint(q, p, motion_results(t, q, q, p), C)
+    fill_rows(q, q, p, motion_results(t, q, q, p), C, None, None, None)
 
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
-    fill_jacobian(q, p, motion_results(t, q, q, p), Cq)
+    fill_rows(q, q, p, motion_results(t, q, q, p), None, Cq, None, None)
 
 
 @callback("jacobian_values")
@@ -36,17 +32,17 @@ def jacobian_values(t, q, p, values):
 
 @callback("constraint_rate")
 def constraint_rate(t, q, p, Ct):
-    fill_rate(q, p, motion_results(t, q, q, p), Ct)
+    fill_rows(q, q, p, motion_results(t, q, q, p), None, None, Ct, None)
 
 
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
-    fill_gamma(q, v, p, motion_results(t, q, v, p), Qd)
+    fill_rows(q, v, p, motion_results(t, q, v, p), None, None, None, Qd)
 
 
 @callback("kinematics")
 def kinematics(t, q, v, p, C, Cq, Ct, Qd):
-    fill_kinematics(q, v, p, motion_results(t, q, v, p), C, Cq, Ct, Qd)
+    fill_rows(q, v, p, motion_results(t, q, v, p), C, Cq, Ct, Qd)
 
 
 @callback("nonholonomic")

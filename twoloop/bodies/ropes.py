@@ -1,8 +1,9 @@
-"""Couple joint coordinates by functions and tendons, and bodies by ropes."""
+"""Couple joint coordinates by functions and tendons, and bodies by curves and ropes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -13,6 +14,7 @@ from twoloop.bodies.frames import point_of
 from twoloop.bodies.functions import n_arguments
 from twoloop.bodies.loads import CoordinateGap, Gears, Row, function_rows
 from twoloop.bodies.parts import COINCIDE, Body, ModelJoint, Numbers
+from twoloop.bodies.rotation_rates import in_body_axes
 from twoloop.bodies.tendons import PrescribedTension, SpringTension, Tendon
 from twoloop.checks.arguments import check_finite, check_not_negative, check_positive, shown
 from twoloop.problem.description import Stop
@@ -20,7 +22,7 @@ from twoloop.problem.description import Stop
 
 @documented
 class Ropes(Gears):
-    """Adds couplings of joint coordinates and ropes to a model. Their constants are not parameters of the model."""
+    """Adds couplings of joints, curves and ropes to a model. Their constants are not parameters of the model."""
 
     def coupling(self, joints: Sequence[Any], function: Callable[..., Any], *, name: str | None = None) -> ModelJoint:
         """Couple joints: a function of their coordinates stays zero.
@@ -64,6 +66,61 @@ class Ropes(Gears):
 
         rows = function_rows(f"coupling {name!r}", [row], bodies, (a, b, at_a, at_b))
         return add(self.joints, ModelJoint(name, "coupling", a, b, rows, at_a, at_b))
+
+    def point_on_curve(
+        self, a: Body | str, b: Body | str, *, at: Any, curve: Callable[..., Any], name: str | None = None
+    ) -> ModelJoint:
+        """Keep a point of b on a curve of a, like a pin in a slot or the tip of a follower on its cam.
+
+        Parameters
+        ----------
+        at : array_like (2 or 3,) or BodyPoint
+            The point of b, in space in the position given, m.
+        curve : callable
+            In the plane curve(x, y), zero on the curve, e.g. `lambda x, y: y - 0.1 * np.cos(5.0 * x)`. In space
+            curve(x, y, z): two values that are zero on a curve, or one that is zero on a surface. From numpy functions
+            without branches; x, y and z in the axes of a relative to its centre of mass (ground: in space), m. The
+            gradients must not vanish there, nor be parallel.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is invalid, or the curve cannot be traced.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from twoloop.bodies import SpatialModel
+        >>> model = SpatialModel(name="bead on a helix")
+        >>> bead = model.particle("bead", mass=1.0, position=(1.0, 0.0, 0.0))
+        >>> wire = model.point_on_curve(
+        ...     "ground", bead, at=(1.0, 0.0, 0.0), curve=lambda x, y, z: (x - np.cos(z), y - np.sin(z))
+        ... )
+        >>> model.problem().freedom.degrees
+        1
+        """
+        body_a, body_b = self._body("a", a), self._body("b", b)
+        self._different("point_on_curve", body_a, body_b)
+        name = self._new_name("point on curve", name, body_a, body_b)
+        if not callable(curve):
+            arguments = "x and y" if self.dimension == 2 else "x, y and z"
+            raise TypeError(f"curve of {name!r} must be a function of {arguments}; given {curve!r}")
+        point_b = self._point("at", at, body_b)
+        point_a = body_a.local_point(body_b.in_space(point_b))
+        values = np.asarray(curve(*point_a.tolist()))
+        if self.dimension == 3 and values.size not in (1, 2):
+            raise ValueError(
+                f"curve of {name!r} must return two values for a curve, or one for a surface; it returned {values.size}"
+            )
+
+        def off(q: Any, k: int) -> Any:
+            value = curve(*in_body_axes(q, body_a.number, point_of(q, body_b.number, point_b)))
+            return value if self.dimension == 2 or values.ndim == 0 else value[k]
+
+        ends = body_a, body_b, Numbers(tuple(point_a)), Numbers(tuple(point_b))
+        rows = [partial(off, k=k) for k in range(1 if self.dimension == 2 else values.size)]
+        joint_rows = function_rows(f"point on curve {name!r}", rows, ends[:2], ends)
+        return add(self.joints, ModelJoint(name, "point on curve", *ends[:2], joint_rows, *ends[2:]))
 
     def _single(self, joint: ModelJoint | str, which: str | None) -> Tendon:
         """Return a joint coordinate as a tendon."""

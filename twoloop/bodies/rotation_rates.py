@@ -36,6 +36,17 @@ def rotated_by(parameters: Any, vector: Any) -> Components:
     return [x + 2.0 * y for x, y in zip(vector, cross(e, across), strict=True)]
 
 
+def in_body_axes(q: Any, body: int, point: Any) -> Components:
+    """Transform a point from space to the axes of a body, relative to its centre of mass."""
+    if body < 0:
+        return list(point)
+    if len(point) == 2:
+        x, y = (each - q[3 * body + k] for k, each in enumerate(point))
+        s, c = np.sin(q[3 * body + 2]), np.cos(q[3 * body + 2])
+        return [c * x + s * y, c * y - s * x]
+    return rotated_by(parameters_of(q, body, -1.0), [x - q[7 * body + k] for k, x in enumerate(point)])
+
+
 def spin_of(q: Any, v: Any, body: int) -> Components:
     """Return the angular velocity of a body in space."""
     if body < 0:

@@ -164,7 +164,9 @@ class SpanningTree:
                 a, b = joint.a.number, joint.b.number
                 child = b if a in parents else a
                 if child not in parents:
-                    place(child, self._edge(joint, child), a + b - child)
+                    points = values(joint.point_a), values(joint.point_b)
+                    edge = Edge(joint, a, b, child, *points, self._motions(joint), len(self.keys))
+                    place(child, edge, a + b - child)
             else:
                 body = next(k for k in range(n_bodies) if k not in parents)
                 place(body, self._free(body), GROUND)
@@ -174,10 +176,6 @@ class SpanningTree:
         self.moves = np.zeros((n_bodies, len(self.keys)), dtype=bool)
         for body in range(n_bodies):
             self.moves[body, moved_by[body]] = True
-
-    def _edge(self, joint: ModelJoint, child: int) -> Edge:
-        points = self.values(joint.point_a), self.values(joint.point_b)
-        return Edge(joint, joint.a.number, joint.b.number, child, *points, self._motions(joint), len(self.keys))
 
     def _free(self, body: int) -> Edge:
         zero, unit = np.zeros(self.dimension), np.eye(self.dimension)

@@ -40,7 +40,8 @@ class LoadedFriction:
     def __init__(self, callbacks: Any, tables: Tables, redundant: bool):
         self._fill_force, self._loaded, self._redundant = callbacks.fill_force, tables.loaded, redundant
         self._dimension = len(tables.gravity)
-        self._numbers = [tables.place(force) + np.arange(_size(force)) for force in tables.loaded]
+        places = [(tables.place(force), len(force.more.values)) for force in tables.loaded if force.more is not None]
+        self._numbers = [place + np.arange(size) for place, size in places]
         self._rows = [self._carrying(force, tables) for force in tables.loaded]
         first = int(tables.p[tables.p.size - HEAD + FORCES]) + FORCE_WIDTH * len(tables.forces)
         # rows of the unit motors, after those of the forces
@@ -55,7 +56,9 @@ class LoadedFriction:
     def of(self, q: Array, v: Array, p: Array, Q: Array, M: Array, G: Array, gamma: Array) -> Array:
         """Return the contribution to Q, (n_q,)."""
         W = np.array([self._along(k, q, p) for k in range(len(self._loaded))])
-        c = np.array([_slope(p[at], rate) for at, rate in zip(self._numbers, W @ v, strict=True)])
+        # coefficient times radius of the hinge times tanh; the numbers begin with constant friction and speed
+        pairs = zip((p[at] for at in self._numbers), W @ v, strict=True)
+        c = np.array([own[2:].prod() * np.tanh(rate / own[1]) for own, rate in pairs])
         if not c.any():
             return np.zeros(len(q))
         n, m = len(q), len(G)
@@ -85,16 +88,6 @@ class LoadedFriction:
             return lam
         axis = np.array(vector_of(q, joint.a.number, joint.axes[0]))
         return np.asarray(lam - np.outer(axis, axis @ lam))
-
-
-def _size(force: Force) -> int:
-    assert force.more is not None
-    return len(force.more.values)
-
-
-def _slope(numbers: Array, rate: float) -> float:
-    """Return coefficient times hinge radius times tanh; numbers begin with constant friction and speed."""
-    return float(numbers[2:].prod() * np.tanh(rate / numbers[1]))
 
 
 def _friction(c: Array, loads: list[Array]) -> Array:
@@ -165,7 +158,7 @@ def system_of(
             in_python.loaded = LoadedFriction(callbacks, tables, in_python.redundant(*start))
         options |= {kind: in_python.callback(kind) for kind in kinds}
         return ConstrainedSystem.from_python(**options)
-    kinds += ["kinematics"] if tables.n_rows and dimension == 2 else []
+    kinds += ["kinematics"] if tables.n_rows else []
     if n_q >= LARGE and tables.n_rows:
         entries = entries_of(dimension, tables)
         if any(force.kind in ROTORS for force in tables.forces):
@@ -306,17 +299,17 @@ class InPython:
 
         self._tables = tables
         self.loaded: LoadedFriction | None = None
-        n, m = tables.n_rows, tables.n_rates
-        # per kind: the compiled function, the shape of its values, and how it is called before the results of motions
-        self._fills: dict[str, tuple[Any, tuple[int, ...], Callable[..., tuple[Any, ...]]]] = {
-            "mass": (callbacks.mass, (n_q, n_q), lambda t, q, v, p: (t, q, p)),
-            "force": (callbacks.fill_force, (n_q,), lambda t, q, v, p: (q, v, p, self._forces(t, q, v, p))),
-            "constraint": (callbacks.fill_constraint, (n,), lambda t, q, v, p: (q, p, self._moved(t, q, q))),
-            "jacobian": (callbacks.fill_jacobian, (n, n_q), lambda t, q, v, p: (q, p, self._moved(t, q, q))),
-            "constraint_rate": (callbacks.fill_rate, (n,), lambda t, q, v, p: (q, p, self._moved(t, q, q))),
-            "gamma": (callbacks.fill_gamma, (n,), lambda t, q, v, p: (q, v, p, self._moved(t, q, v))),
-            "nonholonomic": (fill_nonholonomic, (m, n_q), lambda t, q, v, p: (p, self._moved(t, q, q))),
-            "nonholonomic_gamma": (fill_nonholonomic_gamma, (m,), lambda t, q, v, p: (p, self._moved(t, q, v))),
+        n, m, rows = tables.n_rows, tables.n_rates, callbacks.fill_rows
+        # per kind: the compiled function, the shape of its values, and how it is called with these
+        self._fills: dict[str, tuple[tuple[int, ...], Callable[..., None]]] = {
+            "mass": ((n_q, n_q), lambda t, q, v, p, M: callbacks.mass(t, q, p, M)),
+            "force": ((n_q,), lambda t, q, v, p, Q: callbacks.fill_force(q, v, p, self._forces(t, q, v, p), Q)),
+            "constraint": ((n,), lambda t, q, v, p, C: rows(q, q, p, self._moved(t, q, q), C, None, None, None)),
+            "jacobian": ((n, n_q), lambda t, q, v, p, Cq: rows(q, q, p, self._moved(t, q, q), None, Cq, None, None)),
+            "constraint_rate": ((n,), lambda t, q, v, p, Ct: rows(q, q, p, self._moved(t, q, q), None, None, Ct, None)),
+            "gamma": ((n,), lambda t, q, v, p, Qd: rows(q, v, p, self._moved(t, q, v), None, None, None, Qd)),
+            "nonholonomic": ((m, n_q), lambda t, q, v, p, A: fill_nonholonomic(p, self._moved(t, q, q), A)),
+            "nonholonomic_gamma": ((m,), lambda t, q, v, p, Qa: fill_nonholonomic_gamma(p, self._moved(t, q, v), Qa)),
         }
 
     def callback(self, kind: str) -> Callable[..., Array]:
@@ -345,9 +338,9 @@ class InPython:
     def _evaluate(self, kind: str, t: float, q: Array, v: Array, p: Array) -> Array:
         if q.dtype == object:  # symbols: the compiled callbacks would raise a less helpful error
             raise Untraceable(self._tables.untraced)
-        fill, shape, arguments = self._fills[kind]
+        shape, fill = self._fills[kind]
         values = np.zeros(shape)
-        fill(*arguments(t, q, v, p), values)
+        fill(t, q, v, p, values)
         return values
 
     def _moved(self, t: float, q: Array, v: Array) -> Array:

@@ -52,23 +52,23 @@ POINTS = _gauss_points()
 
 
 @compiled
-def _resultants(sx, sy, kx, ky, dx, dy, p):
+def _resultants(s, k, d, p):
     """Return derivatives of the energy per unit length, where r_x = s + y k and r_y = d.
 
     eps_11 = axial + y s.k + y^2 kk, eps_22 = thick, 2 eps_12 = s.d + y k.d; their parts have the resultants n0, n1,
     n2, m0, g0, g1.
     """
     j2, j4 = p[SECOND], p[FOURTH]
-    axial = 0.5 * (sx * sx + sy * sy - 1.0)
-    kk = 0.5 * (kx * kx + ky * ky)
-    thick = 0.5 * (dx * dx + dy * dy - 1.0)
+    axial = 0.5 * (s[0] * s[0] + s[1] * s[1] - 1.0)
+    kk = 0.5 * (k[0] * k[0] + k[1] * k[1])
+    thick = 0.5 * (d[0] * d[0] + d[1] * d[1] - 1.0)
     mean = axial + j2 * kk
     n0 = p[STIFFNESS] * mean + p[LAME] * thick
-    n1 = p[STIFFNESS] * j2 * (sx * kx + sy * ky)
+    n1 = p[STIFFNESS] * j2 * (s[0] * k[0] + s[1] * k[1])
     n2 = p[STIFFNESS] * (j2 * axial + j4 * kk) + p[LAME] * j2 * thick
     m0 = p[STIFFNESS] * thick + p[LAME] * mean
-    g0 = p[SHEAR] * (sx * dx + sy * dy)
-    g1 = p[SHEAR] * j2 * (kx * dx + ky * dy)
+    g0 = p[SHEAR] * (s[0] * d[0] + s[1] * d[1])
+    g1 = p[SHEAR] * j2 * (k[0] * d[0] + k[1] * d[1])
     return n0, n1, n2, m0, g0, g1
 
 
@@ -76,41 +76,24 @@ def _resultants(sx, sy, kx, ky, dx, dy, p):
 def element_force(e, p, Q):
     """Add the elastic force of one element with coordinates e (12,), -dU/de, to Q (12,)."""
     l = p[LENGTH]
-    cx, cy = (e[6] - e[0]) / l, (e[7] - e[1]) / l
-    kx, ky = (e[10] - e[4]) / l, (e[11] - e[5]) / l
-    Fcx = Fcy = Fkx = Fky = 0.0
+    c = (e[6] - e[0]) / l, (e[7] - e[1]) / l
+    k = (e[10] - e[4]) / l, (e[11] - e[5]) / l
     for g in range(5):
         w = POINTS[g, 0] * l
         s1, s2, s5, xi = POINTS[g, 1], POINTS[g, 2], POINTS[g, 3], POINTS[g, 4]
-        sx = s1 * cx + s2 * e[2] + s5 * e[8]
-        sy = s1 * cy + s2 * e[3] + s5 * e[9]
-        dx = (1.0 - xi) * e[4] + xi * e[10]
-        dy = (1.0 - xi) * e[5] + xi * e[11]
-        n0, n1, n2, m0, g0, g1 = _resultants(sx, sy, kx, ky, dx, dy, p)
-        Fsx = w * (n0 * sx + n1 * kx + g0 * dx)
-        Fsy = w * (n0 * sy + n1 * ky + g0 * dy)
-        Fdx = w * (m0 * dx + g0 * sx + g1 * kx)
-        Fdy = w * (m0 * dy + g0 * sy + g1 * ky)
-        Fkx += w * (n1 * sx + n2 * kx + g1 * dx)
-        Fky += w * (n1 * sy + n2 * ky + g1 * dy)
-        Fcx += s1 * Fsx
-        Fcy += s1 * Fsy
-        Q[2] -= s2 * Fsx
-        Q[3] -= s2 * Fsy
-        Q[8] -= s5 * Fsx
-        Q[9] -= s5 * Fsy
-        Q[4] -= (1.0 - xi) * Fdx
-        Q[5] -= (1.0 - xi) * Fdy
-        Q[10] -= xi * Fdx
-        Q[11] -= xi * Fdy
-    Q[0] += Fcx / l
-    Q[1] += Fcy / l
-    Q[6] -= Fcx / l
-    Q[7] -= Fcy / l
-    Q[4] += Fkx / l
-    Q[5] += Fky / l
-    Q[10] -= Fkx / l
-    Q[11] -= Fky / l
+        s = s1 * c[0] + s2 * e[2] + s5 * e[8], s1 * c[1] + s2 * e[3] + s5 * e[9]
+        d = (1.0 - xi) * e[4] + xi * e[10], (1.0 - xi) * e[5] + xi * e[11]
+        n0, n1, n2, m0, g0, g1 = _resultants(s, k, d, p)
+        for x in range(2):
+            Fs = w * (n0 * s[x] + n1 * k[x] + g0 * d[x])
+            Fd = w * (m0 * d[x] + g0 * s[x] + g1 * k[x])
+            Fk = w * (n1 * s[x] + n2 * k[x] + g1 * d[x]) / l
+            Q[x] += s1 * Fs / l
+            Q[2 + x] -= s2 * Fs
+            Q[4 + x] -= (1.0 - xi) * Fd - Fk
+            Q[6 + x] -= s1 * Fs / l
+            Q[8 + x] -= s5 * Fs
+            Q[10 + x] -= xi * Fd + Fk
 
 
 @compiled
@@ -119,7 +102,7 @@ def element_tangent(e, p, K):
     l = p[LENGTH]
     stiffness, lame, shear = p[STIFFNESS], p[LAME], p[SHEAR]
     j2, j4 = p[SECOND], p[FOURTH]
-    kx, ky = (e[10] - e[4]) / l, (e[11] - e[5]) / l
+    k = (e[10] - e[4]) / l, (e[11] - e[5]) / l
     for g in range(5):
         w = -POINTS[g, 0] * l
         xi = POINTS[g, 4]
@@ -130,66 +113,32 @@ def element_tangent(e, p, K):
         in_d = (1.0 - xi, xi)
         sx = sy = 0.0
         for i in range(4):
-            sx += in_s[i] * e[places[i]]
-            sy += in_s[i] * e[places[i] + 1]
-        dx = (1.0 - xi) * e[4] + xi * e[10]
-        dy = (1.0 - xi) * e[5] + xi * e[11]
-        n0, n1, n2, m0, g0, g1 = _resultants(sx, sy, kx, ky, dx, dy, p)
-        # second derivatives of the energy of a unit of length, xx, xy, yx, yy; those without yx are symmetric
-        ss_xx = w * (n0 + stiffness * (sx * sx + j2 * kx * kx) + shear * dx * dx)
-        ss_xy = w * (stiffness * (sx * sy + j2 * kx * ky) + shear * dx * dy)
-        ss_yy = w * (n0 + stiffness * (sy * sy + j2 * ky * ky) + shear * dy * dy)
-        sk_xx = w * (n1 + 2.0 * stiffness * j2 * sx * kx)
-        sk_xy = w * stiffness * j2 * (sx * ky + kx * sy)
-        sk_yy = w * (n1 + 2.0 * stiffness * j2 * sy * ky)
-        sd_xx = w * (g0 + (lame + shear) * sx * dx)
-        sd_xy = w * (lame * sx * dy + shear * dx * sy)
-        sd_yx = w * (lame * sy * dx + shear * dy * sx)
-        sd_yy = w * (g0 + (lame + shear) * sy * dy)
-        kk_xx = w * (n2 + stiffness * (j2 * sx * sx + j4 * kx * kx) + shear * j2 * dx * dx)
-        kk_xy = w * (stiffness * (j2 * sx * sy + j4 * kx * ky) + shear * j2 * dx * dy)
-        kk_yy = w * (n2 + stiffness * (j2 * sy * sy + j4 * ky * ky) + shear * j2 * dy * dy)
-        kd_xx = w * (g1 + (lame + shear) * j2 * kx * dx)
-        kd_xy = w * j2 * (lame * kx * dy + shear * dx * ky)
-        kd_yx = w * j2 * (lame * ky * dx + shear * dy * kx)
-        kd_yy = w * (g1 + (lame + shear) * j2 * ky * dy)
-        dd_xx = w * (m0 + stiffness * dx * dx + shear * (sx * sx + j2 * kx * kx))
-        dd_xy = w * (stiffness * dx * dy + shear * (sx * sy + j2 * kx * ky))
-        dd_yy = w * (m0 + stiffness * dy * dy + shear * (sy * sy + j2 * ky * ky))
-        for i in range(4):
-            I = places[i]
-            for j in range(4):
-                J = places[j]
-                K[I, J] += in_s[i] * in_s[j] * ss_xx
-                K[I, J + 1] += in_s[i] * in_s[j] * ss_xy
-                K[I + 1, J] += in_s[i] * in_s[j] * ss_xy
-                K[I + 1, J + 1] += in_s[i] * in_s[j] * ss_yy
-            for j in range(2):
-                J = 4 + 6 * j
-                xx = in_s[i] * (in_k[j] * sk_xx + in_d[j] * sd_xx)
-                xy = in_s[i] * (in_k[j] * sk_xy + in_d[j] * sd_xy)
-                yx = in_s[i] * (in_k[j] * sk_xy + in_d[j] * sd_yx)
-                yy = in_s[i] * (in_k[j] * sk_yy + in_d[j] * sd_yy)
-                K[I, J] += xx
-                K[J, I] += xx
-                K[I, J + 1] += xy
-                K[J + 1, I] += xy
-                K[I + 1, J] += yx
-                K[J, I + 1] += yx
-                K[I + 1, J + 1] += yy
-                K[J + 1, I + 1] += yy
-        for i in range(2):
-            I = 4 + 6 * i
-            for j in range(2):
-                J = 4 + 6 * j
-                both = in_k[i] * in_k[j]
-                dd = in_d[i] * in_d[j]
-                kd = in_k[i] * in_d[j]
-                dk = in_d[i] * in_k[j]
-                K[I, J] += both * kk_xx + dd * dd_xx + (kd + dk) * kd_xx
-                K[I, J + 1] += both * kk_xy + dd * dd_xy + kd * kd_xy + dk * kd_yx
-                K[I + 1, J] += both * kk_xy + dd * dd_xy + kd * kd_yx + dk * kd_xy
-                K[I + 1, J + 1] += both * kk_yy + dd * dd_yy + (kd + dk) * kd_yy
+            sx, sy = sx + in_s[i] * e[places[i]], sy + in_s[i] * e[places[i] + 1]
+        s, d = (sx, sy), (in_d[0] * e[4] + in_d[1] * e[10], in_d[0] * e[5] + in_d[1] * e[11])
+        n0, n1, n2, m0, g0, g1 = _resultants(s, k, d, p)
+        for x in range(2):
+            for y in range(2):
+                # second derivatives of the energy of a unit of length by component x of one vector and y of another
+                one = w if x == y else 0.0
+                ss = one * n0 + w * (stiffness * (s[x] * s[y] + j2 * k[x] * k[y]) + shear * d[x] * d[y])
+                sk = one * n1 + w * stiffness * j2 * (s[x] * k[y] + k[x] * s[y])
+                sd = one * g0 + w * (lame * s[x] * d[y] + shear * d[x] * s[y])
+                kk = one * n2 + w * (stiffness * (j2 * s[x] * s[y] + j4 * k[x] * k[y]) + shear * j2 * d[x] * d[y])
+                kd = one * g1 + w * j2 * (lame * k[x] * d[y] + shear * d[x] * k[y])
+                dk = one * g1 + w * j2 * (lame * d[x] * k[y] + shear * k[x] * d[y])
+                dd = one * m0 + w * (stiffness * d[x] * d[y] + shear * (s[x] * s[y] + j2 * k[x] * k[y]))
+                for i in range(4):
+                    I = places[i] + x
+                    for j in range(4):
+                        K[I, places[j] + y] += in_s[i] * in_s[j] * ss
+                    for j in range(2):
+                        J, value = 4 + 6 * j + y, in_s[i] * (in_k[j] * sk + in_d[j] * sd)
+                        K[I, J] += value
+                        K[J, I] += value
+                for i in range(2):
+                    for j in range(2):
+                        value = in_k[i] * (in_k[j] * kk + in_d[j] * kd) + in_d[i] * (in_k[j] * dk + in_d[j] * dd)
+                        K[4 + 6 * i + x, 4 + 6 * j + y] += value
 
 
 @callback("mass")

@@ -12,6 +12,7 @@ import numpy as np
 
 from twoloop.bodies.energy import PlanarEnergy
 from twoloop.bodies.frames import GROUND, BodyPoints
+from twoloop.bodies.geometry import merged
 from twoloop.checks.arguments import check_finite, check_vector
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import callbacks_in
@@ -42,81 +43,61 @@ def force(t, q, v, p, Q):
         Q[3 * i + 1] = -DENSITY * p[i] * GRAVITY
 
 
-@callback("constraint")
-def constraint(t, q, p, C):
-    x = 0.0  # joint at the start of bar i
-    y = 0.0
-    for i in range(3):
-        dx = 0.5 * p[i] * math.cos(q[3 * i + 2])
-        dy = 0.5 * p[i] * math.sin(q[3 * i + 2])
-        C[2 * i] = q[3 * i] - x - dx
-        C[2 * i + 1] = q[3 * i + 1] - y - dy
-        x += 2.0 * dx
-        y += 2.0 * dy
-    C[6] = y  # (35), corrected
-    C[7] = x - p[3]  # (36)
-
-
-@callback("jacobian")
-def jacobian(t, q, p, Cq):
-    for k in range(3):
-        dx = -p[k] * math.sin(q[3 * k + 2])
-        dy = p[k] * math.cos(q[3 * k + 2])
-        Cq[2 * k, 3 * k] = 1.0
-        Cq[2 * k + 1, 3 * k + 1] = 1.0
-        Cq[2 * k, 3 * k + 2] = -0.5 * dx
-        Cq[2 * k + 1, 3 * k + 2] = -0.5 * dy
-        for i in range(k + 1, 3):
-            Cq[2 * i, 3 * k + 2] = -dx
-            Cq[2 * i + 1, 3 * k + 2] = -dy
-        Cq[6, 3 * k + 2] = dy
-        Cq[7, 3 * k + 2] = dx
-
-
-@callback("gamma")
-def gamma(t, q, v, p, Qd):
-    for k in range(3):
-        w2 = v[3 * k + 2] ** 2
-        ddx = -p[k] * math.cos(q[3 * k + 2]) * w2
-        ddy = -p[k] * math.sin(q[3 * k + 2]) * w2
-        Qd[2 * k] += 0.5 * ddx
-        Qd[2 * k + 1] += 0.5 * ddy
-        for i in range(k + 1, 3):
-            Qd[2 * i] += ddx
-            Qd[2 * i + 1] += ddy
-        Qd[6] -= ddy
-        Qd[7] -= ddx
-
-
-@callback("kinematics")
-def kinematics(t, q, v, p, C, Cq, Ct, Qd):
-    x = 0.0
+@merged
+def fill_rows(q, v, p, C, Cq, Qd):
+    """Evaluate those of C, C_q and gamma that are not None."""
+    x = 0.0  # joint at the start of bar k
     y = 0.0
     for k in range(3):
         dx = p[k] * math.cos(q[3 * k + 2])
         dy = p[k] * math.sin(q[3 * k + 2])
-        C[2 * k] = q[3 * k] - x - 0.5 * dx
-        C[2 * k + 1] = q[3 * k + 1] - y - 0.5 * dy
+        if C is not None:
+            C[2 * k] = q[3 * k] - x - 0.5 * dx
+            C[2 * k + 1] = q[3 * k + 1] - y - 0.5 * dy
         x += dx
         y += dy
-        w2 = v[3 * k + 2] ** 2
-        Cq[2 * k, 3 * k] = 1.0
-        Cq[2 * k + 1, 3 * k + 1] = 1.0
-        Cq[2 * k, 3 * k + 2] = 0.5 * dy
-        Cq[2 * k + 1, 3 * k + 2] = -0.5 * dx
-        Qd[2 * k] -= 0.5 * dx * w2
-        Qd[2 * k + 1] -= 0.5 * dy * w2
-        for i in range(k + 1, 3):
-            Cq[2 * i, 3 * k + 2] = dy
-            Cq[2 * i + 1, 3 * k + 2] = -dx
-            Qd[2 * i] -= dx * w2
-            Qd[2 * i + 1] -= dy * w2
-        Cq[6, 3 * k + 2] = dx
-        Cq[7, 3 * k + 2] = -dy
-        Qd[6] += dy * w2
-        Qd[7] += dx * w2
-    C[6] = y
-    C[7] = x - p[3]
+        if Cq is not None:
+            Cq[2 * k, 3 * k] = 1.0
+            Cq[2 * k + 1, 3 * k + 1] = 1.0
+            Cq[2 * k, 3 * k + 2] = 0.5 * dy
+            Cq[2 * k + 1, 3 * k + 2] = -0.5 * dx
+            for i in range(k + 1, 3):
+                Cq[2 * i, 3 * k + 2] = dy
+                Cq[2 * i + 1, 3 * k + 2] = -dx
+            Cq[6, 3 * k + 2] = dx
+            Cq[7, 3 * k + 2] = -dy
+        if Qd is not None:
+            w2 = v[3 * k + 2] ** 2
+            Qd[2 * k] -= 0.5 * dx * w2
+            Qd[2 * k + 1] -= 0.5 * dy * w2
+            for i in range(k + 1, 3):
+                Qd[2 * i] -= dx * w2
+                Qd[2 * i + 1] -= dy * w2
+            Qd[6] += dy * w2
+            Qd[7] += dx * w2
+    if C is not None:
+        C[6] = y  # (35), corrected
+        C[7] = x - p[3]  # (36)
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    fill_rows(q, q, p, C, None, None)
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    fill_rows(q, q, p, None, Cq, None)
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    fill_rows(q, v, p, None, None, Qd)
+
+
+@callback("kinematics")
+def kinematics(t, q, v, p, C, Cq, Ct, Qd):
+    fill_rows(q, v, p, C, Cq, Qd)
 
 
 def four_bar(

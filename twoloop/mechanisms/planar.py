@@ -18,6 +18,7 @@ import numpy as np
 
 from twoloop.bodies.drawings import Sketch
 from twoloop.bodies.energy import PlanarEnergy
+from twoloop.bodies.geometry import merged
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import LARGE, callbacks_in
@@ -74,96 +75,73 @@ def force(t, q, v, p, Q):
         Q[3 * body + 1] = -p[2] * p[3 + 2 * body]
 
 
-@callback("constraint")
-def constraint(t, q, p, C):
+@merged
+def fill_rows(t, q, v, p, C, Cq, Ct, Qd):
+    """Evaluate those of C, C_q, C_t and gamma that are not None."""
     first = 3 + 2 * int(p[0])
     for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
         row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
         if p[k] == COORDINATE:
-            C[row] = q[i] - p[k + 3] - p[k + 4] * t - p[k + 6] * math.sin(p[k + 7] * t)
+            frequency = p[k + 7]
+            if C is not None:
+                C[row] = q[i] - p[k + 3] - p[k + 4] * t - p[k + 6] * math.sin(frequency * t)
+            if Cq is not None:
+                Cq[row, i] = 1.0
+            if Ct is not None:
+                Ct[row] = -p[k + 4] - p[k + 6] * frequency * math.cos(frequency * t)
+            if Qd is not None:
+                Qd[row] = -p[k + 6] * frequency**2 * math.sin(frequency * t)
             continue
-        ax, ay, _, _ = place(q, i, p, k + 3)
-        bx, by, _, _ = place(q, j, p, k + 6)
-        if p[k] == PIN:
-            C[row], C[row + 1] = ax - bx, ay - by
-        else:
-            C[row] = 0.5 * ((ax - bx) ** 2 + (ay - by) ** 2) - p[k + 8]
+        ax, ay, adx, ady = place(q, i, p, k + 3)
+        bx, by, bdx, bdy = place(q, j, p, k + 6)
+        is_pin = p[k] == PIN
+        if C is not None:
+            if is_pin:
+                C[row], C[row + 1] = ax - bx, ay - by
+            else:
+                C[row] = 0.5 * ((ax - bx) ** 2 + (ay - by) ** 2) - p[k + 8]
+        if Cq is not None:
+            if is_pin:
+                add(Cq[row], i, 1.0, 0.0, adx, ady)
+                add(Cq[row], j, -1.0, 0.0, bdx, bdy)
+                add(Cq[row + 1], i, 0.0, 1.0, adx, ady)
+                add(Cq[row + 1], j, 0.0, -1.0, bdx, bdy)
+            else:
+                add(Cq[row], i, ax - bx, ay - by, adx, ady)
+                add(Cq[row], j, bx - ax, by - ay, bdx, bdy)
+        if Qd is not None:
+            au, av, aa, ab = motion(v, i, adx, ady)
+            bu, bv, ba, bb = motion(v, j, bdx, bdy)
+            if is_pin:
+                Qd[row], Qd[row + 1] = ba - aa, bb - ab
+            else:
+                squares = (bu - au) * (au - bu) + (bv - av) * (av - bv)
+                Qd[row] = squares + (ax - bx) * (ba - aa) + (ay - by) * (bb - ab)
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    fill_rows(t, q, q, p, C, None, None, None)
 
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
-    first = 3 + 2 * int(p[0])
-    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
-        row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
-        if p[k] == COORDINATE:
-            Cq[row, i] = 1.0
-            continue
-        ax, ay, adx, ady = place(q, i, p, k + 3)
-        bx, by, bdx, bdy = place(q, j, p, k + 6)
-        if p[k] == PIN:
-            add(Cq[row], i, 1.0, 0.0, adx, ady)
-            add(Cq[row], j, -1.0, 0.0, bdx, bdy)
-            add(Cq[row + 1], i, 0.0, 1.0, adx, ady)
-            add(Cq[row + 1], j, 0.0, -1.0, bdx, bdy)
-        else:
-            add(Cq[row], i, ax - bx, ay - by, adx, ady)
-            add(Cq[row], j, bx - ax, by - ay, bdx, bdy)
+    fill_rows(t, q, q, p, None, Cq, None, None)
 
 
 @callback("constraint_rate")
 def constraint_rate(t, q, p, Ct):
-    first = 3 + 2 * int(p[0])
-    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
-        if p[k] == COORDINATE:
-            Ct[int(p[k + 1])] = -p[k + 4] - p[k + 6] * p[k + 7] * math.cos(p[k + 7] * t)
+    fill_rows(t, q, q, p, None, None, Ct, None)
 
 
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
-    first = 3 + 2 * int(p[0])
-    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
-        row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
-        if p[k] == COORDINATE:
-            Qd[row] = -p[k + 6] * p[k + 7] ** 2 * math.sin(p[k + 7] * t)
-            continue
-        ax, ay, adx, ady = place(q, i, p, k + 3)
-        bx, by, bdx, bdy = place(q, j, p, k + 6)
-        au, av, aa, ab = motion(v, i, adx, ady)
-        bu, bv, ba, bb = motion(v, j, bdx, bdy)
-        if p[k] == PIN:
-            Qd[row], Qd[row + 1] = ba - aa, bb - ab
-        else:
-            Qd[row] = (bu - au) * (au - bu) + (bv - av) * (av - bv) + (ax - bx) * (ba - aa) + (ay - by) * (bb - ab)
+    fill_rows(t, q, v, p, None, None, None, Qd)
 
 
 @callback("kinematics")
 def kinematics(t, q, v, p, C, Cq, Ct, Qd):
-    first = 3 + 2 * int(p[0])
-    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
-        row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
-        if p[k] == COORDINATE:
-            s, c, frequency = math.sin(p[k + 7] * t), math.cos(p[k + 7] * t), p[k + 7]
-            C[row] = q[i] - p[k + 3] - p[k + 4] * t - p[k + 6] * s
-            Cq[row, i] = 1.0
-            Ct[row] = -p[k + 4] - p[k + 6] * frequency * c
-            Qd[row] = -p[k + 6] * frequency**2 * s
-            continue
-        ax, ay, adx, ady = place(q, i, p, k + 3)
-        bx, by, bdx, bdy = place(q, j, p, k + 6)
-        au, av, aa, ab = motion(v, i, adx, ady)
-        bu, bv, ba, bb = motion(v, j, bdx, bdy)
-        if p[k] == PIN:
-            C[row], C[row + 1] = ax - bx, ay - by
-            add(Cq[row], i, 1.0, 0.0, adx, ady)
-            add(Cq[row], j, -1.0, 0.0, bdx, bdy)
-            add(Cq[row + 1], i, 0.0, 1.0, adx, ady)
-            add(Cq[row + 1], j, 0.0, -1.0, bdx, bdy)
-            Qd[row], Qd[row + 1] = ba - aa, bb - ab
-        else:
-            C[row] = 0.5 * ((ax - bx) ** 2 + (ay - by) ** 2) - p[k + 8]
-            add(Cq[row], i, ax - bx, ay - by, adx, ady)
-            add(Cq[row], j, bx - ax, by - ay, bdx, bdy)
-            Qd[row] = (bu - au) * (au - bu) + (bv - av) * (av - bv) + (ax - bx) * (ba - aa) + (ay - by) * (bb - ab)
+    fill_rows(t, q, v, p, C, Cq, Ct, Qd)
 
 
 @callback("mass_values")

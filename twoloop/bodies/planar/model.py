@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.bodies.collection import Points, add, documented
-from twoloop.bodies.frames import angle_of, point_of, vector_of
+from twoloop.bodies.coordinates import Displacement, PlanarAngle
+from twoloop.bodies.frames import vector_of
 from twoloop.bodies.functions import Function, RateFunction
-from twoloop.bodies.loads import Row, hinge_angle, listed
+from twoloop.bodies.loads import Row, listed
 from twoloop.bodies.model_problem import Model
 from twoloop.bodies.parameter_layout import (
     ACROSS,
-    ALONG,
     ANGLE,
-    AXIAL_FORCE,
     POINT,
     RATE_FUNCTION,
-    TORQUE,
     TORSION_SPRING,
 )
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
@@ -32,10 +29,12 @@ class Couplings(Model):
     """Adds couplings to a planar model. Their constants are not parameters of the model."""
 
     def _gear_row(self, one: ModelJoint, other: ModelJoint, ratio: float) -> Row:
-        return lambda q: hinge_angle(q, other) - ratio * hinge_angle(q, one)
+        angles = self.joint_coordinate(other), self.joint_coordinate(one)
+        return lambda q: angles[0].position(q) - ratio * angles[1].position(q)
 
     def _wound_row(self, pinion: ModelJoint, moved: Row, radius: float) -> Row:
-        return lambda q: moved(q) - radius * hinge_angle(q, pinion)
+        angle = self.joint_coordinate(pinion)
+        return lambda q: moved(q) - radius * angle.position(q)
 
     def rolling(
         self, a: Body | str, wheel: Body | str, *, radius: float, axis: Any, name: str | None = None
@@ -59,12 +58,12 @@ class Couplings(Model):
             raise ValueError("wheel must be a body that moves; given the ground")
         check_positive("radius", radius)
         direction = self._direction("axis", axis, body_a)
-        angle, foot = float(np.arctan2(*direction[::-1])), np.array(points[0].values)
-        zero, joint = np.zeros(2), ModelJoint(name, "rolling", body_a, body_b, (), *points)
-        rows = [
-            lambda q: _along(q, body_a, angle + 0.5 * np.pi, foot, body_b, zero),
-            lambda q: _along(q, body_a, angle, foot, body_b, zero) + radius * hinge_angle(q, joint),
-        ]
+        head = name, "displacement", body_a.number, body_b.number
+        x, y = direction.tolist()
+        across, along = (Displacement(*head, axis, points[0].values, (0.0, 0.0)) for axis in ((-y, x), (x, y)))
+        turned = PlanarAngle(name, "angle", *head[2:], float(body_b.rotation - body_a.rotation))
+        rows = [across.position, lambda q: along.position(q) + radius * turned.position(q)]
+        joint = ModelJoint(name, "rolling", body_a, body_b, (), *points)
         return self._coupled(name, "rolling", joint, rows, joint)
 
     def skate(self, body: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
@@ -95,56 +94,6 @@ class Couplings(Model):
         function = RateFunction(f"skate {name!r}", across, columns)
         row = JointRow(RATE_FUNCTION, 1, self.ground, on, *points, places, function)
         return add(self.joints, ModelJoint(name, "skate", self.ground, on, (row,), *points))
-
-    def point_on_curve(
-        self, a: Body | str, b: Body | str, *, at: Any, curve: Callable[[Any, Any], Any], name: str | None = None
-    ) -> ModelJoint:
-        """Keep a point of b on a curve of a, like a pin in a slot or the tip of a follower on its cam.
-
-        Parameters
-        ----------
-        at : array_like (2,) or BodyPoint
-            The point of b, in space in the position given, m.
-        curve : callable
-            curve(x, y), zero on the curve, e.g. `lambda x, y: y - 0.1 * np.cos(5.0 * x)`, from numpy functions without
-            branches; x and y in the axes of a relative to its centre of mass (ground: in space), m. Its gradient must
-            not vanish on the curve.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is invalid, or the curve cannot be traced.
-        """
-        body_a, body_b = self._body("a", a), self._body("b", b)
-        self._different("point_on_curve", body_a, body_b)
-        name = self._new_name("point on curve", name, body_a, body_b)
-        if not callable(curve):
-            raise TypeError(f"curve of {name!r} must be a function of x and y; given {curve!r}")
-        point_b = self._point("at", at, body_b)
-        point_a = body_a.local_point(body_b.in_space(point_b))
-        points = Numbers(tuple(point_a)), Numbers(tuple(point_b))
-
-        def off(q: Any) -> Any:
-            return curve(*_in_body_axes(q, body_a, point_of(q, body_b.number, point_b)))
-
-        joint = ModelJoint(name, "point on curve", body_a, body_b, (), *points)
-        return self._coupled(name, "point on curve", joint, [off], joint)
-
-
-def _along(q: Any, a: Body, angle: float, point_a: Any, b: Body, point_b: Any) -> Any:
-    """Return the displacement of a point of b from a point of a along a direction of a."""
-    (x, y), (u, w) = point_of(q, a.number, point_a), point_of(q, b.number, point_b)
-    total = angle_of(q, a.number) + angle
-    return np.cos(total) * (u - x) + np.sin(total) * (w - y)
-
-
-def _in_body_axes(q: Any, body: Body, point: list[Any]) -> list[Any]:
-    """Transform a point from space to the axes of a body."""
-    if body.number < 0:
-        return point
-    x, y = (each - q[j] for each, j in zip(point, body.coordinates, strict=False))
-    s, c = np.sin(angle_of(q, body.number)), np.cos(angle_of(q, body.number))
-    return [c * x + s * y, c * y - s * x]
 
 
 @documented
@@ -228,11 +177,8 @@ class PlanarModel(Couplings):
 
         Parameters
         ----------
-        name : str
         start, end : array_like (2,)
             m.
-        mass : float
-            kg.
         **motion
             `velocity` and `angular_velocity`, as for `body`.
         """
@@ -248,15 +194,8 @@ class PlanarModel(Couplings):
 
         Parameters
         ----------
-        name : str
         size : array_like (2,)
             Its edges along the axes of the body, m.
-        mass : float
-            kg.
-        position : array_like (2,)
-            Of the centre, m.
-        **pose
-            `angle`, `velocity` and `angular_velocity`, as for `body`.
         """
         edges = check_vector(f"size of {name!r}", size, 2)
         check_positive(f"mass of {name!r}", mass)
@@ -265,20 +204,7 @@ class PlanarModel(Couplings):
         return self.body(name, mass=mass, inertia=mass * float(edges @ edges) / 12.0, position=position, **pose)
 
     def disc(self, name: str, radius: float, *, mass: float, position: ArrayLike, **pose: Any) -> Body:
-        """Add a uniform disc.
-
-        Parameters
-        ----------
-        name : str
-        radius : float
-            m.
-        mass : float
-            kg.
-        position : array_like (2,)
-            Of the centre, m.
-        **pose
-            `angle`, `velocity` and `angular_velocity`, as for `body`.
-        """
+        """Add a uniform disc."""
         check_positive(f"radius of {name!r}", radius)
         check_positive(f"mass of {name!r}", mass)
         return self.body(name, mass=mass, inertia=0.5 * mass * radius**2, position=position, **pose)
@@ -314,18 +240,9 @@ class PlanarModel(Couplings):
     def _no_rotation(self) -> float:
         return 0.0
 
-    def _axis(self, joint: ModelJoint) -> Array:
-        assert joint.rows[0].more is not None
-        self.taken.append(joint.rows[0].more)
-        (angle,) = joint.rows[0].more.values
-        return np.array([np.cos(angle), np.sin(angle)])
-
-    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
-        if joint.kind == "revolute":
-            zero = Numbers((joint.b.rotation - joint.a.rotation,))
-            return JointRow(ANGLE, 1, joint.a, joint.b, more=zero, motion=motion)
-        across = joint.rows[0]
-        return JointRow(ALONG, 1, joint.a, joint.b, across.on_first, across.on_second, across.more, motion)
+    def _turn_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+        zero = Numbers((joint.b.rotation - joint.a.rotation,))
+        return JointRow(ANGLE, 1, joint.a, joint.b, more=zero, motion=motion)
 
     def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
         *law, angle = numbers.values
@@ -334,18 +251,6 @@ class PlanarModel(Couplings):
         names = (*numbers.names[:-1], f"angle of {joint.b.name} against {joint.a.name} {zero} of {name} (rad)")
         values = Numbers((*law, total), names)
         return Force(name, TORSION_SPRING, joint.a, joint.b, None, None, values, joint=joint)
-
-    def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
-        function, more = self._function(name, f, 1, unit)
-        if joint.kind == "revolute":
-            return Force(name, TORQUE, joint.a, joint.b, None, None, more, function, joint=joint)
-        return Force(
-            name, AXIAL_FORCE, joint.a, joint.b, joint.rows[0].more, joint.point_b, more, function, joint=joint
-        )
-
-    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers | None) -> Force:
-        axis = joint.rows[0].more  # None for a revolute joint
-        return Force(name, kind, joint.a, joint.b, axis, joint.point_b, numbers, point_on_first=joint.point_a)
 
     def _check_moments(self, name: str, moments: Array) -> None:
         check_positive(f"moment of inertia of {name}", float(moments[0]))

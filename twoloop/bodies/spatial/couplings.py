@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.bodies.collection import add, documented
+from twoloop.bodies.coordinates import SpatialAngle
 from twoloop.bodies.frames import point_of, vector_of
 from twoloop.bodies.functions import RateFunction, RowFunction
 from twoloop.bodies.loads import Row, function_rows, listed
@@ -18,7 +18,7 @@ from twoloop.bodies.model_problem import Model
 from twoloop.bodies.parameter_layout import RATE_FUNCTION, ROW_FUNCTION
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.rotation import euler_parameters, perpendiculars
-from twoloop.bodies.rotation_rates import cross, euler_product, parameters_of, rotated_by, spin_of
+from twoloop.bodies.rotation_rates import cross, euler_product, spin_of
 from twoloop.checks.arguments import Array, check_positive, check_vector
 
 MOST_TEETH = 1000
@@ -33,8 +33,8 @@ Complex = tuple[Any, Any]
 class GearRow:
     """Evaluate the angle m (rotation of other) - n (rotation of one), over m, up to whole turns."""
 
-    one: ModelJoint
-    other: ModelJoint
+    one: SpatialAngle
+    other: SpatialAngle
     n: int
     m: int
 
@@ -45,7 +45,7 @@ class GearRow:
 
     def off(self, q: Array) -> float:
         """Return the angle from the tooth in mesh in the position given; zero after more than half a turn from it."""
-        one, other = (_angle(_rotation(q, joint)) for joint in (self.one, self.other))
+        one, other = (_angle(_rotation(q, each)) for each in (self.one, self.other))
         meant = one * self.n / self.m
         return float(other - meant) if max(abs(one), abs(meant)) < HALF_TURN else 0.0
 
@@ -65,11 +65,13 @@ class SpatialCouplings(Model):
                 f"ratio of a gear in space must be a ratio of whole numbers up to {MOST_TEETH}, such as -17 / 43 of "
                 f"the teeth, as coordinates in space do not count turns; given {ratio!r}"
             )
-        return GearRow(one, other, n, m)
+        return GearRow(self._hinge(one), self._hinge(other), n, m)
 
     def _wound_row(self, pinion: ModelJoint, moved: Row, radius: float) -> Row:
+        hinge = self._hinge(pinion)
+
         def row(q: Any) -> Any:
-            turns, (c, s) = moved(q) / radius, _rotation(q, pinion)
+            turns, (c, s) = moved(q) / radius, _rotation(q, hinge)
             return radius * _angle(_times((np.cos(turns), np.sin(turns)), (c, -s)))
 
         return row
@@ -88,7 +90,7 @@ class SpatialCouplings(Model):
             row = joint.rows[0].motion
             if isinstance(row, RowFunction) and isinstance(row.function, GearRow) and abs(row.function.off(q)) > MESHES:
                 raise ValueError(
-                    f"{joint.name!r} does not mesh at t = {t:g} as in the position given: {row.function.other.name!r} "
+                    f"{joint.name!r} does not mesh at t = {t:g} as in the position given: {row.function.other.joint!r} "
                     f"is {row.function.off(q):.6g} rad off. Give poses nearer to the start of the motion"
                 )
 
@@ -213,64 +215,6 @@ class SpatialCouplings(Model):
             rows += (JointRow(RATE_FUNCTION, 1, *ends, listed(columns), rate),)
         return add(self.joints, ModelJoint(name, "rolling ball", *ends[:2], rows, *ends[2:]))
 
-    def point_on_curve(
-        self, a: Body | str, b: Body | str, *, at: Any, curve: Callable[[Any, Any, Any], Any], name: str | None = None
-    ) -> ModelJoint:
-        """Keep a point of b on a curve or surface of a, like a pin in a curved slot.
-
-        Parameters
-        ----------
-        at : array_like (3,) or BodyPoint
-            The point of b, in space in the position given, m.
-        curve : callable
-            curve(x, y, z): two values that are zero on a curve, or one that is zero on a surface, from numpy functions
-            without branches; x, y and z in the axes of a relative to its centre of mass (ground: in space), m. Their
-            gradients must not vanish there, nor be parallel.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is invalid, or the curve cannot be traced.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from twoloop.bodies import SpatialModel
-        >>> model = SpatialModel(name="bead on a helix")
-        >>> bead = model.particle("bead", mass=1.0, position=(1.0, 0.0, 0.0))
-        >>> wire = model.point_on_curve(
-        ...     "ground", bead, at=(1.0, 0.0, 0.0), curve=lambda x, y, z: (x - np.cos(z), y - np.sin(z))
-        ... )
-        >>> model.problem().freedom.degrees
-        1
-        """
-        body_a, body_b = self._body("a", a), self._body("b", b)
-        self._different("point_on_curve", body_a, body_b)
-        name = self._new_name("point on curve", name, body_a, body_b)
-        if not callable(curve):
-            raise TypeError(f"curve of {name!r} must be a function of x, y and z; given {curve!r}")
-        point_b = self._point("at", at, body_b)
-        point_a = body_a.local_point(body_b.in_space(point_b))
-        values = np.asarray(curve(*point_a.tolist()))
-        n_values = values.size
-        if n_values not in (1, 2):
-            raise ValueError(
-                f"curve of {name!r} must return two values for a curve, or one for a surface; it returned {n_values}"
-            )
-
-        def off(q: Any, k: int) -> Any:
-            here = point_of(q, body_b.number, point_b)
-            if body_a is not self.ground:
-                apart = [x - q[j] for x, j in zip(here, body_a.coordinates, strict=False)]
-                here = rotated_by(parameters_of(q, body_a.number, -1.0), apart)
-            value = curve(*here)
-            return value if values.ndim == 0 else value[k]
-
-        ends = body_a, body_b, Numbers(tuple(point_a)), Numbers(tuple(point_b))
-        rows = [lambda q, k=k: off(q, k) for k in range(n_values)]
-        joint_rows = function_rows(f"point on curve {name!r}", rows, ends[:2], ends)
-        return add(self.joints, ModelJoint(name, "point on curve", *ends[:2], joint_rows, *ends[2:]))
-
 
 def relative(a: Body, axis_a: Array, b: Body, axis_b: Array) -> Array:
     """Return the rotation of b relative to a that aligns their axes and is nearest to the one given."""
@@ -284,14 +228,9 @@ def relative(a: Body, axis_a: Array, b: Body, axis_b: Array) -> Array:
     return np.asarray((np.eye(3) + cross + cross @ cross / (1.0 + c)) @ given)
 
 
-def _rotation(q: Any, joint: ModelJoint) -> Complex:
+def _rotation(q: Any, hinge: SpatialAngle) -> Complex:
     """Return cosine and sine of the rotation of b on a since the position given."""
-    axis_a, axis_b = joint.axes
-    zero = euler_parameters(relative(joint.a, axis_a, joint.b, axis_b))
-    w, *e = euler_product(
-        euler_product(parameters_of(q, joint.a.number, -1.0), parameters_of(q, joint.b.number)), (zero[0], *-zero[1:])
-    )
-    half = w, sum(n * x for n, x in zip(axis_a, e, strict=True))
+    half = hinge.half(q)
     c, s = _times(half, half)
     size = half[0] * half[0] + half[1] * half[1]
     return c / size, s / size

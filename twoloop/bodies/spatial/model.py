@@ -15,8 +15,6 @@ from twoloop.bodies.loads import function_rows
 from twoloop.bodies.parameter_layout import (
     ALONG,
     ANGLE_DRIVE,
-    AXIAL_FORCE,
-    AXIAL_TORQUE,
     PERPENDICULAR,
     POINT,
     TORSION_SPRING,
@@ -166,13 +164,8 @@ class SpatialModel(SpatialCouplings):
 
         Parameters
         ----------
-        name : str
         start, end : array_like (3,)
             m.
-        radius : float
-            m.
-        mass : float
-            kg.
         **motion
             `velocity` and `angular_velocity`, as for `body`.
         """
@@ -191,15 +184,8 @@ class SpatialModel(SpatialCouplings):
 
         Parameters
         ----------
-        name : str
         size : array_like (3,)
             Its edges along the axes of the body, m.
-        mass : float
-            kg.
-        position : array_like (3,)
-            Of the centre, m.
-        **pose
-            `rotation`, `velocity` and `angular_velocity`, as for `body`.
         """
         squares = check_vector(f"size of {name!r}", size, 3) ** 2
         check_positive(f"mass of {name!r}", mass)
@@ -208,20 +194,7 @@ class SpatialModel(SpatialCouplings):
         return self.body(name, mass=mass, inertia=mass * (squares.sum() - squares) / 12.0, position=position, **pose)
 
     def sphere(self, name: str, radius: float, *, mass: float, position: ArrayLike, **pose: Any) -> Body:
-        """Add a uniform ball.
-
-        Parameters
-        ----------
-        name : str
-        radius : float
-            m.
-        mass : float
-            kg.
-        position : array_like (3,)
-            Of the centre, m.
-        **pose
-            `rotation`, `velocity` and `angular_velocity`, as for `body`.
-        """
+        """Add a uniform ball."""
         check_positive(f"radius of {name!r}", radius)
         check_positive(f"mass of {name!r}", mass)
         return self.body(name, mass=mass, inertia=np.full(3, 0.4 * mass * radius**2), position=position, **pose)
@@ -383,35 +356,15 @@ class SpatialModel(SpatialCouplings):
     def _no_rotation(self) -> Array:
         return np.eye(3)
 
-    def _axis(self, joint: ModelJoint) -> Array:
-        return joint.axes[0]
-
-    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+    def _turn_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         axis_a, axis_b = joint.axes
-        if joint.kind == "prismatic":
-            along = Numbers(tuple(axis_a))
-            return JointRow(ALONG, 1, joint.a, joint.b, joint.point_a, joint.point_b, along, motion)
         first, second = perpendiculars(axis_a)
-        zero = relative(joint.a, axis_a, joint.b, axis_b).T @ first
-        return JointRow(
-            ANGLE_DRIVE, 1, joint.a, joint.b, Numbers((*first, *second)), Numbers(tuple(zero)), None, motion
-        )
+        zero = Numbers(tuple(relative(joint.a, axis_a, joint.b, axis_b).T @ first))
+        return JointRow(ANGLE_DRIVE, 1, joint.a, joint.b, Numbers((*first, *second)), zero, None, motion)
 
     def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
         axis, start = Numbers(tuple(joint.axes[0])), Numbers(tuple(self._zero(joint)))
         return Force(name, TORSION_SPRING, joint.a, joint.b, axis, start, numbers, joint=joint)
-
-    def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
-        function, more = self._function(name, f, 1, unit)
-        axis = Numbers(tuple(joint.axes[0]))
-        if joint.kind == "revolute":
-            return Force(name, AXIAL_TORQUE, joint.a, joint.b, axis, None, more, function, joint=joint)
-        return Force(name, AXIAL_FORCE, joint.a, joint.b, axis, joint.point_b, more, function, joint=joint)
-
-    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers | None) -> Force:
-        axis = Numbers(tuple(joint.axes[0]))
-        places = axis, joint.point_b, numbers
-        return Force(name, kind, joint.a, joint.b, *places, point_on_first=joint.point_a, joint=joint)
 
     def _check_moments(self, name: str, moments: Array) -> None:
         _moments(f"inertia of {name}", moments[TENSOR].reshape(3, 3))
