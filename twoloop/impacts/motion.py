@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import time
 import warnings
 from collections.abc import Sequence as Stops
 from functools import partial
@@ -61,6 +62,7 @@ MIN_EVALUATIONS = 2000  # smallest number of evaluations of gaps, forces and rat
 PRESSED_RATIO = 1e3  # squared rate, over (rebound height times acceleration), up to which stops may press together
 ROUNDING = 1e-13  # rounding errors of gaps and rates, relative to max(1, |q|)
 FIRST_STEP_RATIO = 1e-9  # smallest first step size of an arc, relative to max(1 s, t)
+MIN_TIME_LIMIT = 1e-6  # s; an arc that begins after the time limit of the motion ends by it at once
 NEGLIGIBLE_VALUE = 1e-20  # coordinate (m or rad) or rate (m/s or rad/s) below which it is a rounding error
 MAX_STALLED_TIME = 1e-13  # longest duration of a stalled arc, relative to max(1 s, t)
 MAX_STALLED_ARCS = 30  # number of stalled arcs in a row that ends the motion
@@ -108,6 +110,8 @@ class Motion:
         self.restitution = np.array([stop.restitution for stop in stops])
         self.gaps, self.friction = Gaps("gap", stops, t, q), StopFriction(stops, t, q)
         self.law, self.unfinished_sequences = law, []  # type: ignore[var-annotated]
+        limit = options.get("time_limit")
+        self.deadline = np.inf if limit is None else time.monotonic() + limit
         # impacts whose outcome depends on the law: time, stops, event
         self.law_dependent_impacts: list[tuple[float, list[str], str]] = []
         self.noise = EQUAL_GAPS * max(1.0, float(np.abs(q).max()))
@@ -430,6 +434,9 @@ class Motion:
         system = self._contact_system(free_system, mode, cacheable)
         if system.n_c and (resting or self.modes.n_joints):
             self._project(system, resting)
+        if self.arcs or resting:
+            self.q[np.abs(self.q) < NEGLIGIBLE_VALUE] = 0.0
+            self.v[np.abs(self.v) < max(NEGLIGIBLE_VALUE, 1e-16 * float(self.speeds.max()))] = 0.0
         start = self.gaps.at(self.t, self.q, self.v)
         accelerations = self._accelerations(system, cacheable) if resting or STICKS in signs else None
 
@@ -460,6 +467,8 @@ class Motion:
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
             least_step = FIRST_STEP_RATIO * max(1.0, abs(self.t))  # coordinates near zero give no scale for a step
             options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least_step), t1 - self.t)
+        if self.deadline < np.inf:
+            options["time_limit"] = max(self.deadline - time.monotonic(), MIN_TIME_LIMIT)
         if resting:  # the callbacks of an extended system call other callbacks, and cannot be traced
             options |= options_without_traces(options)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
@@ -502,14 +511,12 @@ class Motion:
         """Project the state onto the constraints of a mode, from which it deviates by less than the tolerances."""
         self.q = corrected_positions(system, self.t, self.q)
         if resting:
-            self.q[np.abs(self.q) < NEGLIGIBLE_VALUE] = 0.0
             gap = self.gaps.at(self.t, self.q, self.v)
             W, u = gap.W[list(resting)], gap.u[list(resting)]
             X = responses(self.system, self.t, self.q, W)
             self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE_RATIO)[0]
         rows, violation = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
         self.v = self.v - np.linalg.lstsq(rows, violation, rcond=NEGLIGIBLE_RATIO)[0]
-        self.v[np.abs(self.v) < max(NEGLIGIBLE_VALUE, 1e-16 * float(self.speeds.max()))] = 0.0
 
     def _gap_event(self, k: int, start: Gap) -> Any:
         """Return the event of a gap that is open or about to open; its zero is where the gap has closed again."""
@@ -625,7 +632,7 @@ def solve_with_stops(
         the fastest first, as in Newton's cradle and as with small gaps. None: Moreau's law, with an `ImpactWarning`
         where impacts one by one give other velocities.
     **options
-        Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
+        Further keyword arguments of `solve_dae`: max_step, compiled, time_limit, ...
 
     Returns
     -------
@@ -686,6 +693,8 @@ def checked_options(
     if unknown:
         raise TypeError(f"{caller} has no option {unknown[0]!r}; those of runs are {', '.join(sorted(names))}")
     check_positive("rtol", rtol)
+    if options.get("time_limit") is not None:
+        check_positive("time_limit", options["time_limit"])
     return {"method": method, "rtol": rtol, "atol": check_tolerance("atol", atol, n_q)}
 
 
@@ -721,7 +730,7 @@ def solve_with_friction(
     law : "moreau", "poisson" or "sequential", optional
         As for `solve_with_stops`.
     **options
-        Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
+        Further keyword arguments of `solve_dae`: max_step, compiled, time_limit, ...
 
     Returns
     -------
