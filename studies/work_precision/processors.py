@@ -49,10 +49,12 @@ def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
 
 
 def kept(output: Output, rows: pd.DataFrame, stamp: str, known: Standings) -> list[dict[str, Any]]:
-    """Keep the verdicts of these rows beside those of other processors, and compare all."""
-    table = added(output.file(FILE), verdicts(rows, stamp, known))
+    """Keep the verdicts of these rows beside those of other processors, and compare theirs with each other one."""
+    made = verdicts(rows, stamp, known)
+    table = added(output.file(FILE), made)
     output.write(FILE, table.to_csv(index=False))
-    return findings_of(table)
+    own = set(made["processor"])
+    return [pair for pair in findings_of(table) if any(line["name"] in own for line in pair["processors"])]
 
 
 def findings_of(table: pd.DataFrame, who: str = headline.OWN_CODE) -> list[dict[str, Any]]:
