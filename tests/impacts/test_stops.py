@@ -215,6 +215,20 @@ def test_impacts_that_follow_ever_faster_come_one_by_one(masses, restitutions, x
     assert result.success and np.abs(result.q[:, -1] - known).max() < 10.0 * tolerance, result.message
 
 
+def test_rounding_of_coordinates_that_are_zero_does_not_end_a_motion():
+    """A light ball between two others, on rails through y = 0, where a violation has nothing to be compared with."""
+    masses, x, speeds, restitutions = [1.0, 0.0106, 1.06], [0.5, 1.2, 1.9], [0.39, 0.56, -0.41], [0.33, 0.55]
+    model = PlanarModel()
+    for k in range(3):
+        ball = model.disc(f"{k}", 0.1, mass=masses[k], position=(x[k], 0.0), velocity=(speeds[k], 0.0))
+        model.prismatic("ground", ball, at=(x[k], 0.0), axis=(1.0, 0.0))
+    for k in range(2):
+        model.stop(f"{k + 1}", (x[k + 1], 0.0), f"{k}", (x[k], 0.0), normal=(1.0, 0.0), restitution=restitutions[k])
+    _, result = moved(model, 2.5, rtol=1e-6, atol=1e-6)
+    known = one_by_one(masses, restitutions, x, speeds, 2.5, False)
+    np.testing.assert_allclose(result.q[::3, -1], known, atol=1e-5)
+
+
 EQUAL, UNEQUAL = ([1.0] * 4, [1.0] * 3), ([1.0, 2.0, 1.5, 0.5], [0.3, 0.8, 0.2])  # masses and restitutions
 BALLS = [("sequential", EQUAL, [0, 0, 0, 1.0]), ("moreau", EQUAL, [-0.5, 0.5, 0.5, 0.5])]
 
