@@ -202,6 +202,8 @@ def one_by_one(masses, restitutions, x, v, t1, wall):
 LINES = [([1.2, 0.015, 0.9], [0.45, 0.55], [0.0, 0.9, 1.6], [0.8, 0.1, -1.1], False)]
 LINES += [([0.07, 1.4], [0.4, 0.6], [0.4, 1.3], [0.2, -0.9], True)]
 LINES += [([2.0, 0.1], [0.9, 0.7], [1.0, 1.5], [-1.0, 0.3], True)]
+# a gap that opens so slowly that it changes by rounding at first
+LINES += [([1.0, 0.99, 0.087, 1.08], [0.37, 0.39, 0.53], [1.0, 1.78, 2.52, 2.82], [0.94, -0.3, -0.79, -1.25], False)]
 
 
 @pytest.mark.parametrize("tolerance", [1e-8, slow(1e-5), slow(1e-11)])
