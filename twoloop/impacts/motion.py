@@ -529,7 +529,7 @@ class Motion:
             if g0 > low or (closing and g0 > noise):
                 return g
             if opens:
-                return (g - g0) / (t - t0) if abs(g - g0) > noise else u0  # at first, g changes by rounding alone
+                return (g - g0) / (t - t0) if u0 * (t - t0) > noise else u0  # at first, g changes by rounding alone
             return g - min(g0, 0.0) + low
 
         event = make_terminal(gap_function)
