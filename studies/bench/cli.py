@@ -131,11 +131,11 @@ def processor() -> str:
 def named(known: Mapping[str, str]) -> str:
     """Name a processor and its vectors; with family and model where it has no number: times of generations differ."""
     name, flags = known.get("model name", ""), known.get("flags", "").split()
-    width = "AVX-512" if "avx512f" in flags else "AVX2" if "avx2" in flags else ""
-    told = f"{name} with {width}" if name and width else name
-    for made in generation(known) if name and not any(map(str.isdigit, name)) else ():
-        told += f" ({made.removeprefix('cpu ')})"
-    return told
+    vectors = "AVX-512" if "avx512f" in flags else "AVX2" if "avx2" in flags else ""
+    parts = [f"{name} with {vectors}" if name and vectors else name]
+    if name and not any(map(str.isdigit, name)):
+        parts += [f"({each.removeprefix('cpu ')})" for each in generation(known)]
+    return " ".join(parts)
 
 
 def generation(known: Mapping[str, str]) -> list[str]:
