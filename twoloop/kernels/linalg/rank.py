@@ -156,9 +156,9 @@ SIMILAR_EIGENVALUES = 1e-7
 # dead centre of the slider-crank with two rods; hence redundant rows with large coefficients become independent ones.
 # The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
 MAX_COEFFICIENT = 1.5
-# a coefficient counts as larger than another one if their ratio exceeds this: in symmetrical mechanisms many are equal,
+# two coefficients are tied, and the first row decides, up to this ratio: in symmetrical mechanisms many are equal,
 # and rounding would decide among them, at each start anew
-CLEARLY = 1.01
+TIE_RATIO = 1.01
 
 
 def workspace_size(n_rows: int, n: int) -> int:
@@ -301,7 +301,7 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_ke
             for k in range(n_kept):
                 kept_square = _dot(G[kept[k]], G[kept[k]])
                 coefficient = abs(coefficients[k]) * math.sqrt(kept_square / max(row_square, TINY))
-                if coefficient > largest and (leaving < 0 or coefficient > CLEARLY * largest):
+                if coefficient > largest and (leaving < 0 or coefficient > TIE_RATIO * largest):
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
             return
