@@ -271,8 +271,8 @@ def ensemble(
 
     - the first run, with all checks, and with a tenth of the tolerances if they are above 1e-9: the lanes are compared
       with it
-    - runs that come near a singular position; runs with events, nonholonomic rows, callbacks that branch, or other
-      methods
+    - runs with a step that ends near a singular position; runs with events, nonholonomic rows, callbacks that branch,
+      or other methods
     - runs whose forces or drives act for less than a thousandth of the run, with a `max_step` of half of that
     - all runs, if they take less than a twentieth of the estimated time to compile their code
 
