@@ -19,7 +19,7 @@ from twoloop.generate.llvm_text import Module
 from twoloop.generate.null_space import Factors
 from twoloop.generate.program import Coefficients, Program
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
-from twoloop.kernels.data.indices import BY_GENERAL, DONE
+from twoloop.kernels.data.indices import DONE, USED_GENERAL
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.inner_loop import generated_inner_loop
 from twoloop.methods.presets import PRESETS
@@ -88,7 +88,7 @@ def check_projection(make, compiled):
     q0 = problem.q0 + 1e-6 * rng.standard_normal(problem.q0.size)
     v0 = problem.v0 + 1e-3 * rng.standard_normal(problem.q0.size)
     code, q, v, a, lam = inner(run, tasks.PROJECT, 0.0, q0, v0)
-    assert code == DONE and run.work.notes[BY_GENERAL] == 0.0  # not by the general inner loop
+    assert code == DONE and run.work.notes[USED_GENERAL] == 0.0  # not by the general inner loop
     M, G = system.mass(0.0, q), system.jacobian(0.0, q)
     rate = system.constraint_rate(0.0, q)
     if system.n_a:
@@ -153,8 +153,8 @@ def test_near_a_singular_position_the_general_inner_loop_takes_over():
 
     q = v = np.zeros(3)
     run = run_from(system(1.0), q, v, True)
-    assert inner(run, tasks.PROJECT, 0.5, q, v)[0] == DONE and run.work.notes[BY_GENERAL] == 0.0
-    assert inner(run, tasks.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[BY_GENERAL] == 1.0
+    assert inner(run, tasks.PROJECT, 0.5, q, v)[0] == DONE and run.work.notes[USED_GENERAL] == 0.0
+    assert inner(run, tasks.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[USED_GENERAL] == 1.0
 
 
 def test_redundant_rows_that_stop_holding_end_the_run():

@@ -221,7 +221,7 @@ def solve_dae(
             if run is None:
                 run, _ = set_up(system, t0, t1, q0, v0, options)
                 if every < np.inf:
-                    run.control[run.a.APART] = every
+                    run.control[run.a.TIME_SPACING] = every
             if left == repeats and run.rows_warning:
                 warnings.warn(run.rows_warning, ConstraintWarning, stacklevel=2)
             with_code = bool(run.plan.own)

@@ -35,7 +35,7 @@ from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.__main__ import compile_all
 from twoloop.kernels.compile import callbacks
 from twoloop.kernels.control.discontinuities import N_SAMPLES
-from twoloop.kernels.data.indices import LONGEST_UNSEEN
+from twoloop.kernels.data.indices import MAX_GAP_RATIO
 
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
@@ -65,7 +65,7 @@ OWN_OF = {  # groups of many runs, which fewer methods make
     traps.LINKAGE: (GIVEN, "DOP853"),
     traps.FORCE: (*OWN, *OF_FORCES),
 }
-LOOK = LONGEST_UNSEEN / N_SAMPLES  # of a run: longest time between two evaluations of a force that changes with time
+LOOK = MAX_GAP_RATIO / N_SAMPLES  # of a run: longest time between two evaluations of a force that changes with time
 LIMITED = ", max_step"  # of other solvers whose largest step is that time
 
 KINDS = {  # kinds of solvers, in words

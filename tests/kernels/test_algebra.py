@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.problems import called, entry
 from twoloop.generate.elimination import MIN_PIVOTS, RANK_TOL, SINGULAR_MASS, START_LIMITS
 from twoloop.kernels.lanes import layout
-from twoloop.kernels.lanes.layout import FINE, LANES, N_FIELDS
+from twoloop.kernels.lanes.layout import ACTIVE, LANES, N_FIELDS
 from twoloop.kernels.linalg import dense as linalg
 from twoloop.kernels.linalg import markowitz_lu as elimination
 from twoloop.kernels.linalg import markowitz_lu as factors
@@ -39,24 +39,24 @@ def test_systems_are_solved_with_rows_exchanged_as_each_lane_needs(imaginary):
     right = np.einsum("kij,kj->ki", A, x[0] + 1j * x[1] * (parts - 1))
     matrix, pivots = N_FIELDS, N_FIELDS + 2 * N * N
     room = np.zeros((pivots + 3 * N, LANES))
-    room[FINE] = 1.0
+    room[ACTIVE] = 1.0
     room[matrix : matrix + 2 * N * N] = np.concatenate([A.real, A.imag], axis=1).reshape(LANES, -1).T
     room[pivots + N :] = np.concatenate([right.real, right.imag], axis=1).T
     flat, apart = room.ravel(), N * N * (parts - 1)
     called(layout.factor_matrices, flat, matrix, pivots, N, apart)
     called(layout.solve_systems, flat, matrix, pivots, N, apart, pivots + N)
     found = room[pivots + N :].reshape(2, N, LANES)[:parts]
-    assert np.abs(found - x[:parts].transpose(0, 2, 1)).max() < 1e-4 and (room[FINE] == 1.0).all()
+    assert np.abs(found - x[:parts].transpose(0, 2, 1)).max() < 1e-4 and (room[ACTIVE] == 1.0).all()
     assert np.delete(np.abs(found - x[:parts].transpose(0, 2, 1)), 2, axis=2).max() < 1e-11
 
 
 def test_a_singular_matrix_is_noted_in_its_lane_alone():
     room = np.zeros((N_FIELDS + N * N + N, LANES))
-    room[FINE] = 1.0
+    room[ACTIVE] = 1.0
     room[N_FIELDS : N_FIELDS + N * N] = np.eye(N).reshape(-1, 1)
     room[N_FIELDS + 6, 3] = 0.0
     called(layout.factor_matrices, room.ravel(), N_FIELDS, N_FIELDS + N * N, N, 0)
-    assert np.flatnonzero(room[FINE] != 1.0).tolist() == [3]
+    assert np.flatnonzero(room[ACTIVE] != 1.0).tolist() == [3]
 
 
 make_program, factor = entry(factors.make_program), entry(factors.factor)

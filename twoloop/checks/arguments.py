@@ -1,4 +1,4 @@
-"""Checks of arguments; each message says which one is wrong, what was given, what is expected, and what to do."""
+"""Check arguments; each error message names the argument, the given value, the expected value, and a remedy."""
 
 import inspect
 import math
@@ -16,16 +16,16 @@ Array = NDArray[np.float64]
 
 FLOAT, ARRAY = np.dtype(np.float64), np.ndarray
 NUMBERS = (float, int)  # bool is excluded
-FAR = 1e300  # s: times below this are certainly finite
-SURELY_APART = 1e-14  # relative to the ends of a span: a longer span is certainly long enough
-NEAR = 8.0  # in spacings of floating-point numbers: times that differ by less cannot be distinguished
+FAR = 1e300  # magnitude of times, s, below which they are certainly finite
+SURELY_APART = 1e-14  # duration of a span, relative to its ends, above which it is certainly long enough
+NEAR = 8.0  # difference, in spacings of floating-point numbers, below which two times cannot be distinguished
 # contents of arrays, for messages, by NumPy's kind
 HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}
 SHOWN = 120  # largest number of characters of a given value in a message
 
 
 def shown(value: Any) -> str:
-    """Return `value` as a message shows it: its repr, cut if it is long."""
+    """Return the text of a value for a message: its repr, cut if it is long."""
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 10**30:
         return f"an integer of {value.bit_length()} bits"  # more digits than Python writes
     try:
@@ -36,7 +36,7 @@ def shown(value: Any) -> str:
 
 
 def shaped(array: NDArray[Any]) -> str:
-    """Describe an array of an unexpected shape, as a message shows it."""
+    """Return the text, for a message, of an array that has an unexpected shape."""
     if array.ndim == 0:
         return f"the number {shown(array.tolist())}"
     return f"shape {array.shape}, {shown(array.tolist())}"
@@ -159,7 +159,7 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
 
 
 def is_vector(value: Any, n: int) -> TypeGuard[Array]:
-    """Return whether a value is a float vector of length n already; its numbers may not be finite."""
+    """Return whether a value is already a float vector of length n; its numbers need not be finite."""
     return type(value) is ARRAY and value.dtype == FLOAT and value.shape == (n,)
 
 
@@ -281,7 +281,7 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
 
 
 def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
-    """Raise the error that describes the first wrong output time; the caller knows that there is one."""
+    """Raise the error that describes the first wrong output time; the caller has found that one is wrong."""
     if not np.isfinite(times).all():
         raise wrong_entries("t_eval", "finite", times, ~np.isfinite(times))
     if times.min() < t0 or times.max() > t1:

@@ -29,15 +29,15 @@ OWN_MODULES = {
     *("twoloop.checks.callbacks", "twoloop.generate.graph", "twoloop.generate.trace"),
     *("twoloop.generate.parameter_expressions", "twoloop.bodies.system"),
 }
-# number of parameters appended to those of a callback: if this prevents the error, `parameters` was too short
+# number of numbers appended to `parameters` after an index error: without an error then, `parameters` was too short
 N_APPENDED = 4096
 
 
 def check_bounds(system: ConstrainedSystem, t: float, q: Array, v: Array) -> None:
     """Run every compiled callback of a system once at (t, q, v) with bounds checked; later calls do nothing.
 
-    Large dense matrices of systems that give values of entries are left out: they are checked before their first use.
-    Raise ValueError if an index is out of bounds; the message names the callback, the index and the sizes of arrays.
+    If a system gives values of entries, large dense matrices are left out, and checked before their first use. Raise
+    ValueError if an index is out of bounds; the message names the callback, the index and the sizes of arrays.
     """
     if len(system.within_bounds) == len(KINDS):
         return
@@ -90,7 +90,7 @@ def _index_error(
                 copy(t, *given, *(np.zeros(array.shape) for array in out))
         except IndexError as error:
             return error
-        except Exception:  # the callback may run only compiled; its own errors are raised when it is called
+        except Exception:  # the callback may only run compiled; its own errors are raised when it is called later
             continue
         if changed is not None:
             changed += [
@@ -106,7 +106,7 @@ def _in_python(function: types.FunctionType, _: Any) -> Any:
 
 @lru_cache(256)
 def _own_in_python(function: Dispatcher) -> Any:
-    """Copy a callback of twoloop once for all systems: the globals that it names never change."""
+    """Return a copy of a callback of twoloop, cached for all systems because its globals never change."""
     return FunctionCopier(_in_python).replacement_of(function)
 
 
@@ -129,15 +129,15 @@ def place_of(error: BaseException) -> str:
     return f", in `{source}` ({file}, line {line})" if source else ""
 
 
-SAME = 1e-11  # relative to the largest entry: larger differences between two callbacks count
+SAME = 1e-11  # largest difference between equal callbacks, relative to the largest entry
 MAX_ENTRIES = 4_000_000  # largest number of entries of a dense matrix that is allocated for a comparison
-UNSYMMETRIC = 1e-10  # relative to the largest entry of M: larger differences from the transpose are not rounding
+UNSYMMETRIC = 1e-10  # largest difference of M from its transpose, relative to max|M|, that counts as rounding
 
 
 def wrong_values(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Describe where `mass_values` or `jacobian_values` differ from the dense callbacks beside them, or return None.
+    """Describe where `mass_values` or `jacobian_values` differ from the dense callbacks, or return None.
 
-    Matrices of more than `MAX_ENTRIES` entries are not allocated: no run of such a system uses them.
+    Matrices of more than `MAX_ENTRIES` entries are not compared, because no run of such a system uses them.
     """
     for kind, (rows, columns) in system.entries.items():
         if kind in system.scattered or system.n_q * (system.n_q if kind == "mass" else system.n_c) > MAX_ENTRIES:
@@ -173,7 +173,7 @@ def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | Non
 
 
 def _largest_of_matrix(mass: Array) -> tuple[int, int, float, float]:
-    """Return the entry that differs most from its transpose, with both values; (0, 0, 0.0, 0.0) if that is rounding."""
+    """Return indices and both values of the entry that differs most from its transpose; zeros if that is rounding."""
     off = np.abs(mass - mass.T)
     if not off.max() > UNSYMMETRIC * np.abs(mass).max():
         return 0, 0, 0.0, 0.0

@@ -23,21 +23,22 @@ if TYPE_CHECKING:
 
 
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
-# relative: coordinates whose corrections exceed their limits by equal ratios are tied; the message names the first one
+# relative difference up to which the ratios of two corrections to their limits are equal: the message then names the
+# first of the coordinates
 TIED = 1e-6
 NEIGHBOURS = 4  # number of neighbouring positions at which constraints are evaluated to measure their rounding
 # largest rounding error of a constraint, relative to the largest coordinate times the largest entry of the row
 MOST_NOISE = 1e-11
-# relative to the largest singular value of M in units of the inertia: smaller ones count as zero
+# singular value of M in units of the inertia, relative to the largest one, below which it counts as zero
 NO_INERTIA = 1e-12
 ROUNDING = 64.0  # allowed rounding error of the state, in spacings of floating-point numbers
 
 
 def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
-    """Return whether values are no larger than the rounding of their terms; such values are accepted without scales.
+    """Return whether values are no larger than the rounding of their terms; then no scales need to be computed.
 
-    Rows given by entries avoid scales, which need full matrices. Each of their entries counts as the largest of its
-    row, which covers rounding of the entries, too.
+    Scales need full matrices, which rows given by entries avoid. Each of their entries counts as the largest entry of
+    its row, which includes rounding of the entries.
     """
     if isinstance(rows, SparseRows):
         terms = rows.largest() * (rows.pattern() @ np.abs(state)) + np.abs(rate)
@@ -46,9 +47,9 @@ def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float 
 
 
 def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: float) -> Array:
-    """Estimate how much rounding of a position q changes constraints, by their values at neighbours of q, (n_rows,).
+    """Estimate how much rounding of q changes each constraint (n_rows,), from values at neighbouring positions.
 
-    `largest`: the largest coordinate, or velocity, by which the rows are multiplied.
+    `largest`: largest coordinate, or velocity, by which the rows are multiplied.
     """
     noise = np.zeros(len(rows))
     for k in range(NEIGHBOURS):
@@ -60,8 +61,8 @@ def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: flo
 def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array, columns: Array) -> Array:
     """Return the accelerations M^-1 Q without constraints; zero in directions without inertia, as of Euler parameters.
 
-    The constraints exclude these directions. Because of rounding such an M may have an inverse of 1e16. So small
-    singular values count as zero, in units in which the largest inertia of each coordinate, here or nearby, is 1.
+    The constraints exclude these directions. Rounding may give such an M an inverse of 1e16. So small singular values
+    count as zero, in units in which the largest inertia of each coordinate, at q or nearby, is 1.
     """
     mass, inertia = system.mass(t, q), np.zeros(len(q))
     for each in (mass, defined(lambda: system.mass(t, q + columns * generic_factors(len(q))))):
@@ -74,11 +75,11 @@ def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array
 
 
 class Violation:
-    """Violation of constraints by a state, as the change of coordinates (or velocities) that would correct it.
+    """Violation of constraints by a state, measured by the change of coordinates (or velocities) that corrects it.
 
-    `correction` is the Newton correction, by least squares with C_q, coordinates weighted by their scales. `allowed` is
-    the accepted correction: 1e-8 of the mechanism's size, plus rounding. `left` is the residual after the correction,
-    where rows of C_q depend on one another or are zero, and `allowed_left` its limit.
+    `correction`: Newton correction by least squares, with coordinates weighted by their scales. `allowed`: largest
+    accepted correction, 1e-8 of the mechanism's size plus rounding. `left`: residual after the correction, which
+    remains if rows of C_q are dependent or zero; `allowed_left`: its limit.
     """
 
     def __init__(
@@ -127,12 +128,12 @@ class Violation:
         scales: Scales,
         harmless: Array | float = 0.0,
     ) -> Violation:
-        """Measure the violation of C_q v + C_t = 0 and A v + b = 0, relative to the fastest motion there.
+        """Measure the violation of C_q v + C_t = 0 and A v + b = 0, relative to the fastest motion at the state.
 
-        Corrections up to `harmless`, (n_q,), are accepted in any case: relative to no motion, rounding is large.
+        Corrections up to `harmless`, (n_q,), are always accepted, because at rest rounding is large relative to v.
         """
         rate = system.rates(t, q)
-        # an entry that is zero at this position only counts, too: bars may lie in line with an axis
+        # entries that are zero only at this position count, too: bars may be in line with an axis
         pattern = pattern_of(system, t, q)[: len(jacobian)]
         fastest = (pattern * (np.abs(v) / scales.columns)).max(axis=1)
         pull = _without_constraints(system, t, q, v, scales.columns)
@@ -184,7 +185,7 @@ class Violation:
 
 
 def is_consistent(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Return whether a state at which all callbacks are finite is consistent, for limits see `Violation`."""
+    """Return whether a state, at which all callbacks are finite, is consistent; for the limits see `Violation`."""
     rows, C, rate = system.rows(t, q), system.constraint(t, q), system.rates(t, q)
     jacobian, scales = rows[: system.n_c], scales_of(system, t, q, rows)
     if not is_at_rounding(C, jacobian, q):
@@ -228,11 +229,11 @@ def check_start(
     exact: Callable[[], bool] | None = None,
     harmless: Array | float = 0.0,
 ) -> None:
-    """Call every callback once at the start; check shapes, finiteness, rank, consistency and, if asked, derivatives.
+    """Call every callback once at the start; check shapes, finiteness, rank, consistency and optionally derivatives.
 
     `exact` returns whether derivatives were derived from traces: then they are not compared with differences.
-    Velocities may be corrected by `harmless`, (n_q,), in any case. Raise TypeError or ValueError if a check fails; the
-    message names the callback or the argument, the value found and a remedy.
+    Corrections of velocities up to `harmless`, (n_q,), are accepted. Raise TypeError or ValueError if a check fails;
+    the message names the callback or the argument, its value and a remedy.
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
@@ -269,9 +270,9 @@ def check_start(
 
 
 class StartEvaluation:
-    """First evaluation of compiled callbacks at one start after another: its arrays, and the result of the last one.
+    """Evaluation of compiled callbacks at one start after another, with its arrays and the results at the last start.
 
-    `pattern` is 1 where the rows C_q and A have entries there or nearby.
+    `pattern` is 1 where the rows C_q and A have entries at the start or nearby.
     """
 
     def __init__(self, system: ConstrainedSystem):
@@ -294,17 +295,17 @@ class StartEvaluation:
         values.fill(0.0)
         try:
             return int(self._evaluate(self.system.kit, t, q, v, self.sizes(), *arrays))
-        except Exception:  # a callback raised: the detailed checks call it again and give the message
+        except Exception:  # raised by a callback: the detailed checks call it again, and describe the error
             return 0
 
     def sizes(self) -> Array:
-        """Return sizes of coordinates at earlier starts (see `Scales.keep`): lower limits for rounding errors."""
+        """Return sizes of coordinates at earlier starts (see `Scales.keep`), as lower bounds for rounding errors."""
         sizes: Array = self.system.derived.get("sizes", NONE)
         return sizes
 
 
 def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Return whether compiled callbacks pass all checks at a start, so that no check has to be repeated in detail."""
+    """Return whether compiled callbacks pass all checks at a start, so that no detailed check is needed."""
     if system.called_in_python or system.entries:
         return False
     evaluation = StartEvaluation(system)

@@ -1,7 +1,7 @@
 """Compare C_q, C_t, Q_d and the tangents of a system with differences, and check the symmetry of M.
 
-A run with a wrong sign in one of these often ends without an error and looks like a motion. At the start every entry is
-compared, later in a run only the derivative along one direction through all coordinates.
+A run with a wrong sign in one of these often ends without an error, and looks like a motion. At the start every entry
+is compared; later in a run, only the derivative along one direction in which all coordinates change.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-ALL_SIDES = (0, 1, -1)  # sides: around the place; if the callbacks are undefined there, after it or before it
-FORWARD = (1, -1)  # sides for times at the start: callbacks need not be defined before it
-FIRST_TIME_SCALE = 0.1  # s: first guess of the time scale of the constraints
-# displacement relative to the coordinates: tangents are checked a little off the start, where no symmetry hides terms
+ALL_SIDES = (0, 1, -1)  # sides to sample: around a point or, if callbacks are undefined there, after or before it
+FORWARD = (1, -1)  # sides for the start time, before which callbacks need not be defined
+FIRST_TIME_SCALE = 0.1  # first guess of the time scale of the constraints, s
+# displacement from the start, relative to the coordinates, to a state at which no symmetry hides terms of tangents
 NEAR_START = 1e-3
 MAX_WIDTHS_IN_RUN = 9  # largest number of half-widths of intervals tried at a state of a run
 
@@ -63,10 +63,10 @@ HINTS = {
 def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Callable[[], bool] | None = None) -> None:
     """Compare the callbacks of a system with one another near (t, q), at generic velocities.
 
-    Every entry is compared on its own, with a suitable displacement; an entry that differences cannot decide is
-    accepted. C_q comes first, then C_t, then gamma, whose check relies on both. This takes a few dozen calls of each
-    callback for each coordinate, once for each system; none if `exact` returns that the derivatives are exact. Raise
-    ValueError if an entry is wrong; the message names the callback, the entry, the value given and the one differenced.
+    Every entry is compared with its own displacement; if differences cannot decide, the entry is accepted. C_q is
+    checked first, then C_t, then gamma, whose check relies on both. This takes a few dozen calls of each callback for
+    each coordinate, once for each system, and none if `exact` returns that the derivatives are exact. Raise ValueError
+    if an entry is wrong; the message names the callback, the entry, its value and the value by differences.
     """
     if system.checked:
         return
@@ -87,12 +87,12 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Call
 
 
 def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
-    """Describe which of C_q, C_t and gamma is wrong at a state of a run, or None: formulas may hold at starts only.
+    """Describe which of C_q, C_t and gamma is wrong at a state of a run, or return None.
 
-    One direction through all coordinates and time covers all entries. So this mostly costs nine calls of `constraint`,
-    sixteen of `jacobian`, ten of `constraint_rate` and one of `gamma`, whatever n_q. Only after a difference are the
-    entries compared one by one, as at the start. Tangents are not checked: they decide whether Newton's method
-    converges, not what it converges to.
+    A formula may be right at the start only. One direction in which all coordinates and the time change covers all
+    entries, with nine calls of `constraint`, sixteen of `jacobian`, ten of `constraint_rate` and one of `gamma` for any
+    n_q. After a difference, the entries are compared one by one, as at the start. Tangents are not checked: they decide
+    whether Newton's method converges, not to which result.
     """
     jacobian, rate = system.sparse_rows(t, q), system.rates(t, q)
     if jacobian.size == 0 or not (is_finite(jacobian) and np.isfinite(rate).all()):
@@ -170,9 +170,9 @@ class _Comparison:
 def _wrong_constraint(
     system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...], *faster: Array
 ) -> str | None:
-    """Describe the first wrong entry of C_q, C_t or gamma, in this order, because each check relies on those before.
+    """Describe the first wrong entry of C_q, C_t or gamma; checks in this order rely on the results of earlier checks.
 
-    `gamma` is compared at generic velocities and at the `faster` ones of a run: it may be wrong only at high speed.
+    `gamma` is compared at generic velocities, and at the velocities `faster` of a run: it may be wrong only there.
     """
     wrong = _wrong_jacobian(system, t, q, sides) if system.n_c > 0 else None
     if wrong is not None:
@@ -196,7 +196,7 @@ def _wrong_constraint(
 
 
 def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Describe an asymmetry of M a little off the start, where more entries are nonzero, or return None."""
+    """Describe an asymmetry of M near the start, where more entries are nonzero, or return None."""
     if system.constant_mass:
         return None
     near = q + NEAR_START * sizes(q) * np.abs(generic_factors(system.n_q))
@@ -208,7 +208,7 @@ def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | No
 
 
 def _given_gammas(system: ConstrainedSystem) -> list[tuple[str, slice]]:
-    """Return the given right-hand sides of the acceleration constraints, with the rows they belong to."""
+    """Return the kinds of callbacks given for the right-hand side of G a = gamma, with their rows."""
     rows = {"gamma": slice(0, system.n_c), "nonholonomic_gamma": slice(system.n_c, None)}
     return [(kind, part) for kind, part in rows.items() if kind in system.given]
 
@@ -254,7 +254,7 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
 
 
 def _varies(function: Callable[[Array], Array], x: Array) -> bool:
-    """Return whether a function changes along one direction, which is cheaper than all columns."""
+    """Return whether a function changes along one direction; this costs less than differences of all columns."""
     values = [defined(lambda part=part: function(part * x)) for part in (1.0, 1.001, 2.0, 0.0, 1e3)]  # type: ignore[misc]
     known = [value for value in values if value is not None]
     return any(bool((value != known[0]).any()) for value in known)
@@ -291,9 +291,9 @@ def _wrong_column(
 
 
 def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: SparseRows) -> str | None:
-    """Compare C_q given by entries: columns that share no row are displaced together, each by its own scale.
+    """Compare C_q given by entries, in groups of columns without common rows, which are displaced together.
 
-    A group with a difference is compared column by column, to name the entry. This also finds entries that
+    If a group has a difference, its columns are compared one by one, to name the entry. This also finds entries that
     `jacobian_entries` does not name: they add to another column, or to a row without entries in the group.
     """
     noise = EPS * (abs(jacobian) @ np.abs(q))

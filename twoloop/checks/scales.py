@@ -1,14 +1,14 @@
 """Sizes of a mechanism, coordinate by coordinate, and derivatives by differences with estimates of their errors.
 
-Consistency is judged by the sizes, in any unit and with any offset. The offset of a coordinate is not a size, and
-millimetres and radians have no size in common. But the Jacobian shows which displacements of two coordinates change a
-constraint equally, and how far they must move until it changes itself (a rod's length, a radian).
+Sizes decide which violations of constraints are small, in any unit and with any offset. The offset of a coordinate is
+not a size, and millimetres and radians have no size in common. But the Jacobian shows which displacements of two
+coordinates change a constraint equally, and how far they must move until the Jacobian changes (a rod's length, a
+radian).
 
-To differentiate a function, it is sampled at nine Chebyshev points around a place. If its expansion in Chebyshev
-polynomials decays before it ends, the slope of the interpolant is the derivative, and the last coefficients estimate
-its error: with rounding, a kink, a step, or an oscillation that the points do not resolve, they remain large
-(Trefethen, Approximation Theory and Approximation Practice, 2013). Several widths of the interval are tried, because
-scales are not known beforehand.
+To differentiate a function, it is sampled at nine Chebyshev points around a point. If its Chebyshev coefficients decay,
+the slope of the interpolant is the derivative, and the last coefficients estimate its error. They remain large in the
+presence of rounding, a kink, a step, or an oscillation that the points do not resolve (Trefethen, Approximation Theory
+and Approximation Practice, 2013). Several widths of the interval are tried, because scales are not known beforehand.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from twoloop.kernels.compile.linking import entry_point
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
-# 1/s: largest speed of a drive, in sizes of the mechanism per second; at a faster one C_q must be nearly zero
+# largest speed of a drive, in sizes of the mechanism per second; if it seems faster, C_q is nearly zero
 FASTEST = 1e9
 EPS = float(np.finfo(np.float64).eps)
 DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # displacements in units of the coordinates, for the curvature of the constraints
 ROUNDS = 3  # number of iterations that find units: the first units may be off by 1e5
 MOST_PLACES = 16  # largest number of positions whose sizes are kept
 NONE = np.zeros(0)
-# distance in units: if a row changes by much more than its length over it, the row is short only at this position
+# distance in units over which a row changes by much more than its norm if it is short only at this position
 TURNS = 0.1
 
 
@@ -51,19 +51,19 @@ class Scales:
     reach: Array  # (n_c,), distance in these units over which each constraint keeps its Jacobian
 
     def scaled(self, jacobian: Array) -> Array:
-        """Return C_q in these units with rows of norm 1, or less where a row vanishes at this position."""
+        """Return C_q in these units, with rows of norm 1; rows that vanish at this position have smaller norms."""
         return jacobian * self.columns / self.rows[:, None]
 
     def by_coordinate(self, per_row: Array, jacobian: Array) -> Array:
-        """Return for each coordinate the least value among its constraints, in its unit; of all if it has none."""
+        """Return for each coordinate, in its unit, the smallest value of its constraints, or of all if it has none."""
         values = np.where(jacobian != 0.0, per_row[:, None], np.inf).min(axis=0, initial=np.inf)
         return self.columns * np.where(np.isfinite(values), values, per_row.min(initial=np.inf))
 
     def keep(self, system: ConstrainedSystem, q: Array, jacobian: Array) -> None:
-        """Store the reach of the coordinates at a consistent position, and the position and entries it belongs to.
+        """Store the reach of the coordinates at a consistent position, with the position and the entries of C_q.
 
-        Relative to the reach, rounding is negligible. Checks of later starts near the position use it if C_q has the
-        same entries, and need not compute these scales again; elsewhere the mechanism may be much smaller. The latest
+        Rounding is negligible relative to the reach. Later starts near the position, at which C_q has the same entries,
+        are checked with this reach, without new scales. Elsewhere the mechanism may be much smaller. The last
         MOST_PLACES positions are stored.
         """
         from twoloop.kernels.evaluation.checks import MAX_RELATIVE_DISTANCE, NO_ENTRY
@@ -87,7 +87,7 @@ def sizes(q: Array) -> Array:
 
 
 def typical_sizes(q: Array) -> Array:
-    """Return sizes of the coordinates, (n_q,): at least the median of those not negligible; 1 if all are zero."""
+    """Return sizes of the coordinates (n_q,), at least the median of sizes that are not negligible; 1 if all are 0."""
     from twoloop.kernels.evaluation.checks import NEGLIGIBLE
 
     size = np.abs(q)
@@ -108,7 +108,7 @@ def median(values: Array) -> float:
 
 
 def column_scales(jacobian: Rows, typical: Array) -> Array:
-    """Return units of the coordinates in which entries of C_q are of similar size; zero columns get typical ones."""
+    """Return units of the coordinates in which entries of C_q are of similar size; `typical` units for zero columns."""
     from twoloop.kernels.evaluation.checks import column_units
 
     if isinstance(jacobian, SparseRows):
@@ -139,7 +139,7 @@ def _sparse_column_scales(jacobian: SparseRows, typical: Array) -> Array:
 
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:
-    """Return the scales at a position, from C_q there and nearby; from C_q and A, if `jacobian` has both."""
+    """Return the scales at a position, from C_q (and A, if `jacobian` has both) at this position and nearby."""
     from twoloop.kernels.evaluation.checks import NEGLIGIBLE, linear_ranges
 
     size, columns = np.abs(q), units(system, t, q, jacobian, typical_sizes(q))
@@ -156,9 +156,9 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
 
 
 def units(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, typical: Array) -> Array:
-    """Return units of the coordinates in which entries of C_q (and A) are of similar size, here or a unit away.
+    """Return units of the coordinates in which entries of C_q (and A) are of similar size, at q or one unit away.
 
-    An entry that is small only at this position, as of a bar that is almost upright, does not determine units.
+    An entry that is small only at q, for example because a bar is almost upright, does not determine units.
     """
     columns, shifts = column_scales(jacobian, typical), np.outer([1.0, -1.0], generic_factors(len(q)))
     for _ in range(ROUNDS):  # a fixed number, so that rounding does not change the number of rounds
@@ -169,7 +169,7 @@ def units(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, typical
 
 
 def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> Rows:
-    """Return the largest magnitude of each entry, here and at other places; places outside the domain do not count."""
+    """Return the largest magnitude of each entry at one position (`here`) and at `places` within the domain."""
     if not isinstance(here, SparseRows):
         beside = rows_at(system, t, places)[0][:, : len(here)]
         return np.maximum(abs(here), abs(np.where(np.isfinite(beside), beside, 0.0)).max(axis=0))
@@ -185,7 +185,7 @@ def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> 
 
 
 def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return C_q and A at positions, (n, n_c + n_a, n_q), and at which of these no callback raised, (n,)."""
+    """Return C_q and A at positions, (n, n_c + n_a, n_q), and a mask (n,) of positions at which no callback raised."""
     from twoloop.kernels.evaluation import checks as start_checks
 
     check_callback(system, "jacobian", t, [places[0]])
@@ -227,7 +227,7 @@ def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_
 
 
 def generic_velocities(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, rate: Array) -> list[Array]:
-    """Return velocities in which no coordinate is negligible; last, if C_t is not zero, some as fast as the drive."""
+    """Return velocities in which no coordinate is negligible; if C_t is not zero, the last are as fast as the drive."""
     size = sizes(q)
     v = units(system, t, q, jacobian, size) * generic_factors(len(q))
     v = v / median(np.abs(v) / size)
@@ -243,7 +243,7 @@ Function = Callable[[float], Array]
 DEGREE = 8
 TAIL = 5  # index of the first coefficient that must have decayed
 NODES = np.cos(np.pi * np.arange(DEGREE + 1) / DEGREE)
-SLOPES: dict[int, Array] = {  # slopes of the polynomials at the place, by the side on which the interval lies
+SLOPES: dict[int, Array] = {  # slopes of the polynomials at the point, by the side on which the interval lies
     side: np.asarray(chebyshev.chebval(-float(side), chebyshev.chebder(np.eye(DEGREE + 1)))) for side in (0, 1, -1)
 }
 FIRST = 2.0**-5  # first half-width, relative to the scale
@@ -253,19 +253,19 @@ N_SMALLER, N_LARGER = 11, 8  # numbers of smaller and larger half-widths that ar
 CONFIRM_RATIO, N_WIDER, N_NARROWER = 4.0, 8, 24
 BESIDE = (0.55, 1.8, 3.1)  # half-widths that confirm an estimate first, relative to its own
 RIPPLES = 3  # number of narrower intervals after which a smooth function shows only rounding
-LEAST_SPACINGS = 256.0  # smallest half-width, in spacings of floating-point numbers at the place
-# relative to an entry: at this agreement, error of the difference included, no other half-width is tried
+LEAST_SPACINGS = 256.0  # smallest half-width, in spacings of floating-point numbers at the point
+# difference, relative to an entry and including its estimated error, below which no other half-width is tried
 SETTLED = 2e-7
-AGREEMENT = 3e-7  # relative to an entry: a smaller difference is not an error
+AGREEMENT = 3e-7  # difference, relative to an entry, below which the entry is not wrong
 DECAYED = 0.01  # largest ratio of the last coefficients to the first, for a function that the points resolve
-# largest ratio of the last two coefficients to those before, unless all are rounding: a larger one shows a ripple
+# ratio of the last two coefficients to those before, if not all are rounding, above which the function has a ripple
 RIPPLE = 0.2
-CONSTANT = 100.0  # in rounding errors: a function that varies by less counts as constant
-SAFETY = 5.0  # factor on the estimated error of the difference that gives the allowed difference
-# in rounding errors of the result: terms inside a function may be larger than its result, but hardly by more than this
+CONSTANT = 100.0  # variation of a function, in rounding errors, below which it counts as constant
+SAFETY = 5.0  # ratio of the allowed difference to the estimated error of the difference
+# largest ratio, in rounding errors of the result, by which terms within a function may exceed its result
 FROZEN = 1e4
-FLAT = 3  # number of intervals of different widths on which a constant function must be constant for the derivative 0
-TINY = 1e-12  # relative to the largest entry: a smaller entry counts as zero
+FLAT = 3  # number of intervals of different widths on which a function must be constant for the derivative 0
+TINY = 1e-12  # magnitude, relative to the largest entry, below which an entry counts as zero
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ class _Window:
 
 
 def _window(function: Function, place: float, width: float, side: int, noise: Array) -> _Window | None:
-    """Compute slopes on an interval around the place (side 0), after it (1) or before it (-1); None: undefined."""
+    """Compute slopes on an interval around a point (side 0), after it (1) or before it (-1); None: undefined."""
     shifts = width * (NODES + side) / (2.0 if side else 1.0)
     shifts = (place + shifts) - place  # shifts as rounded by floating-point addition to the place
     try:
@@ -351,16 +351,16 @@ def differentiate(
     sides: tuple[int, ...] = (0,),
     max_widths: int = N_SMALLER + N_LARGER + 1,
 ) -> Estimate:
-    """Differentiate at a place until each entry is accurate enough to judge the given one.
+    """Differentiate a function at a point until each entry is accurate enough to judge the given entry.
 
     Each entry gets the estimate of the half-width with the smallest estimated error; at most `max_widths` are tried.
-    The function is evaluated at place + shift; an exception or a value that is not finite means undefined there.
+    Where the function raises an exception, or its value is not finite, it counts as undefined.
 
     - `scale`: a first guess of the distance over which the function changes
     - `noise`: effect of rounding of the arguments on the function
-    - `given`, `largest`: the given entries to check, and the largest entry beside each
-    - `spacing`: smallest displacement that rounding does not hide, if larger than the spacing of numbers at the place
-    - `sides`: 0 around the place, 1 after it, -1 before it; the next is tried if the function is undefined on this one
+    - `given`, `largest`: the given entries to check, and for each the largest of the entries to which it is compared
+    - `spacing`: smallest displacement that rounding does not hide, if larger than the spacing of numbers at the point
+    - `sides`: 0 around the point, 1 after it, -1 before it, in the order in which they are tried until one is defined
     """
     m = len(given)
     for side in sides:
@@ -408,10 +408,10 @@ def _settled(best: Estimate, given: Array, largest: Array) -> NDArray[np.bool_]:
 def confirms(
     function: Function, place: float, entry: int, best: Estimate, given: float, noise: Array, spacing: float = 0.0
 ) -> bool:
-    """Return whether other intervals, wider and narrower, also find that this entry differs from the given one.
+    """Return whether other intervals, wider and narrower, also show that an entry differs from the given one.
 
-    One disagreement may be an accident, and a function with a small fast part (a fine ripple on a long slope) shows it
-    on narrow intervals only. If an interval finds another derivative, the entry counts as correct.
+    One disagreement may be an accident, and a small fast part of a function (a fine ripple on a long slope) appears on
+    narrow intervals only. If an interval gives another derivative, the entry counts as correct.
     """
     width = float(best.width[entry])
     for part in BESIDE:
@@ -439,7 +439,7 @@ def confirms(
 
 
 def defined(function: Callable[[], Array]) -> Array | None:
-    """Return the value of a callback away from the state; None outside its domain (it raises or is not finite)."""
+    """Return the value of a callback at a displaced state; None if it raises or is not finite, outside its domain."""
     try:
         value = function()
     except Exception:
@@ -448,7 +448,7 @@ def defined(function: Callable[[], Array]) -> Array | None:
 
 
 def format_difference(first: float, second: float) -> tuple[str, str]:
-    """Format two numbers to the third digit of their difference; further digits are rounding, or irrelevant."""
+    """Format two numbers up to the third digit of their difference; further digits are rounding, or irrelevant."""
     if not 0.0 < abs(first - second) < np.inf:
         return f"{first:.3g}", f"{second:.3g}"
     places = 2 - math.floor(math.log10(abs(first - second)))

@@ -19,7 +19,7 @@ class SparseRows:
         self.values = self.added(values)
 
     def added(self, values: Array) -> Array:
-        """Reorder values from the constructor's order to that of the entries, adding values of the same entry."""
+        """Return values, given in the constructor's order, in the order of entries; add up the values of an entry."""
         return np.bincount(self.place_of, values, len(self.rows)).astype(np.float64)
 
     @property

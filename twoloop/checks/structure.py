@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-RANK_TOLERANCE = 1e-11  # relative to the largest diagonal entry of R: smaller pivots are zero
+RANK_TOLERANCE = 1e-11  # pivot, relative to the largest diagonal entry of R, below which it counts as zero
 SHOWN = 5  # largest number of dependent rows whose equations are written out
 # largest number of other rows that a message names with coefficients, and largest number that it names at all
 MOST_TERMS, MOST_NAMED = 3, 8
-WEAK = 1e-9  # relative to the largest singular value: above it, a direction certainly belongs to the pseudo-inverse
-NO_DIRECTION = 1e-12  # relative to a row: a smaller remainder, after its dependent components are subtracted, is zero
+WEAK = 1e-9  # singular value, relative to the largest, above which a direction certainly is in the pseudo-inverse
+NO_DIRECTION = 1e-12  # remainder of a row, relative to the row, without its dependent components, that counts as zero
 
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
@@ -62,7 +62,7 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
-    """Describe which rows depend on which others, with coefficients only if they are few: many vary between starts."""
+    """Describe which rows depend on which others; few coefficients are listed, because many vary between starts."""
     from twoloop.kernels.linalg.rank import express_other_rows
 
     (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
@@ -96,7 +96,7 @@ def equations_in_words(redundant: list[int], others: list[int], shares: Array, l
 
 
 NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # displacements, relative to the coordinates, at which the pattern of C_q is sampled
-SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+SINGULAR_MASS = 1e-12  # ratio of the smallest eigenvalue to the largest entry below which M may have no inverse
 
 
 def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
@@ -133,7 +133,7 @@ def is_definite(mass: Array) -> bool:
 
 
 def place_of_mass(system: ConstrainedSystem, t: float, q: Array) -> Any:
-    """Return the key of a mass matrix: the position on which it depends, or None if it is constant."""
+    """Return the key of a mass matrix in a cache: the position on which it depends, or None if it is constant."""
     return None if system.constant_mass else (t, q.tobytes())
 
 
@@ -179,8 +179,8 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
     )
 
 
-NEAR = 1e-3  # displacement relative to the coordinates: a little off the start, where no symmetry hides terms
-# allowed difference of C between two callbacks, in addition to SAME, in rounding errors of its terms
+NEAR = 1e-3  # displacement from the start, relative to the coordinates, at which no symmetry hides terms
+# allowed difference of C between two callbacks, in rounding errors of its terms, in addition to SAME
 ROUNDED = 100.0
 MAX_ENTRIES = 1_000_000  # largest number of entries of Jacobians that are evaluated together
 ROUNDING = 1e-12  # rounding error of a difference, relative to the largest entry over the displacement
@@ -189,9 +189,9 @@ ROUNDING = 1e-12  # rounding error of a difference, relative to the largest entr
 def run_inconsistency(
     system: ConstrainedSystem, states: Sequence[tuple[float, Array, Array]], t0: float, q0: Array
 ) -> tuple[float, str] | None:
-    """Describe what is wrong in M, `kinematics` or values at states of a run from (t0, q0), and when; None: nothing.
+    """Describe, with its time, an error in M, `kinematics` or values of entries at states of a run; None: no error.
 
-    Mostly all values are equal to the bit, which is fast to check.
+    The run begins at (t0, q0). Most values are equal bit for bit, which is fast to check.
     """
     before = _mass_at(system, t0, q0).tobytes() if system.constant_mass else b""
     kit = system.kit if "kinematics" in system.given else None
@@ -212,7 +212,7 @@ def run_inconsistency(
 
 
 def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Describe where the fused callback differs from the separate ones, which other checks compare with differences."""
+    """Describe where `kinematics` differs from the separate callbacks, which other checks compare with differences."""
     if "kinematics" not in system.given:
         return None
     _, rate, rows = _compared(system, system.kit, t, q, 0.0 * q)
@@ -254,7 +254,7 @@ def _compared(system: ConstrainedSystem, kit: Kit, t: float, q: Array, v: Array)
 
 
 def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: Array) -> str | None:
-    """Describe a change of M between two positions if constant_mass is set; None: it does not change."""
+    """Describe a change of M between two positions although constant_mass is set; None: M does not change."""
     there, before = defined(lambda: _mass_at(system, t, q)), _mass_at(system, t0, q0)
     if there is None or there.tobytes() == before.tobytes():
         return None

@@ -1,1 +1,1 @@
-"""Many runs of one system: one setup used again and again, or thousands at once with parameters and starts of each."""
+"""Many runs of one system: one after another with one setup, or thousands at once with their own parameters."""

@@ -127,7 +127,7 @@ class LaneEnsemble:
         self.method_of = np.full(n_runs, -1, dtype=np.int8)  # index in `methods` for each run in lanes; -1: none
         self.reasons: dict[int, str] = {}  # why runs were left to `solve_dae`, by their numbers
         self.messages: dict[int, str] = {}  # messages of the runs that failed, by their numbers
-        self.refusal = ""  # why no run was integrated in lanes, or none by the first method
+        self.refusal = ""  # why no run was integrated in lanes, or why the first method integrated none
         self.deadline = np.inf  # time of `time.monotonic` at which runs stop; compilation delays it
 
     @property
@@ -186,7 +186,7 @@ class LaneEnsemble:
         return result
 
     def _integrate(self, lanes: LaneRuns, numbers: Integers, first: Result, threads: int) -> None:
-        """Integrate these runs in lanes; raise Untraceable if the first does not end where `first` does."""
+        """Integrate the runs `numbers` in lanes; raise Untraceable if run 0 does not end where `first` does."""
         starts, t1, times, rtol, atol = self.starts, self.t1, self.times, self.rtol, self.atol
         for run in numbers[is_inconsistent(lanes.kit, starts)[numbers]].tolist():
             _check_start(self.system, starts, run)
@@ -236,7 +236,7 @@ def with_run_number(run: int, error: ValueError) -> ValueError:
 MAX_LISTED = 5  # largest number of runs that a message names
 FIRST_RUN_REASON = "the first, which checks the system"  # reason for which the first run is not in lanes
 N_ROUNDS = 3  # number of attempts for a run that is integrated singly, with increasing time limits
-# smallest time limit of a single run: share of the remaining time, or multiple of the longest single run so far
+# smallest time limit of a single run, as a share of the remaining time, or a multiple of the longest single run so far
 MAX_SHARE, MAX_MULTIPLE = 0.1, 3.0
 MAX_FIRST_SHARE = 0.5  # largest share of the time limit that the first run takes
 TIME_LIMIT_MESSAGE = (

@@ -103,9 +103,9 @@ def _have_short_changes(values: Array, rtol: float) -> NDArray[np.bool_]:
     return np.asarray(is_short | ~is_finite)
 
 
-# number of operations of a series per coordinate (measured at 2, 11 and 13), and tolerance, from which on "auto" takes
-# DOP853 first. No method is faster on all mechanisms: at an error of 1e-6, DOP853 takes 1.7 times as long as series on
-# four-bars, and series take over twice as long as DOP853 on the spatial slider-crank
+# smallest number of operations of a series per coordinate (measured at 2, 11 and 13), and smallest tolerance, at which
+# "auto" takes DOP853 first. No method is faster on all mechanisms: at an error of 1e-6, DOP853 takes 1.7 times as long
+# as series on four-bars, and series take over twice as long as DOP853 on the spatial slider-crank
 COSTLY_SERIES, SMALLEST_FOR_DOP853 = 6.0, 1e-9
 N_STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # number of stages of the implicit methods
 IN_LANES = ("auto", "Taylor", "DOP853", *N_STAGES)  # presets that can run in lanes
@@ -130,8 +130,8 @@ class LaneMethod:
 def is_series_costly(system: ConstrainedSystem) -> bool:
     """Return whether a Taylor series takes so many operations that the stages of DOP853 cost less.
 
-    Return False if a force may be steep: DOP853 would then need short steps, while series only check the defect more
-    often.
+    Return False if a force may be steep, because DOP853 would then need short steps, while series only check the defect
+    more often.
     """
     if may_be_steep(system, force_was_traced=True):
         return False
@@ -196,7 +196,8 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
     """Return the numbers that a step kernel reads: step-size control, then the options of the plan."""
     plan = method.plan(n, rtol, atol, False)
-    return np.concatenate([plan.rule, [plan.rough, cached_run().FIRST_STEP, least_tolerance(rtol, atol)], plan.options])
+    tolerance, first_step = least_tolerance(rtol, atol), cached_run().FIRST_STEP
+    return np.concatenate([plan.rule, [plan.jump_ratio, first_step, tolerance], plan.options])
 
 
 Integers = NDArray[np.int64]
@@ -209,7 +210,7 @@ MIN_BLOCK_RUNS, MAX_BLOCK_RUNS = 128, 4096
 BLOCKS_PER_THREAD = 3  # number of blocks of runs per thread; with 3, all threads end at about the same time
 # statuses of runs besides those in layout.py: SHORT_FORCE, a short force was found; OUT_OF_TIME, the time
 # limit ended before the run
-SHORT_FORCE = min(layout.NO_START, layout.UNLIKE) - 1
+SHORT_FORCE = min(layout.NO_START, layout.CALLBACKS_DIFFER) - 1
 OUT_OF_TIME = SHORT_FORCE - 1
 STOP_INTERVAL = 0.01  # time, s, between calls of `stop`, which are repeated as more runs may have begun
 MAX_RESIDUAL = 1e-7  # largest residual of the equations at the end of a valid run, relative to their terms
@@ -218,9 +219,9 @@ REASONS = {  # reasons for which a run is left to `solve_dae`, by its status in 
     layout.NO_START: "the code made for the first run does not hold at the start",
     layout.NO_STATE: "a state at t_eval could not be put on the constraints",
     layout.NO_VALUES: "the equations have no values in a step (constraints lose rank, a root of a negative number)",
-    layout.OFTEN_REFUSED: "steps are refused again and again (a sudden force, stiff motion, a singular position)",
+    layout.MANY_REJECTIONS: "steps are refused again and again (a sudden force, stiff motion, a singular position)",
     layout.MANY_STEPS: "it takes more than 100,000 steps in lanes (stiff, or very fast motion)",
-    layout.UNLIKE: "the callbacks do not agree with the code at the end (they branch)",
+    layout.CALLBACKS_DIFFER: "the callbacks do not agree with the code at the end (they branch)",
     OUT_OF_TIME: "the time limit ended before the run did, in lanes",
     SHORT_FORCE: "forces or drives change for so short a time that lanes may miss others",
 }
@@ -267,7 +268,7 @@ class LaneRuns:
 
         States at `times` are written to `out_q` and `out_v`. Runs stop at the deadline, a time of `time.monotonic`.
         """
-        from twoloop.kernels.lanes.control import MOST_STEPS
+        from twoloop.kernels.lanes.control import MAX_STEPS
 
         n_runs = len(numbers)
         status, n_steps, n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
@@ -280,8 +281,8 @@ class LaneRuns:
             self._integrate_block(numbers[rows], t1, times, rtol, atol, out, counts)
 
         def stop() -> None:
-            """End the runs in all threads, as if they had taken MOST_STEPS steps."""
-            n_steps[status == layout.UNDECIDED] = MOST_STEPS
+            """End the runs in all threads, as if they had taken MAX_STEPS steps."""
+            n_steps[status == layout.UNDECIDED] = MAX_STEPS
 
         if not run_in_blocks(integrate_block, n_runs, threads, deadline, stop):
             status[(status == layout.MANY_STEPS) | (status == layout.UNDECIDED)] = OUT_OF_TIME
@@ -347,7 +348,7 @@ class LaneRuns:
         is_valid = has_ended & is_finite
         status[has_ended & ~is_finite] = layout.NO_STATE
         is_satisfied = self.satisfies_equations(numbers, is_valid, t1, atol, q, v, ends)
-        status[is_valid & ~is_satisfied] = layout.UNLIKE
+        status[is_valid & ~is_satisfied] = layout.CALLBACKS_DIFFER
         is_valid &= is_satisfied
         if self.sampling is not None:
             times, runs = np.linspace(self.starts.t0, t1, N_SHORT + 1), np.flatnonzero(is_valid)

@@ -81,7 +81,7 @@ def writable_kit(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
 
 
 def is_inconsistent(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bool_]:
-    """Return a mask of the starts whose C or C_q v + C_t is larger than rounding of its terms explains."""
+    """Return a mask of the starts whose C or C_q v + C_t is larger than the rounding of its terms."""
     from twoloop.kernels.lanes.starts import constraint_residuals
 
     functions, sizes = kit

@@ -134,10 +134,10 @@ KAPPA = 0.02  # iteration error, in tolerances, at which the sweeps end: then to
 TARGET_SWEEPS = 6.0  # number of sweeps for which the step size is chosen; larger with predictions of degree 6 and more
 EXTRA_SWEEPS = 7  # number of sweeps beyond the target at which a step that has not converged is rejected
 MAX_CONTRACTION = 0.8  # a step is rejected in its fourth sweep or later if the contraction is at least this
-MIN_RHO, MAX_RHO = 1e-3, 0.9  # lower and upper bound that replace a measured contraction outside of them
+MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
 # smallest and largest contraction with which the guessed size of the first step is accepted
 FAST_START, SLOW_START = 0.04, 0.3
-# if the contraction is at least this, changes below MAX_ROUNDING, relative to the values, are rounding errors
+# contraction from which on changes below MAX_ROUNDING, relative to the values, count as rounding errors
 STAGNATION_RATIO = 0.5
 # values that replace KAPPA, MAX_ROUNDING and the limit of sweeps in steps of fixed size
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
@@ -241,19 +241,19 @@ class CollocationCode:
         def fallback() -> Value:
             if not self.has_reduced:
                 return constant(DOUBLE, float(mem.NOT_COMPUTED))
-            num.store(constant(DOUBLE, STEPS_BY_MASS_FIRST), work, mem.CAREFUL)
+            num.store(constant(DOUBLE, STEPS_BY_MASS_FIRST), work, mem.N_MASS_FIRST)
             return iterate_mass_first()
 
         if self.has_reduced:
-            n_careful = num.load(work, mem.CAREFUL)
+            n_careful = num.load(work, mem.N_MASS_FIRST)
             with self._returning_if(emit, builder.compare("fcmp ogt", n_careful, llvm_code.ZERO)):
-                num.store(num.subtract(n_careful, llvm_code.ONE), work, mem.CAREFUL)
+                num.store(num.subtract(n_careful, llvm_code.ONE), work, mem.N_MASS_FIRST)
                 builder.ret(iterate_mass_first())
         self._call(emit, "begin_nodes", self._predict_nodes, [work, state, tolerances])
         return self._iterate(emit, work, state, tolerances, evaluate, fallback)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of the function that iterates with the elimination of M first; write it if it is missing."""
+        """Return the name of the function whose elimination begins with M, and write this function if it is missing."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -453,9 +453,9 @@ class CollocationCode:
         all_valid = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [store_others()])
         with self._returning_if(emit, builder.operation("xor", all_valid, Value(BIT, "true"))):
             builder.ret(fallback())
-        for value, place in ((sweep, mem.SWEEPS), (change, mem.CHANGE), (target, mem.TARGETED), (rho_now, mem.RHO)):
+        for value, place in ((sweep, mem.SWEEPS), (change, mem.CHANGE), (target, mem.N_TARGET), (rho_now, mem.RHO)):
             num.store(value, work, place)
-        code = builder.select(has_converged, number(mem.CONVERGED), number(mem.REFUSED))
+        code = builder.select(has_converged, number(mem.CONVERGED), number(mem.REJECTED))
         code = builder.select(was_guessed, number(mem.GUESSED), code)
         with builder.if_then(
             builder.bitwise_and(builder.compare("fcmp oeq", code, number(mem.CONVERGED)), has_estimate)
@@ -464,7 +464,7 @@ class CollocationCode:
         return code
 
     def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Store ERROR and CURVED, and the ratios FACTOR and FACTOR_OF_ERROR of the next step size to this one.
+        """Store ERROR and CURVATURE, and the ratios FACTOR and FACTOR_OF_ERROR of the next step size to this one.
 
         The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the larger
         coefficient of degrees 7 and 8, s the larger one of degrees 5 and 6, f the largest one from degree 3 on. The
@@ -473,7 +473,7 @@ class CollocationCode:
         because the estimate is of order 12.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
-        n_sweeps, change, target, rho = (num.load(work, i) for i in (mem.SWEEPS, mem.CHANGE, mem.TARGETED, mem.RHO))
+        n_sweeps, change, target, rho = (num.load(work, i) for i in (mem.SWEEPS, mem.CHANGE, mem.N_TARGET, mem.RHO))
         vec2 = LaneEmitter(builder, 2)
         error_to_kappa = num.divide(num.multiply(rho, change), constant(DOUBLE, KAPPA))
         error_to_kappa = num.add(error_to_kappa, constant(DOUBLE, SMALLEST_RATIO))
@@ -501,7 +501,7 @@ class CollocationCode:
         h = num.load(work, mem.H)
         error = num.multiply(num.multiply(wide.max_over_lanes(error), h), constant(DOUBLE, ERROR_WEIGHT))
         num.store(error, work, mem.ERROR)
-        num.store(num.multiply(wide.max_over_lanes(curved), h), work, mem.CURVED)
+        num.store(num.multiply(wide.max_over_lanes(curved), h), work, mem.CURVATURE)
         log_error = num.multiply(
             builder.extract(vec2.logarithm(vec2.broadcast(error)), 0), constant(DOUBLE, 1.0 / mem.ORDER)
         )
@@ -627,14 +627,14 @@ class CollocationCode:
         num.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, mem.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project positions at the ends of eight steps in place; store FINE (success) and MOVED (largest changes)."""
+        """Project positions at the ends of eight steps in place; store VALID (success) and MOVED (largest changes)."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:
             self._project_in_parts(emit, work, numbers, self.split_functions.project_position, ("moved", "q"))
 
     def project_states(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project the states at the ends of eight steps in place; store accelerations, multipliers, FINE and MOVED."""
+        """Project the states at the ends of eight steps in place; store accelerations, multipliers, VALID and MOVED."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.projection)
         else:
@@ -676,8 +676,8 @@ class CollocationCode:
         for value in values:
             largest = emit.maximum(emit.function("fabs", value), largest)
         store_lanes(emit, largest, work, mem.MOVED)
-        before = load_lanes(emit, work, mem.FINE)
-        store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.FINE)
+        before = load_lanes(emit, work, mem.VALID)
+        store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
         """Store positions and velocities at the nodes; return the largest change of a velocity since the last sweep."""

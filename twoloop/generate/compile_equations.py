@@ -36,9 +36,9 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# largest relative error of accelerations at a start with which generated code is used: it grew up to 200 times in runs
+# largest relative error of accelerations at a start with which generated code is used: in runs it grew up to 200 times
 LARGEST_LOSS = 1e-8
-# this error is measured at the first of so many positions, at this distance of one another, with large enough pivots
+# number of positions, and their distance, at which this error is tried to be measured until pivots are large enough
 MAX_POSITIONS, DISTANCE = 4, 0.02
 
 
@@ -106,8 +106,8 @@ def _accelerations(
 ) -> tuple[list[Value], Value]:
     """Write code for the accelerations; return their values, and a flag: whether they are valid.
 
-    `state` returns t and pointers to q and v, the arguments of the function that is called if pivots are small: its
-    elimination begins with M. `state` may write code.
+    If pivots are small, the code calls a function whose elimination begins with M. `state`, which may write code,
+    returns the arguments of this function: t and pointers to q and v.
     """
     program, *alternatives = equations.accelerations
     (a,) = program.run(lowering)
@@ -171,8 +171,8 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# equations with more operations than this are split into functions, which halves the time to compile. SPLIT_ALL applies
-# if there is no reduced program for the accelerations: they are then split, too, and take 50 % longer to run
+# number of operations above which equations are split into functions, which halves the time to compile. SPLIT_ALL: the
+# number if there is no reduced program for the accelerations, which are then split, too, and run 50 % longer
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
@@ -480,7 +480,8 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
     """Return the largest relative error of the accelerations of generated code, at rest at a start or near it.
 
-    They are computed with a projection and alone, which may take different pivots. Infinite: pivots are too small.
+    Two functions compute them, with and without a projection, because their pivots may differ. The error is infinite if
+    pivots are too small at all positions.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)
@@ -509,7 +510,7 @@ def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) 
 
 
 def _call(address: int, t: float, *arrays: Array) -> bool:
-    """Call a generated function of the time and of arrays."""
+    """Call the generated function at `address` with the time and arrays; return its result."""
     function = ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_double, *[ctypes.c_void_p] * len(arrays))(address)
     return bool(function(t, *(x.ctypes.data for x in arrays)))
 

@@ -27,8 +27,7 @@ DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": 
 class DerivedPrograms:
     """Programs that replace missing callbacks, shared by the systems of a trace cache.
 
-    programs : by kind of callback: the program, and the flat indices, in the callback's array, of the results of the
-        program.
+    programs : for each kind of callback, a program and the flat indices of its results in the callback's array.
     traced : the traces from which the programs were derived.
     """
 
@@ -136,7 +135,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
 def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Return whether callbacks for C_q, C_t and Gamma agree with the exact derivatives at states near a start.
 
-    Raises ValueError if there is no callback for C_t, although C depends on time by its trace (but not near the start).
+    Raises ValueError if C depends on time, at least far from the start, but there is no callback for C_t.
     """
     direction = generic_factors(len(q)) * sizes(q)
     states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * direction) for displacement in DISPLACEMENTS]

@@ -45,7 +45,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # rows of G are added to M if the ratio of the smallest to the largest eigenvalue of M is smaller
+SINGULAR_MASS = 1e-10  # ratio of the smallest to the largest eigenvalue of M below which rows of G are added to M
 RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
 PIVOT_FRACTION = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
 # possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to its pivot without
@@ -55,16 +55,16 @@ MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
 # none, MIN_PIVOTS[-1] is chosen
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 N_FEW_COORDINATES = 24  # largest number of coordinates for which MIN_INDEX_FEW, not MIN_INDEX_MANY, applies
-# smallest index in MIN_PIVOTS, i.e. largest pivots, at which all rows of G may be added to M:
-# MIN_INDEX_FEW (pivots below 1e-3) with up to N_FEW_COORDINATES coordinates; MIN_INDEX_FEW_SINGULAR if M is singular as
-# well (Euler parameters lose two digits in sound models); MIN_INDEX_MANY with more coordinates: the code gets longer
+# smallest index in MIN_PIVOTS, that is, largest pivots, at which all rows of G may be added to M. MIN_INDEX_FEW: with
+# up to N_FEW_COORDINATES coordinates. MIN_INDEX_FEW_SINGULAR: if M is singular as well, because Euler parameters lose
+# two digits even in sound models. MIN_INDEX_MANY: with more coordinates, because the code gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
-SCALE_STEP = 1024.0  # the scale of an added row is decreased by powers of this: other starts rarely need another one
-DISPLACEMENT = 0.2  # of coordinates, m or rad: far enough from positions where entries happen to vanish
+SCALE_STEP = 1024.0  # scales of added rows differ by powers of this factor, which rarely change from start to start
+DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
 MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number
-# dependent coordinates are eliminated if G has at least this number of rows per coordinate; with fewer rows, the linear
-# system for the multipliers is smaller than this
+# smallest number of rows of G per coordinate with which dependent coordinates are eliminated; with fewer rows, the
+# linear system for the multipliers is the smaller one
 MIN_ROW_RATIO = 2.0 / 3.0
 
 PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -99,7 +99,7 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # larger pivots need no test: with them, random models kept 10 digits; added rows have set `is_refined` already
+        # no test with larger pivots, as random models then kept 10 digits, or with added rows, which set `is_refined`
         is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or len(set(choice.scales)) > 1
         if choice.rows and is_uncertain and choice.is_refined is None:
             choice = replace(choice, is_refined=loses_digits(mass, G, choice))
@@ -211,11 +211,10 @@ class PivotChooser:
     def _with_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
         """Return the choice for M + s G^T G if its smallest pivot is much larger than for M, else `choice`.
 
-        G: here the independent rows. Some bodies have little inertia about their joints, such as a rod with a mass
-        in its middle.
-        Then the rows are nearly dependent in the metric of M: if the smallest pivot is 10^-k, accelerations
-        lose up to 2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times
-        as large as M, k digits are lost, which refinement restores. `index`: index in MIN_PIVOTS of the choice for M.
+        G: the independent rows. `index`: index in MIN_PIVOTS of the choice for M. If a body has little inertia about
+        its joints, such as a rod with a mass in its middle, the rows are nearly dependent in the metric of M, and a
+        smallest pivot of 10^-k costs up to 2 k digits of accelerations. In the metric of M + s G^T G the rows are not
+        nearly dependent. If s G^T G is 10^k times as large as M, k digits are lost, and refinement restores them.
         """
         rows = G[list(choice.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
@@ -255,9 +254,9 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     """Return the factor by which to multiply the scale of each row of G that is added to M.
 
-    The factor is a negative power of SCALE_STEP if the row has entries only in columns in which the rows `singular`
-    have some, and M is small there; else 1. A row on Euler parameters alone, such as their norm, would otherwise hide
-    little inertia beside heavy bodies.
+    The factor is 1 unless M is small in all columns of the row, and the rows `singular` have entries in all of them;
+    then it is a negative power of SCALE_STEP. Otherwise a row on Euler parameters alone, such as their norm, would
+    hide the little inertia of a body beside heavy bodies.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0
@@ -265,14 +264,14 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # of one step and a quarter: parts of one mechanism that differ by less keep their digits
+    # add 0.25: a mechanism whose parts differ by less than one step and a quarter keeps its digits without a factor
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
 
 MAX_OPERATIONS = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
-# largest cost of `reduced_program`, relative to `mass_first_program`, at which it is used: both are compiled, as the
-# latter is needed where pivots become small. A reduced program of relative cost 0.68 (four-bar) saves 5 % of a run
+# largest cost of `reduced_program`, relative to `mass_first_program`, at which the reduced program is compiled, too:
+# where pivots become small, only the other is valid. At a relative cost of 0.68 (four-bar) it saves 5 % of a run
 MAX_COST_RATIO = 0.75
 
 
@@ -515,7 +514,7 @@ def multipliers_of_least_norm(
 
 
 class Solution:
-    """Programs that solve M a + G^T lam = r, G a = c in two steps: factors, stored in an array, and solution with them.
+    """Programs that solve M a + G^T lam = r, G a = c in two steps: first the factors, then the solution with them.
 
     other_programs : other programs at the same state; quantities that they share with the factors are stored, too.
 

@@ -28,7 +28,7 @@ MAX_TRACED_OPERATIONS = 20_000
 # might underflow or overflow. They stay in if their product is not between MIN_FACTOR and 1 / MIN_FACTOR in magnitude,
 # and in the squares from which a power with an exponent above HIGH_EXPONENT is computed.
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
-# reason, for messages, why a callback is refused that compares an expression, or converts one to a number
+# reason given in messages when a callback is refused because it compares an expression or converts it to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
 
 # functions of `math` that also accept Parameters

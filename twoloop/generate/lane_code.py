@@ -49,7 +49,9 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-TARGET_ERROR = 0.3  # value of OFF for which the next step size is chosen after a step was rejected because OFF > 1
+TARGET_ERROR = (
+    0.3  # value of DEPARTURE for which the next step size is chosen after a step was rejected because DEPARTURE > 1
+)
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
 MAX_REJECTIONS = 10  # largest number of successive rejected steps; after more, the run leaves its lane
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
@@ -85,7 +87,7 @@ class LaneSteps:
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
         """Store and return UNIT, the unit of time of the series, s; a new one in new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
-        is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
+        is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
         next_unit = emit.minimum(
             emit.multiply(emit.load(work, lanes.LENGTH), unit),
@@ -98,8 +100,8 @@ class LaneSteps:
             emit.store(select(is_fresh, emit.constant(value), emit.load(work, field)), work, field)
         return unit
 
-    def lengths(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store the step sizes H and X, computed from the last two terms of the series, and update RUNNING and FINE."""
+    def choose_sizes(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Store the step sizes H and X, computed from the last two terms of the series; update RUNNING and ACTIVE."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, norms = emit.constant(1.0), []
@@ -129,15 +131,15 @@ class LaneSteps:
         h = builder.select(builder.compare("fcmp oge", h, time_left), time_left, h)
         largest = emit.maximum(emit.function("fabs", t), emit.function("fabs", t1))
         is_continued = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
-        for field in (lanes.RUNNING, lanes.FINE):
+        for field in (lanes.RUNNING, lanes.ACTIVE):
             is_continued = builder.bitwise_and(is_continued, is_set(emit, work, field))
         h = builder.select(is_continued, h, zero)
         emit.store(h, work, lanes.H)
         emit.store(emit.divide(h, unit), work, lanes.X)
-        for field in (lanes.RUNNING, lanes.FINE):
+        for field in (lanes.RUNNING, lanes.ACTIVE):
             store_mask(emit, work, field, is_continued)
 
-    def evaluate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+    def evaluate_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Evaluate the series at X units of time; store NEW, `series_a`, and the positions once more as `predicted`."""
         memory = self.memory(emit, order, control, work)
         for j, q in enumerate(self.evaluate_positions(emit, memory, emit.load(work, lanes.X))):
@@ -169,7 +171,7 @@ class LaneSteps:
                 emit.store(emit.multiply(a, acceleration_unit), memory.series_a, j)
         return positions
 
-    def defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+    def evaluate_defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store DEFECT, the defect of a step at its end (see `compute_defect`), for the accelerations in memory."""
         memory = self.memory(emit, order, control, work)
         a = [emit.load(memory.a, j) for j in range(self.n)]
@@ -198,8 +200,8 @@ class LaneSteps:
             max_defect = emit.maximum_or_nan(emit.divide(emit.subtract(defect, noise), allowed), max_defect)
         return emit.multiply(duration, max_defect)
 
-    def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store OFF, the ratio of |predicted - projected positions| to its limit, see control/step_size.py."""
+    def compute_departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Store DEPARTURE, the ratio of |predicted - projected positions| to its limit, see control/step_size.py."""
         n, memory, (rtol, atol) = self.n, self.memory(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -216,7 +218,7 @@ class LaneSteps:
             )
             motion = emit.maximum(distance, motion)
         is_passage, least = (
-            self.singular_passage_mask(emit, memory),
+            self.crossing_mask(emit, memory),
             emit.multiply(emit.constant(FRACTION_AT_SIGN_CHANGE), motion),
         )
         motion = emit.multiply(emit.constant(FRACTION_OF_MOTION), motion)
@@ -230,18 +232,18 @@ class LaneSteps:
                 allowed = emit.builder.select(is_passage, emit.minimum(scale, least), allowed)
             allowed = emit.maximum(allowed, emit.constant(LEAST))
             error = emit.maximum_or_nan(emit.divide(difference(memory.predicted, memory.new, j), allowed), error)
-        emit.store(error, work, lanes.OFF)
+        emit.store(error, work, lanes.DEPARTURE)
 
-    def singular_passage_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
+    def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
         """Return a mask of the lanes whose step may have passed a singular position; None if steps are not checked."""
         return None
 
-    def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+    def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store ACCEPTED, and LONGEST, the largest next step size; clear RUNNING after MAX_REJECTIONS or a NaN."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, emit.divide(one, emit.to_double(order))
-        off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
-        is_valid = is_set(emit, work, lanes.FINE)
+        off, *defects = (emit.load(work, field) for field in (lanes.DEPARTURE, lanes.WORST_DEFECT, lanes.DEFECT))
+        is_valid = is_set(emit, work, lanes.ACTIVE)
         for value in (off, *defects):
             magnitude = emit.function("fabs", value)
             is_valid = builder.bitwise_and(is_valid, builder.compare("fcmp olt", magnitude, emit.constant(math.inf)))
@@ -259,11 +261,11 @@ class LaneSteps:
         is_running, is_refused = is_set(emit, work, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
         is_accepted = builder.bitwise_and(is_running, builder.compare("fcmp oge", factor, one))
         store_mask(emit, work, lanes.ACCEPTED, is_accepted)
-        n_refused = emit.load(work, lanes.REFUSED)
+        n_refused = emit.load(work, lanes.N_REJECTED)
         n_refused = select(builder.bitwise_and(is_running, is_refused), emit.add(n_refused, one), n_refused)
         # end a run with a value that is not finite: shorter steps could pass the point where equations are undefined
         n_refused = select(is_valid, n_refused, emit.constant(math.inf))
-        emit.store(n_refused, work, lanes.REFUSED)
+        emit.store(n_refused, work, lanes.N_REJECTED)
         h_longest = emit.multiply(emit.load(work, lanes.H), select(is_refused, factor, emit.constant(MAX_FACTOR)))
         emit.store(select(is_running, h_longest, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
         within_limit = builder.compare("fcmp ole", n_refused, emit.constant(float(MAX_REJECTIONS)))
@@ -314,9 +316,9 @@ def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
     emit.store(emit.builder.select(mask, emit.constant(1.0), emit.constant(0.0)), work, field)
 
 
-def clear_fine_unless(emit: LaneEmitter, work: Value, is_valid: Value) -> None:
-    """Clear FINE in the lanes in which `is_valid` is false."""
-    store_mask(emit, work, lanes.FINE, emit.builder.bitwise_and(is_set(emit, work, lanes.FINE), is_valid))
+def clear_active_unless(emit: LaneEmitter, work: Value, is_valid: Value) -> None:
+    """Clear ACTIVE in the lanes in which `is_valid` is false."""
+    store_mask(emit, work, lanes.ACTIVE, emit.builder.bitwise_and(is_set(emit, work, lanes.ACTIVE), is_valid))
 
 
 SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by column
@@ -390,11 +392,11 @@ class LaneStages:
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
         for i in range(1, len(b)):
             stage_time = emit.add(t, emit.multiply(emit.constant(c[i]), x))
-            emit.store(stage_time, work, lanes.AHEAD)
+            emit.store(stage_time, work, lanes.T_NEW)
             with emit.loop(integer(0), integer(self.n), []) as (j, _, _):
                 coordinate = _Coordinate(self, emit, memory, j, i)
                 coordinate.store_state(A[i], A[i] @ A, x)
-            emit.builder.call_void("accelerate", arguments)
+            emit.builder.call_void("compute_accelerations", arguments)
         rtol, zero = broadcast_entry(emit, control, lanes.RTOL), emit.constant(0.0)
         with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
             coordinate = _Coordinate(self, emit, memory, j, len(b))
@@ -464,7 +466,7 @@ class _Coordinate:
         return q, v
 
 
-GOLDEN_SECTION = 0.6180339887498949  # multiples of this number modulo 1 are spread evenly on [0, 1]
+GOLDEN_SECTION = 0.6180339887498949  # the multiples of this number, modulo 1, are spread evenly on [0, 1]
 MAX_PARTS = 1000.0  # largest number of parts of a step, between which the defect is evaluated
 MAX_SERIES_OPERATIONS = 1500  # largest number of operations of a series: this many take some seconds to compile
 
@@ -537,7 +539,7 @@ class LaneCode(LaneSteps):
 
     # methods that write the generated functions
 
-    def series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+    def compute_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Compute the Taylor coefficients of q about the state of each lane, with UNIT as the unit of time."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, out, scratch = self.update_unit(emit, control, work), memory.series, memory.scratch
@@ -557,12 +559,12 @@ class LaneCode(LaneSteps):
         for j in range(n):
             total = emit.add(total, emit.multiply(emit.constant(0.0), emit.load(last_row, j)))
         is_valid = builder.bitwise_and(is_valid, builder.compare("fcmp oeq", total, emit.constant(0.0)))
-        store_mask(emit, work, lanes.FINE, is_valid)
+        store_mask(emit, work, lanes.ACTIVE, is_valid)
 
-    def check_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store WORST, the largest defect at equidistant times within the step, at most GAP apart.
+    def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Store WORST_DEFECT, the largest defect at equidistant times within the step, at most GAP apart.
 
-        AHEAD becomes each of these times, and finally the end of the step. SHIFT is a multiple of the golden section
+        T_NEW becomes each of these times, and finally the end of the step. SHIFT is a multiple of the golden section
         modulo 1, which moves the times as far as GAP allows, so that they differ from step to step.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
@@ -582,43 +584,43 @@ class LaneCode(LaneSteps):
             part = emit.to_double(index)
             is_inside = builder.compare("fcmp olt", part, n_lane_parts)
             x = builder.select(is_inside, emit.add(emit.multiply(part, part_size), offset), zero)
-            emit.store(emit.add(emit.load(work, lanes.T), x), work, lanes.AHEAD)
+            emit.store(emit.add(emit.load(work, lanes.T), x), work, lanes.T_NEW)
             self.evaluate_positions(emit, memory, emit.divide(x, emit.load(work, lanes.UNIT)))
             is_valid, a = self._accelerations(emit, work, memory)
             defect = builder.select(is_valid, self.compute_defect(emit, control, memory, a), emit.constant(math.inf))
             new.append(emit.maximum_or_nan(builder.select(is_inside, defect, zero), max_defect))
-        emit.store(new[0], work, lanes.WORST)
+        emit.store(new[0], work, lanes.WORST_DEFECT)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
         is_last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
-        emit.store(builder.select(is_last, t1, emit.add(t, h)), work, lanes.AHEAD)
+        emit.store(builder.select(is_last, t1, emit.add(t, h)), work, lanes.T_NEW)
 
-    def approach(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct the positions NEW once in lanes with FINE = 1; store in FINE and LEFT_TO_MOVE where this succeeds."""
+    def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Correct the positions NEW once where ACTIVE is 1; store in ACTIVE and UNCONVERGED where this succeeds."""
         is_active, _ = self._project(
-            emit, self.equations.position_projection, lanes.FINE, self.memory(emit, order, control, work)
+            emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
-        for field in (lanes.FINE, lanes.LEFT_TO_MOVE):
+        for field in (lanes.ACTIVE, lanes.UNCONVERGED):
             store_mask(emit, work, field, is_active)
-        emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
+        emit.store(emit.constant(math.inf), work, lanes.LAST_CORRECTION)
 
-    def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Project NEW once in lanes with LEFT_TO_MOVE = 1; store a, lam, FINE (converged) and LEFT_TO_MOVE."""
+    def correct_state(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Project NEW once in lanes with UNCONVERGED = 1; store a, lam, ACTIVE (converged) and UNCONVERGED."""
         builder, memory = emit.builder, self.memory(emit, order, control, work)
-        is_fine, is_unfinished = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
-        is_active, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, memory)
+        was_active, is_unfinished = (is_set(emit, work, field) for field in (lanes.ACTIVE, lanes.UNCONVERGED))
+        is_active, moved = self._project(emit, self.equations.basic_projection, lanes.UNCONVERGED, memory)
         largest = emit.constant(0.0)
         for j in range(self.n):
             largest = emit.maximum(emit.function("fabs", emit.load(memory.new, j)), largest)
         tolerance = emit.multiply(emit.constant(RELATIVE_CORRECTION), largest)
         tolerance = emit.maximum(tolerance, emit.constant(ABSOLUTE_CORRECTION))
         converged = builder.bitwise_and(is_active, builder.compare("fcmp ole", moved, tolerance))
-        limit = emit.multiply(emit.constant(CONTRACTION), emit.load(work, lanes.MOVED_BEFORE))
+        limit = emit.multiply(emit.constant(CONTRACTION), emit.load(work, lanes.LAST_CORRECTION))
         is_continued = builder.bitwise_and(is_active, builder.compare("fcmp ole", moved, limit))
         is_continued = builder.bitwise_and(is_continued, builder.compare("fcmp ogt", moved, tolerance))
-        emit.store(emit.maximum(moved, tolerance), work, lanes.MOVED_BEFORE)
-        store_mask(emit, work, lanes.LEFT_TO_MOVE, is_continued)
-        has_finished = builder.operation("xor", is_fine, builder.bitwise_and(is_fine, is_unfinished))
-        store_mask(emit, work, lanes.FINE, builder.operation("or", has_finished, converged))
+        emit.store(emit.maximum(moved, tolerance), work, lanes.LAST_CORRECTION)
+        store_mask(emit, work, lanes.UNCONVERGED, is_continued)
+        has_finished = builder.operation("xor", was_active, builder.bitwise_and(was_active, is_unfinished))
+        store_mask(emit, work, lanes.ACTIVE, builder.operation("or", has_finished, converged))
 
     def _project(self, emit: LaneEmitter, outputs: Program, field: int, memory: LaneMemory) -> tuple[Value, Value]:
         """Correct NEW by a projection program, in the lanes in which `field` is 1.
@@ -640,19 +642,19 @@ class LaneCode(LaneSteps):
                 emit.store(select(is_active, value, emit.load(base, k)), base, k)
         return is_active, largest
 
-    def accelerate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store the accelerations at the state NEW and the time AHEAD; clear FINE in lanes where they are invalid."""
+    def compute_accelerations(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Store the accelerations at the state NEW and the time T_NEW; clear ACTIVE in lanes where they are invalid."""
         memory = self.memory(emit, order, control, work)
         is_valid, a = self._accelerations(emit, work, memory)
         for k, value in enumerate(a):
             emit.store(value, memory.a, k)
-        clear_fine_unless(emit, work, is_valid)
+        clear_active_unless(emit, work, is_valid)
 
     def _accelerations(self, emit: LaneEmitter, work: Value, memory: LaneMemory) -> tuple[Value, list[Value]]:
         a, is_valid = write_accelerations(emit, self.equations, self._new_state(emit, work, memory), self.numbers)
         return is_valid, a
 
-    def singular_passage_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
+    def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
         """Return `orientation_change_mask` for the step; None for series, whose defects reveal singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
@@ -661,7 +663,7 @@ class LaneCode(LaneSteps):
         )
 
     def _ends_of_step(self, memory: LaneMemory) -> list[tuple[int, Value]]:
-        return [(lanes.T, memory.state), (lanes.AHEAD, memory.new)]
+        return [(lanes.T, memory.state), (lanes.T_NEW, memory.new)]
 
     def _row_values(self, emit: LaneEmitter, memory: LaneMemory, time: int, base: Value) -> list[dict[int, Value]]:
         """Return the nonzero entries of each row of G, by column; `time`: field of t; `base`: pointer to the state."""
@@ -672,19 +674,19 @@ class LaneCode(LaneSteps):
             rows[k][j] = value
         return rows
 
-    def stages(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+    def compute_stages(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store NEW and ERROR, computed by the stages of an explicit step."""
         assert self.stage_generator is not None
         self.stage_generator.write(emit, (order, control, work), self.memory(emit, order, control, work))
 
-    def redundant(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Clear FINE in the lanes in which NEW violates a redundant constraint."""
+    def check_redundant_rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Clear ACTIVE in the lanes in which NEW violates a redundant constraint."""
         memory, outputs = self.memory(emit, order, control, work), self.equations.redundant_rows
         lowering, (no_values,) = lower_program(emit, outputs, self._new_state(emit, work, memory), self.numbers)
-        clear_fine_unless(emit, work, lowering.is_valid(outputs, no_values))
+        clear_active_unless(emit, work, lowering.is_valid(outputs, no_values))
 
     def _new_state(self, emit: LaneEmitter, work: Value, memory: LaneMemory) -> list[Value]:
-        return [emit.load(work, lanes.AHEAD), *(emit.load(memory.new, i) for i in range(2 * self.n))]
+        return [emit.load(work, lanes.T_NEW), *(emit.load(memory.new, i) for i in range(2 * self.n))]
 
 
 class LaneConstraints(LaneSteps):
@@ -715,15 +717,15 @@ class LaneConstraints(LaneSteps):
         self.structure = hashlib.sha256(repr(description).encode()).hexdigest()
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._program.quantities())
 
-    def rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store C, C_t and the entries of C_q, at the state NEW and the time AHEAD, in `LaneMemory.series`."""
+    def compute_rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Store C, C_t and the entries of C_q, at the state NEW and the time T_NEW, in `LaneMemory.series`."""
         memory = self.memory(emit, order, control, work)
-        inputs = [emit.load(work, lanes.AHEAD), *(emit.load(memory.new, i) for i in range(2 * self.n))]
+        inputs = [emit.load(work, lanes.T_NEW), *(emit.load(memory.new, i) for i in range(2 * self.n))]
         lowering, arrays = lower_program(emit, self._program, inputs, self.numbers)
         values = [value for array in arrays for value in array]
         for k, value in enumerate(values):
             emit.store(value, memory.series, k)
-        clear_fine_unless(emit, work, lowering.is_valid(self._program, values))
+        clear_active_unless(emit, work, lowering.is_valid(self._program, values))
 
 
 SECONDS_PER_QUANTITY = 3e-4  # estimated time to compile the operation of one quantity, s

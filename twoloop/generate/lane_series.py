@@ -170,7 +170,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return the elements number `lane` of all `vectors` as one vector; of a single vector, return this element."""
+    """Return a vector of element number `lane` of each of `vectors`; for a single vector, return this element."""
     builder, indices = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -283,10 +283,9 @@ class LaneSeries:
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
         """Return the factors of the sums that products (cos x) x' and (sin x) x' share with recurrences of sin and cos.
 
-        The keys are the quantities that are such products; the values are pairs of factors, see `_factors`. (cos x) x'
-        is the derivative of sin x. So a sum in the recurrence of sin x for order k + 1, divided by the unit of time, is
-        the part of coefficient k of the product that is known before order k is solved. The same holds for (sin x) x'
-        and cos x.
+        Keys: the quantities that are such products. Values: pairs of factors, see `_factors`. (cos x) x' is the
+        derivative of sin x. So the part of its coefficient k that is known before order k is solved is a sum in the
+        recurrence of sin x for order k + 1, divided by the unit of time. The same holds for (sin x) x' and cos x.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -380,7 +379,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for the results of operations at order 0; store those of their factors in `row` that are known."""
+        """Write code for the results of operations at order 0; store the factors that are known already in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -455,7 +454,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write code for the results of operations at order k > 0; leave out terms with a factor not known yet."""
+        """Write code for the results of operations at order k > 0, without terms whose factors are not known yet."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:

@@ -23,7 +23,7 @@ from twoloop.generate.graph import Affine, is_zero
 Array = NDArray[np.float64]
 
 # largest change of accelerations or multipliers by a step of refinement, relative to the largest of them, that counts
-# as rounding. During runs of random models the change grew by up to 300; the governor, with 6e-11, is not refined.
+# as rounding. In runs of random models the change grew up to 300 times; the governor, with 6e-11, is not refined
 ROUNDING_OF_SOLUTION = 1e-10
 
 
@@ -71,9 +71,9 @@ class Factors:
                     rows[j].pop(i, None)
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
-    def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a block of pivots; add conditions. `alone`: pivots of G without other rows of G."""
-        diagonal = [None if pivot is None else pivot.as_term() for pivot in alone]
+    def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
+        """Return the inverse of a block of pivots; add conditions. `own_pivots`: pivots of G without its other rows."""
+        diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
             self.mass_pivots.append(a)
@@ -120,7 +120,7 @@ def solve(blocks: Sequence[Block], rhs: Sequence[Affine]) -> list[Affine]:
 
 
 def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products; if their first factors are multiples of one expression, first sum up the others."""
+    """Return the sum of products; if all first factors are multiples of one expression, add up the second factors."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -188,9 +188,9 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
 PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
 Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
-# smallest allowed square of each of three ratios: of a pivot to the norm of the entries that it divides, of a pivot to
-# the norm of its column, and the sine of the angle between the two columns of a block. A ratio of 10^-k costs up to 3 k
-# digits of accelerations. At a start the limits are stricter, see linalg/dependent_columns.py.
+# smallest allowed square of a pivot over the norm of the entries that it divides, of a pivot over the norm of its
+# column, and of the sine of the angle between the two columns of a block. A ratio of 10^-k costs up to 3 k digits of
+# accelerations. The choice at a start has stricter limits, see linalg/dependent_columns.py
 MIN_PIVOT_SQUARE = 0.03**2
 
 
@@ -285,10 +285,10 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """Add to `conditions` that a pivot is not small compared with the entries that it divides, or with its column.
+        """Add to `conditions` that a pivot is not small relative to the entries that it divides, nor to its column.
 
-        `pivot`: determinant of `block`. For a block of two rows, the second condition is that the columns of the block
-        are not nearly parallel. A pivot may change its sign: the formula for the accelerations remains valid.
+        `pivot`: determinant of `block`. For two rows, the second condition is that the columns of the block are not
+        nearly parallel. A pivot may change its sign, because the formula for the accelerations remains valid.
         """
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _add_products(self._zero, [(entry, entry) for entry in entries])
@@ -364,8 +364,8 @@ def _nonzero(entries: Terms) -> Terms:
 def loses_digits(mass: Array, G: Array, choice: Any) -> bool:
     """Return whether the elimination with a PivotChoice loses so many digits at a position that refinement is needed.
 
-    The loss is the change of a solution by one step of refinement: one solution for forces (gamma = 0), and one for
-    motion that the rows prescribe (Q = 0). `mass` (n_q, n_q) and G (n_c + n_a, n_q) are values at the position.
+    The loss is the change by one step of refinement, of a solution for forces alone (gamma = 0) and of a solution for
+    prescribed motion alone (Q = 0). `mass` (n_q, n_q) and G (n_c + n_a, n_q) are values at the position.
     """
     rows, added, n = G[list(choice.rows)], G[list(choice.added_rows)], len(mass)
     pull = added.T * np.array(choice.scales)

@@ -228,9 +228,9 @@ LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference from 1 or -1 at which a
 
 
 class Coefficient(float):
-    """Coefficient that generated code reads from an array; compared by identity, not by value.
+    """Coefficient that generated code reads from an array; two coefficients are equal only if they are one object.
 
-    `index`: index in the array. `varies`: whether the array is that of the coefficients that vary with parameters.
+    `index`: index in the array. `varies`: whether this is the array of coefficients that vary with parameters.
     """
 
     __slots__ = ("index", "varies")
@@ -275,7 +275,7 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """Return `values` as expressions in the parameters; the same array object until a coefficient is added."""
+        """Return `values` as expressions in the parameters, in the same array object until a coefficient is added."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas

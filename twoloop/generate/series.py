@@ -45,10 +45,10 @@ class Sums(NamedTuple):
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    groups : one row for each group of independent operations of one kind: the kind, then three ranges, each as first
-        and end index: of the operations, and of the further terms in `first` and in `second` (all terms after the first
-        one of a sum, see `Sums`). A group of sines includes the cosines of the same angles. The last group contains the
-        products whose second factors depend on the solution of the linear system.
+    groups : one row for each group of independent operations of one kind: the kind, then the first and end index of
+        three ranges: the operations, and their further terms in `first` and in `second` (see `Sums`). A group of sines
+        includes the cosines of the same angles. The last group contains the products whose second factors depend on
+        the solution of the linear system.
     first, second : arguments of the operations.
     """
 
@@ -291,7 +291,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero ones of `exprs` as Sums, and their indices in `exprs`; `nodes`: node of each quantity."""
+    """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: node of each quantity."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _as_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)

@@ -10,8 +10,8 @@ missing callbacks. Series, eliminations, references and derived callbacks are ge
 `TraceCache` stores traces for all systems that share their callbacks: coefficients are expressions in the parameters.
 
 - Parameters that are whole numbers are constants in the traces: they may be counts, indices or switches, and zeros and
-  ones save operations. Parameters of equal magnitude are one variable. So in the systems of one cache the same
-  parameters are whole numbers, with the same values, and the same parameters have equal magnitudes.
+  ones save operations. Parameters of equal magnitude are one variable.
+- So all systems of one cache have equal values of these constants, and equal magnitudes of the same parameters.
 - A callback that branches on its parameters, or rounds them, is traced for each system.
 """
 
@@ -157,7 +157,7 @@ def _refuse_symbols(value: Any, verb: str) -> None:
 
 
 def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Return a wrapper that calls a function, but refuses symbols, which the function might not handle like numbers."""
+    """Return a wrapper of a function that refuses symbols, because the function might not handle them like numbers."""
 
     @functools.wraps(function_of_numbers)
     def function(*arguments: Any, **options: Any) -> Any:
@@ -436,8 +436,7 @@ class TraceCache:
 
     Fields:
     parameters : parameters with which callbacks are traced.
-    traced_kinds : kinds of callbacks that were traced; as they do not branch, they write to the same entries in all
-        systems.
+    traced_kinds : kinds of callbacks that were traced. They do not branch: they write to equal entries in all systems.
     within_bounds : kinds of traced callbacks for which `check_bounds` succeeded in one of the systems.
     """
 

@@ -37,7 +37,7 @@ MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run: large systems need fewer states
 # largest difference between call and trace that counts as a rounding error, relative to the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-# a trace is wrong if relative differences are larger; if they are smaller, see `_is_systematic`
+# relative difference above which a trace is wrong; for smaller differences see `_is_systematic`
 CLEAR_DIFFERENCE = 1e-6
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
 MARGIN = 0.01  # margin of a CheckedRegion, relative to its ranges: small compared with the steps of a run
@@ -69,13 +69,13 @@ class CallbackTraces:
         self.program = OperationTable.from_results(graph, 1 + 2 * system.n_q, results)
 
     def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
-        """Return a copy with the coefficients of another system of the same trace cache."""
+        """Return a copy for another system of the same trace cache; `evaluate` computes the system's coefficients."""
         traced = self.with_coefficients(evaluate)
         traced.name = system.name
         return traced
 
     def with_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
-        """Return a copy, not trusted yet, with `convert` applied to each array of coefficients in the table."""
+        """Return a copy that is not trusted yet, in which `convert` has replaced each array of coefficients."""
         traced = copy.copy(self)
         traced.program = self.program.with_coefficients(convert)
         traced.is_trusted = False
@@ -149,7 +149,7 @@ class CallbackTraces:
         return n_different, called, traced, bounds
 
     def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Return whether an entry differs by about the same amount at neighbouring states; rounding errors do not."""
+        """Return whether an entry differs by about the same amount at neighbouring states, unlike a rounding error."""
         directions = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * directions))
         errors = (called - traced)[:, entry]

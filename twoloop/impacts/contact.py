@@ -24,7 +24,7 @@ from twoloop.run.singular_start import Branch, branch_at
 
 
 class Gap(NamedTuple):
-    """Gaps of k stops, their rates, the part of their second derivatives without v', and their gradients (k, n_q)."""
+    """Gaps of k stops, their rates, their second derivatives without the terms in v', and gradients (k, n_q)."""
 
     g: Array
     u: Array
@@ -99,7 +99,7 @@ class Gaps:
 
 
 def _with_derivatives(graph: Graph, gap: Affine, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
-    """Return a gap, its rate, the part of its second derivative without v', and its gradient."""
+    """Return a gap, its rate, its second derivative without the term in v', and its gradient."""
     unit = Affine(graph, 1.0, {})
     (t_input,), q_inputs = t.terms, [next(iter(coordinate.terms)) for coordinate in q]
     direction = {t_input: unit, **dict(zip(q_inputs, v, strict=True))}
@@ -140,7 +140,7 @@ class ContactSystem:
         self._derived = with_derived_callbacks(system, accept_traces)[0] if slipping else system
 
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
-        """Return a part of a `Gap` for closed stops, followed by that for the displacements that remain constant."""
+        """Return a field of the `Gap` of closed stops, followed by the same field for constant displacements."""
         rows = getattr(self._gaps.at(t, q, v), part)[self._closed]
         if not self._sticking:
             return rows

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
 Signs = list[int | None]  # for each joint its sliding direction, STICKS or IDLE
-STICKS, IDLE = 0, None  # states of a joint: held by its friction; held already by stops and other joints
+STICKS, IDLE = 0, None  # states of a joint at rest: held by its own friction; held by stops and other joints
 MIN_COMPLIANCE = 1e-9  # smallest compliance of a joint that can slide while others are held, relative to a free joint
 REST_RATE = 1e-10  # largest rate that counts as zero, relative to the largest velocities of the last arc
 COUPLING_TOLERANCE = 1e-6  # tolerance of coefficients, 0, 1 or -1, by which one displacement follows from others
@@ -100,7 +100,7 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     """Return forces (at stops, in joints at rest, of friction at stops), and the directions in which stops slide.
 
     The forces of stops are non-negative and complementary to the accelerations (or velocities) D x + c. Friction
-    opposes sliding with its coefficient times the force of the stop; at rest it is less than that. Fixed-point
+    opposes sliding with its coefficient times the force of the stop; at rest it is smaller. A fixed-point
     iteration finds these bounds from the forces. Once the state of each contact is known, the equations are linear.
     """
     n_tangents = len(tangents.normal)

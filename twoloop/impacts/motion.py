@@ -62,18 +62,18 @@ MIN_EVALUATIONS = 2000  # smallest number of evaluations of gaps, forces and rat
 PRESSED_RATIO = 1e3  # squared rate, over (rebound height times acceleration), up to which stops may press together
 ROUNDING = 1e-13  # rounding errors of gaps and rates, relative to max(1, |q|)
 FIRST_STEP_RATIO = 1e-9  # smallest first step size of an arc, relative to max(1 s, t)
-MIN_TIME_LIMIT = 1e-6  # s; an arc that begins after the time limit of the motion ends by it at once
+MIN_TIME_LIMIT = 1e-6  # time limit, s, of an arc that begins after the time limit of the motion
 NEGLIGIBLE_VALUE = 1e-20  # coordinate (m or rad) or rate (m/s or rad/s) below which it is a rounding error
 MAX_STALLED_TIME = 1e-13  # longest duration of a stalled arc, relative to max(1 s, t)
 MAX_STALLED_ARCS = 30  # number of stalled arcs in a row that ends the motion
 RELEASE_REDUCTION = 1e-7  # relative reduction of the static friction of a joint just released, against chattering
 STICKING_MARGIN = 1e-9  # relative tolerance in comparing the friction that a joint needs with what is available
-EQUAL_GAPS = 4e-15  # largest difference of gaps that close at once, due to rounding, relative to max(1, |q|)
-TIED_GAPS = 0.01  # largest gap, in rebound heights, of stops whose order of closing the tolerance leaves open
+EQUAL_GAPS = 4e-15  # largest rounding difference of gaps that close at the same time, relative to max(1, |q|)
+TIED_GAPS = 0.01  # largest gap, in rebound heights, of stops whose order of closing is below the tolerance
 MAX_DISPLACEMENT = 10.0  # largest motion, in rebound heights, in a sequence of impacts that is not integrated
 MAX_GAP = 1e4  # largest gap, in rebound heights, of stops in a sequence of impacts
-MIN_RATE_RATIO = 1e-13  # smallest rate in a sequence of impacts, relative to the velocities; smaller: rounding
-MAX_DIFFERENCE = 1e-6  # largest difference between two laws of impact that does not count, relative to velocities
+MIN_RATE_RATIO = 1e-13  # rate in a sequence of impacts, relative to the velocities, below which it is rounding
+MAX_DIFFERENCE = 1e-6  # largest difference, relative to velocities, at which two laws of impact count as equal
 TOUCHING_EVENT = "an impact reaches stops that touch"
 MAX_LISTED = 100  # largest number of impacts of a sequence that are listed one by one
 LAWS = ("moreau", "poisson", "sequential")
@@ -170,7 +170,7 @@ class Motion:
         return self.t - before <= MAX_STALLED_TIME * max(1.0, abs(self.t))
 
     def _law_note(self) -> str:
-        """Describe where the outcome depends on the law of impacts, or which sequence was not followed to its end."""
+        """Describe impacts whose outcome depends on the law, and sequences that were not followed to their end."""
         note = ""
         if self.law_dependent_impacts:
             t, stops, event = self.law_dependent_impacts[0]
@@ -251,7 +251,7 @@ class Motion:
         return Mode(signs, tuple(closing_stops[is_pushing].tolist()), sliding_stops, sticks)
 
     def _available_friction(self, joints: list[int]) -> Array:
-        """Return the friction available to joints at rest; slightly reduced for those just released."""
+        """Return the friction available to joints at rest; slightly reduced for joints that were just released."""
         reduced = np.minimum(self.modes.kinetic_friction, (1.0 - RELEASE_REDUCTION) * self.modes.static_friction)
         return np.array([(reduced if k in self.released_joints else self.modes.static_friction)[k] for k in joints])
 
@@ -300,10 +300,10 @@ class Motion:
         self.friction.resting_stops, self.friction.released_stops = set(), set()
 
     def _follow_impacts(self, gap: Gap, near: NDArray[np.int64]) -> bool:
-        """Follow impacts that come faster than the motion between them can be integrated; return whether any did.
+        """Follow impacts that succeed one another too fast for an integration between them; return whether any do.
 
-        Stops that close at once share an impact by Moreau's law. All others are hit in the order in which they close,
-        however soon, because another order or a shared impact would result in other velocities.
+        Stops that close at the same time share an impact by Moreau's law. All others are hit in the order in which they
+        close, however soon, because another order or a shared impact would result in other velocities.
         """
         rounding = MIN_RATE_RATIO * np.abs(gap.W).sum(axis=1) * float(self.speeds.max())
         at_rest = REST_RATE * (np.abs(gap.W) @ self.speeds) + rounding
@@ -481,7 +481,7 @@ class Motion:
         if arc.t.size:
             self.speeds = np.abs(arc.v).max(axis=1)
             t_before, self.t = self.t, float(arc.t[-1])
-            # if the arc stalled, keep the opened stops: parallel stops would take turns, with forces of rounding size
+            # if the arc stalled, keep the opened stops: otherwise parallel stops would alternate by rounding
             if not self._is_stalled(t_before):
                 self.opened_stops = []
             self.q, self.v = arc.q[:, -1].copy(), arc.v[:, -1].copy()
@@ -545,20 +545,20 @@ class Motion:
         return make_terminal(self._slip_event(lambda t, q, v: (friction(k, t, q, v), self.modes.static_friction[k])))
 
     def _stop_rest_event(self, k: int, sign: int) -> Any:
-        """Return the event of a stop that ceases to slide; if sliding has just begun, its rate is zero initially."""
+        """Return the event at which a stop ceases to slide; if sliding has just begun, its rate is zero initially."""
         slide, slides = self.friction.slide_index[k], self.friction.slides
         u0 = sign * float(slides.at(self.t, self.q, self.v).u[slide])
         offset = u0 - self.rebound_height if k in self.friction.resting_stops | self.friction.released_stops else 0.0
         return lambda t, q, v: sign * float(slides.at(t, q, v).u[slide]) - offset
 
     def _joint_rest_event(self, k: int, sign: int) -> Any:
-        """Return the event of a joint that comes to rest; if sliding has just begun, its rate is zero initially."""
+        """Return the event at which a joint comes to rest; if sliding has just begun, its rate is zero initially."""
         u0 = sign * float(self.modes.gradients(self.q, k) @ self.v)
         offset = u0 - self.rebound_height if k in self.resting_joints or k in self.released_joints else 0.0
         return lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset
 
     def _slip_event(self, balance: Any) -> Any:
-        """Return the event at which friction slips: (needed, available) = balance(t, q, v), and needed > available."""
+        """Return the event at which the friction needed exceeds that available; balance(t, q, v) returns both."""
         needed, available = balance(self.t, self.q, self.v)
         if abs(needed) > (1.0 + RELEASE_REDUCTION) * available:
             raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {available:.10g}")

@@ -1,4 +1,4 @@
-"""Follow impacts that come faster than the motion between them can be integrated, one by one."""
+"""Follow, one by one, impacts that succeed one another too fast for an integration between them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from twoloop.checks.arguments import Array
 from twoloop.impacts.friction import Tangents, impulses
 
 MAX_HITS = 20_000  # largest number of impacts of a sequence; more than 10,000 occur with mass ratios of 1e8
-MIN_RATE_RATIO = 1e-11  # rates, relative to the fastest closing rate, up to which a sequence has died out
+MIN_RATE_RATIO = 1e-11  # largest rate, relative to the fastest closing rate, of a sequence that has died out
 
 
 class ImpactWarning(UserWarning):

@@ -57,10 +57,10 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import PARTITION_CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-# a force is assumed to change suddenly in a step that is rejected with a larger error, in tolerances
+# error of a rejected step, in tolerances, above which a force is assumed to change suddenly in the step
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
-# number of accepted steps before a short next step can end the trial of a method, because the first size is a guess
+# number of accepted steps, at first of guessed sizes, after which a short next step can end the trial of a method
 FIRST_JUDGED_STEP = 2
 
 
@@ -69,7 +69,7 @@ def start(f, w, t, state):
     """Factor M, choose the partition, and store a and lam in `state` [q, v, a, lam] at time t; return a code."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
-    w.kink_before = t  # C_t or b of a drive may be discontinuous at the start
+    w.last_jump = t  # C_t or b of a drive may be discontinuous at the start
     code = prepare_mass(f, w, t, q)
     if code == DONE:
         code = renew_partition(f, w, t, q)
@@ -131,7 +131,7 @@ def _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, st
     if kind == JUMP:
         clock[at.JUMP_FROM] = t if low - t <= EQUAL_SPACINGS * np.spacing(abs(t)) else low
         clock[at.JUMP_TO] = high
-        w.kink_after = clock[at.JUMP_FROM]
+        w.next_jump = clock[at.JUMP_FROM]
         return True
     if kind == RAMP and accepted and control[at.FIXED_STEP] == 0.0:
         clock[at.H_NEXT] = max(low - t, high - low)
@@ -193,7 +193,7 @@ def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
 @merged
 def _can_take_many(control, clock):
     """Return whether the method may take many steps in one call, without any checks by the loop between these steps."""
-    if control[at.MAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
+    if control[at.TAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
         return False
@@ -288,11 +288,11 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        if w.time_is_up == 1.0:  # evaluations may be missing in this attempt: discard it
+        if w.time_is_up == 1.0:  # discard this attempt, in which evaluations may be missing
             f.settle(f, w, options, memory, tolerances, False)
             return at.PAUSED
-        # where a force jumps, an error estimate may be small by chance: `error_factor` enlarges it until ROUGH_TO
-        error_factor = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
+        # where a force jumps, an error estimate may be small by chance: `error_factor` increases it until JUMP_END
+        error_factor = control[at.JUMP_RATIO] if t < clock[at.JUMP_END] else 1.0
         accepted = code == DONE and error * error_factor <= 1.0
         if accepted and not reaches_goal and ends_near_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
@@ -305,7 +305,7 @@ def advance(
             w.n_rejected_error += 1
             clock[at.FAILURE_CODE] = SINGULAR
             return at.NEAR_SINGULAR
-        checks_rates = control[at.DRIVEN] == 1.0 and not jumps
+        checks_rates = control[at.MAY_JUMP] == 1.0 and not jumps
         if checks_rates and _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
             w.n_rejected_error += 1
@@ -321,7 +321,7 @@ def advance(
                 t_repeated = t
             continue
         if error > SUDDEN_ERROR and not accepted:
-            clock[at.ROUGH_TO] = t + size
+            clock[at.JUMP_END] = t + size
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)

@@ -1,13 +1,13 @@
 """Start a run and take its first steps in one compiled call, which stores all results in one array.
 
-`start_and_advance` checks the start, makes the choices of the previous run (independent rows, dependent coordinates),
-takes steps, and fills one array:
+`start_and_advance` checks the start, keeps the independent rows and dependent coordinates of the previous run, takes
+steps, and fills one array:
 
     ... | report: N_REPORT numbers, counters | times | steps | states ...
                                                              ^ a fixed index
-`advance` writes states from the fixed index on. The length of the other parts depends on the number of steps: they are
-copied afterwards, and end where the states begin. The result is then contiguous: Python copies it as one slice, and
-splits the copy when a field of the result is used.
+`advance` writes states from the fixed index on. The other parts, whose length depends on the number of steps, are then
+copied so that they end where the states begin. The result is contiguous: Python copies it as one slice, and splits the
+copy when a field of the result is used.
 """
 
 import math
@@ -32,7 +32,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import GAP, LONGEST_UNSEEN, LOOK, N_COUNTERS
+from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 
 ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate; a smaller correction is omitted
@@ -60,7 +60,7 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
         rounding_error = max(rounding_error, ROUNDING * abs(q[j]))
     w.rounded, w.reuse = rounding_error, max(reuse, rounding_error)
     w.gamma_required, w.gamma_step_ratio = accuracy, 1.0
-    w.kink_before, w.kink_after = -math.inf, math.inf
+    w.last_jump, w.next_jump = -math.inf, math.inf
 
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
@@ -72,7 +72,7 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
 FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 SHORTEST_STEP = 1e-16  # step size, relative to the first step size, at which a run fails
-GAP_TO_LOOK = 10  # ratio of tolerances[GAP] to tolerances[LOOK] if forces may change suddenly with position or velocity
+GAP_RATIO = 10  # tolerances[GAP] over tolerances[DEFECT_GAP] if forces may change suddenly with position or velocity
 
 
 @exact
@@ -99,16 +99,16 @@ def _first_step_size(state, n, t, span, smallest):
 
 @exact
 def _set_step_limits(control, tolerances, span, longest, within):
-    """Store GAP and LOOK in `tolerances`, and MAX_STEP, APART and SPACING in `control`.
+    """Store GAP and DEFECT_GAP in `tolerances`, and MAX_STEP, TIME_SPACING and SPACING in `control`.
 
-    They limit the time between two evaluations of the equations to LONGEST_UNSEEN times the duration `span` (s) of the
-    run. If `within`, the method evaluates the equations between its stages, too, and only `longest` (s) limits steps.
+    These limits keep the time between two evaluations of the equations below MAX_GAP_RATIO times the duration `span`
+    (s) of the run. Methods that evaluate the equations within steps (`within`) limit steps by `longest` (s) only.
     """
-    max_gap = LONGEST_UNSEEN * span
-    tolerances[GAP], tolerances[LOOK] = max_gap, max_gap / (GAP_TO_LOOK if control[at.BY_STATE] > 0.0 else 1.0)
+    max_gap = MAX_GAP_RATIO * span
+    tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
     control[at.MAX_STEP] = longest if within else min(longest, max_gap / control[at.MAX_EVALUATION_GAP])
-    control[at.APART] = max_gap / N_SAMPLES
-    control[at.SPACING] = control[at.APART] if control[at.BY_TIME] + control[at.BY_STATE] > 0.0 else 0.0
+    control[at.TIME_SPACING] = max_gap / N_SAMPLES
+    control[at.SPACING] = control[at.TIME_SPACING] if control[at.BY_TIME] + control[at.BY_STATE] > 0.0 else 0.0
 
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
@@ -133,9 +133,9 @@ def _is_within_bounds(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Fill `h` with step sizes (s), `changes` with changes of counters, and `used_newton` with flags of Newton steps.
+    """Split `steps`, rows of out_steps, into step sizes h (s), `changes` of the counts, and flags `used_newton`.
 
-    `steps`: rows of out_steps; `counts`: numbers of rejections and partitions, on entry before the steps, then after.
+    `counts`: numbers of rejections and partitions, on entry before these steps, on return after them.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -149,8 +149,7 @@ def split_steps(steps, counts, h, changes, used_newton):
 # UNUSUAL: Python must read the report, and may have to continue the run
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
-# arrays of runs that are repeated from different starts, for checks of a start, the choice of rows, and the run; among
-# them are
+# arrays of runs from different starts: for checks of a start, the choice of rows, and the steps. Among them are
 # - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
 # - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
 # - `last_start`: the last start, see START; `start_rows`: indices of the independent rows at the last start
@@ -176,19 +175,20 @@ RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INT
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# indices in `constants`. ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w. HAS_ALL_ENTRIES: 1 if `rows` is
-# nonzero wherever `kinds` is not 0. RANK, WEAK: thresholds for `choose`. SCALE: factor s in M + s G^T G. CONTRADICTS:
-# relative tolerance of redundant rows. MASS_FLAG: flag of M (DEFINITE, INDEFINITE or 0). LEAST_PIVOT: smallest pivot of
-# an accepted start. EQUATION_FORM: value of FORM. FIRST: first step size that the user has chosen, s; 0: none. LEAST:
-# argument `smallest` of _first_step_size. LONGEST, EVALUATES_WITHIN: arguments of _set_step_limits. NEAR: pivot below
-# which Python checks the run. MAX_CHANGE_RATIO: velocities have jumped if their change in the last step, relative to
-# the change that accelerations explain, is larger. MIN_SAMPLES: least time between two sudden changes, in spacings of
-# samples
+# indices in `constants`
+# - ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w; EQUATION_FORM: value of FORM
+# - RANK, WEAK: thresholds for `choose`; SCALE: factor s in M + s G^T G; MASS_FLAG: DEFINITE, INDEFINITE or 0
+# - HAS_ALL_ENTRIES: 1 if `rows` is nonzero wherever `kinds` is not 0; CONTRADICTS: relative tolerance of redundant rows
+# - LEAST_PIVOT: smallest pivot of an accepted start; NEAR: pivot below which Python checks the run
+# - FIRST: first step size, s, that the user has chosen, or 0; LEAST: argument `smallest` of _first_step_size
+# - LONGEST, EVALUATES_WITHIN: arguments of _set_step_limits
+# - MAX_CHANGE_RATIO: largest change of velocities in the last step, relative to the change that accelerations explain
+# - MIN_SAMPLES: shortest time between two sudden changes, in spacings of samples
 ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
 EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
-# indices in `expected`, the choices for which code was generated (empty without generated code). PLACE: result of
-# choose_rows. N_KEPT, N_ADDED: numbers of independent rows and of rows added to M. KEPT: index of the first row
-PLACE, N_KEPT, N_ADDED, KEPT = range(4)
+# indices in `expected`, the choices for which code was generated (empty without generated code). BOUND: result of
+# choose_rows. N_ROWS, N_ADDED: numbers of independent rows and of rows added to M. FIRST_ROW: index of the first row
+BOUND, N_ROWS, N_ADDED, FIRST_ROW = range(4)
 
 
 @merged
@@ -196,18 +196,18 @@ def _has_same_choices(b):
     """Choose rows and dependent coordinates at a start; return whether the generated code has the same choices."""
     b.scratch[0] = 0.0
     first_bound = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
-    n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
-    if b.chosen[0] != n_kept:
+    n_rows, n_added = b.expected[N_ROWS], b.expected[N_ADDED]
+    if b.chosen[0] != n_rows:
         return False
-    if n_kept == 0:
+    if n_rows == 0:
         return True
-    if first_bound != b.expected[PLACE] or b.chosen[1] != n_added or b.scratch[0] != b.constants[SCALE]:
+    if first_bound != b.expected[BOUND] or b.chosen[1] != n_added or b.scratch[0] != b.constants[SCALE]:
         return False
     is_same = True
-    for k in range(n_kept):
-        is_same = is_same and b.chosen[2 + k] == b.expected[KEPT + k]
+    for k in range(n_rows):
+        is_same = is_same and b.chosen[2 + k] == b.expected[FIRST_ROW + k]
     for k in range(n_added):
-        is_same = is_same and b.chosen[2 + len(b.rows) + k] == b.expected[KEPT + n_kept + k]
+        is_same = is_same and b.chosen[2 + len(b.rows) + k] == b.expected[FIRST_ROW + n_rows + k]
     if is_same and b.kinds.size > 0:
         n = 4 * b.dependents(b.rows, b.kinds, b.counted, b.counted.size, b.search, b.search_places, b.found)
         is_same = n == b.blocks.size
@@ -284,7 +284,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
         return REFUSED
     if w.pivot < b.constants[LEAST_PIVOT]:
         return REFUSED
-    w.kink_after = t1
+    w.next_jump = t1
     if b.control[at.FIXED_STEP] == 0.0:
         span, h, within = t1 - t, b.constants[FIRST], b.constants[EVALUATES_WITHIN] > 0.0
         _set_step_limits(b.control, b.tolerances, span, b.constants[LONGEST], within)
@@ -319,7 +319,7 @@ NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started yet; the dat
 
 @exact
 def _is_last_start(last_start, t, t1, q, v):
-    """Return whether the start (t, t1, q, v) equals bit for bit the start in `last_start`, which it then replaces."""
+    """Return whether the start (t, t1, q, v) equals `last_start` bit for bit, and store it in `last_start`."""
     n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -380,8 +380,8 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
 def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consistent):
     """Start a run from t to t1, and take the first steps; return the number of steps, REFUSED, IN_DOUBT or UNUSUAL.
 
-    If a start is repeated bit for bit, the second run still checks the start, and saves the data of the started run.
-    From the third run on, these data are restored without a check. Arguments: see _start_run and _write_report.
+    If a start is repeated bit for bit, the second run checks it again, and saves the data of the started run. The third
+    and later runs restore these data without a check. For the arguments see _start_run and _write_report.
     """
     f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
     is_repeated, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]

@@ -19,9 +19,9 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# v gets its own polynomial if the rounding error of q, divided by the interval, exceeds this many tolerances of v
+# rounding error of q over the duration of an interval, in tolerances of v, above which v has a polynomial of its own
 MAX_VELOCITY_ROUNDING = 10.0
-# a position in an interval is singular if its pivot, relative to the larger one at the ends, is smaller than this
+# pivot, relative to the larger one at the ends of an interval, below which a position in the interval is singular
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5  # pivot below which any position is singular; for pivots see min_pivot_ratio in partition.py
 # a position with a pivot below WEAK_PIVOT is singular, too, if velocities of the polynomials violate the constraints by
@@ -75,7 +75,7 @@ def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q
     """Store in q and v the values at t[i] + s h of the polynomials of an interval of duration h, by Horner's scheme.
 
     (z, c, size) are the nodes, coefficients and number of coefficients for q; (z_v, c_v, size_v) are those for v if
-    `kind` is APART. Otherwise v is the derivative of q.
+    `kind` is SEPARATE. Otherwise v is the derivative of q.
     """
     n = q.size
     for m in range(n):
@@ -84,7 +84,7 @@ def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q
             slope = slope * (s - z[r]) + value
             value = value * (s - z[r]) + c[r, m]
         q[m], v[m] = value + states[i, m], slope / h
-    if kind == kinds.APART:
+    if kind == kinds.SEPARATE:
         for m in range(n):
             value = c_v[size_v - 1, m]
             for r in range(size_v - 2, -1, -1):
@@ -94,12 +94,12 @@ def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q
 
 @merged
 def _kind_by_duration(kind, tolerances, h, states, i):
-    """Return `kind`, or APART if the interval (duration h) is so short that rounding of q would spoil velocities."""
+    """Return `kind`, or SEPARATE if the interval (duration h) is so short that rounding of q would spoil velocities."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
         if EPS * abs(states[i, m]) > MAX_VELOCITY_ROUNDING * h * (atol + rtol * abs(states[i, n + m])):
-            return kinds.APART
+            return kinds.SEPARATE
     return kind
 
 
@@ -116,10 +116,10 @@ def _velocity_change(tolerances, v_before, v):
 
 @compiled
 def _is_singular(f, w, t, states, i, last, time, q, change):
-    """Return whether q at `time` is so near a singular position that rounding errors explain `change`.
+    """Return whether q at `time` is so near a singular position that rounding errors explain a change of velocities.
 
-    `change` is the change of velocities by the projection, in tolerances. The pivot at q is compared with
-    SINGULAR_PIVOT_RATIO and WEAK_PIVOT; i and `last` are the indices of the states at the ends of the interval.
+    `change`: change of velocities by the projection, in tolerances. i and `last`: indices of the states at the ends of
+    the interval. The pivot at q is compared with SINGULAR_PIVOT_RATIO and WEAK_PIVOT.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):
@@ -151,7 +151,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
         lo, hi = _node_range(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
-        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.SEPARATE else 0
         # choose independent coordinates anew in each interval, so that results do not depend on other output times
         has_partition = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
@@ -212,7 +212,7 @@ def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
             slope = slope * (s - z[r]) + value
             value = value * (s - z[r]) + c[r, m]
         a[m] = curvature / (h * h)
-    if kind == kinds.APART:
+    if kind == kinds.SEPARATE:
         for m in range(a.size):
             value, slope = c_v[size_v - 1, m], 0.0
             for r in range(size_v - 2, -1, -1):
@@ -234,13 +234,14 @@ def _has_similar_gaps(t, lo, hi):
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
     """Store in out[g] the estimated error of the polynomials of interval g of `groups`, relative to the tolerances.
 
-    The estimate is made as follows:
-    - 0 if the polynomials do not interpolate accelerations (kinds APART and VELOCITIES), have more than two nodes, at
-      about equal distances, and have no node inside the interval;
-    - else, with more than two nodes, the change by the last node, if it is at most 1 or if the kind is VELOCITIES,
-      because accelerations then contain the noise of stiff modes;
-    - else the difference of positions, velocities and accelerations at CHECKED_FRACTIONS from the constraints and the
-      equations of motion; that of accelerations, times h over the number of coefficients, counts as one of velocities.
+    The first of these estimates that applies is returned:
+    - 0 for polynomials that do not interpolate accelerations (kinds SEPARATE and VELOCITIES), with more than two nodes
+    at
+      about equal distances, none of them inside the interval;
+    - the change by the last of more than two nodes, if it is at most 1 or the kind is VELOCITIES, because accelerations
+      then contain the noise of stiff modes;
+    - the residual of the polynomials in the constraints and the equations of motion at CHECKED_FRACTIONS. A residual of
+      accelerations, times h over the number of coefficients, counts as a residual of velocities.
     """
     n = w.Q.size
     half = z.size // 2
@@ -253,7 +254,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
         lo, hi = _node_range(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
-        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.SEPARATE else 0
         out[g] = 0.0
         if kind < kinds.ACCELERATIONS and last == i + 1 and hi - lo > 1 and _has_similar_gaps(t, lo, hi):
             continue
@@ -261,7 +262,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
             for k in range(N_CHECKED_TIMES):
                 s = CHECKED_FRACTIONS[k]
                 _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
-                shorter_size = size_v - 2 if kind == kinds.APART else 0
+                shorter_size = size_v - 2 if kind == kinds.SEPARATE else 0
                 _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter_size, q_1, v_1)
                 out[g] = max(out[g], _max_difference(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
             if out[g] <= 1.0 or kind == kinds.VELOCITIES:
@@ -310,7 +311,7 @@ def fill_accelerations(f, w, times, states, out):
                 code = find_tangents(f, w, times[p], q)
         if code == DONE:
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
-        if code == GAMMA_INACCURATE:  # accept any accuracy of Gamma, because no step depends on these accelerations
+        if code == GAMMA_INACCURATE:  # accept this, because no step depends on these accelerations
             required = w.gamma_required
             w.gamma_required = np.inf
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])

@@ -36,11 +36,11 @@ ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: nam
 
 
 class Layout(NamedTuple):
-    """Offsets of the arrays of a workspace: one block of memory contains all floats, another one all integers.
+    """Offsets of the arrays of a workspace, whose floats are in one block of memory, and whose integers in another.
 
-    The table of addresses and shapes that a workspace contains is the sum of `table`, `of_numbers` times the address of
-    the floats, and `of_integers` times the address of the integers. The first `n_lasting` floats and
-    `n_lasting_integers` integers keep data from one step to the next; a step fills all others before it reads them.
+    The table of addresses and shapes in a workspace is `table` + `of_numbers` * (address of the floats) + `of_integers`
+    * (address of the integers). The first `n_lasting` floats and `n_lasting_integers` integers keep data from one step
+    to the next; a step fills all others before it reads them.
     """
 
     numbers: ArrayRanges
@@ -55,7 +55,7 @@ class Layout(NamedTuple):
 
 
 def empty_workspace(sizes: Sizes) -> Work:
-    """Return a workspace of `sizes` in its initial state: an unused workspace, or if there is none, a new one."""
+    """Return a workspace of `sizes` in its initial state: a workspace that is not in use, or a new one."""
     unused = _take_unused_workspace(sizes)
     return _allocate_workspace(sizes) if unused is None else reset_workspace(unused)
 

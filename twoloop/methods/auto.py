@@ -216,12 +216,12 @@ class Auto:
         pays = self._series_pays(n_q, tolerance)
         explicit = self._explicit(n_q, rtol, atol, second, cost_ratio)
         # at looser tolerances the series also pays if the other methods are limited to a hundredth of the run
-        stages_suffice = explicit.unseen < 1.0 and not self.narrow
+        stages_suffice = explicit.max_gap < 1.0 and not self.narrow
         if not pays and (stages_suffice or not self._series_pays(n_q, SHORT_STEP_TOLERANCE)):
             return explicit
         series = self.series.plan(n_q, rtol, atol, False)
         chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, ESTIMATES_FEW, cost_ratio)
-        return chosen.changed(substitute=explicit, provisional=not pays)
+        return chosen.changed(substitute=explicit, on_trial=not pays)
 
     def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, cost_ratio: float) -> Plan:
         """Return the plan of the explicit method, `few` or `many`, with its switch to Newton's method, `second`."""

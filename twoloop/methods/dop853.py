@@ -10,7 +10,15 @@ from typing import Literal
 
 import numpy as np
 
-from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_choices, check_tolerances, least_tolerance
+from twoloop.methods.plan import (
+    INNER_TOL,
+    JUMP_RATIO,
+    LARGEST_MOVE,
+    Plan,
+    check_choices,
+    check_tolerances,
+    least_tolerance,
+)
 
 _LOWER_TRIANGLE = """
 0.05260015195876773
@@ -164,11 +172,11 @@ class DOP853:
             np.zeros(kernels.memory_size(s, n_q)),
             exponent=1.0 / 8.0,
             safety=SAFETY,
-            watchful=free,
+            checks_within=free,
             projects=free,
             least_error=LEAST_ERROR if free else 0.0,
-            rough=ROUGH,
+            jump_ratio=JUMP_RATIO,
             stable_to=lambda memory: STABLE_TO,
             reuse=0.0 if fixed else REUSE_TOLERANCE * least_tolerance(rtol, atol),
-            unseen=LONGEST_GAP if free else 1.0,
+            max_gap=LONGEST_GAP if free else 1.0,
         )

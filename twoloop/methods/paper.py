@@ -99,8 +99,8 @@ class Newmark:
             exponent=1.0 / 2.0 if self.error_tol is None else 1.0 / 3.0,
             factor_min=0.5,
             limit_start=1.0 if self.error_tol is not None else np.inf,
-            lands=self.error_tol is not None,
-            apart=True,
+            ends_at_outputs=self.error_tol is not None,
+            separate=True,
         )
 
 
@@ -189,7 +189,7 @@ class BDF:
             np.zeros(kernels.memory_size(n_q)),
             exponent=1.0,  # not used: the order varies, and the step returns the factor for its order
             projects=True,
-            apart=True,
+            separate=True,
         )
 
 

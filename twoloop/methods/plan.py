@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 # remains is about the square of this correction
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # lower limit of the error, relative to the tolerance, in the trend that the step size follows
-ROUGH = 10.0  # measured largest ratio of error to estimate of a step in which a force jumps, for most methods
+JUMP_RATIO = 10.0  # measured largest ratio of error to estimate of a step in which a force jumps, for most methods
 # largest correction of a position, unit of q, after which a projection is not repeated: velocities are then as exact
 LARGEST_MOVE = 1e-14
 OUTER_TOL_RATIO = 0.01  # tolerance of the outer loop, relative to that of the step
@@ -42,13 +42,13 @@ class Plan:
     limit_memory: int = 10  # number of accepted steps after a failed step for which `limit_factor` applies
     symmetric: bool = False  # whether each step uses the partition chosen at its midpoint
     least_error: float = 0.0  # lower limit of the error in the trend that the step size follows; 0: no trend
-    rough: float = 1.0  # largest ratio of error to estimate of a step in which a force jumps
+    jump_ratio: float = 1.0  # largest ratio of error to estimate of a step in which a force jumps
     reuse: float = 0.0  # largest correction of a position, within a step, with which the previous Jacobian is used
-    watchful: bool = False  # whether short steps trigger a check for a singular position nearby
+    checks_within: bool = False  # whether short steps trigger a check for a singular position nearby
     # whether steps evaluate accelerations without a projection, and call the projection separately
     projects: bool = False
-    lands: bool = False  # whether steps are shortened to end at output times
-    apart: bool = False  # whether errors of q and v are independent: then v is not the slope of q between steps
+    ends_at_outputs: bool = False  # whether steps are shortened to end at output times
+    separate: bool = False  # whether errors of q and v are independent: then v is not the slope of q between steps
     # function of `memory` that returns the largest stable h rho for vibration and for decay, see control/stiffness.py
     stable_to: Any = None
     inner: Any = None  # inner loop that calls generated code; None: the general one
@@ -59,10 +59,10 @@ class Plan:
     parts: int = 1  # number of equal steps into which a step is divided for the solution between its ends
     interior: "Plan | None" = None  # plan of these `parts` of a step; None: the plan of the method with fixed steps
     # whether steps evaluate the equations between their ends; if not, their length is limited
-    looks_within: bool = False
-    unseen: float = 1.0  # longest part of a step without an evaluation of the equations, relative to the step
+    evaluates_within: bool = False
+    max_gap: float = 1.0  # longest part of a step without an evaluation of the equations, relative to the step
     substitute: "Plan | None" = None  # plan that continues the run if values of this one are not finite
-    provisional: bool = False  # whether the substitute also takes over if this plan's steps are not longer than its own
+    on_trial: bool = False  # whether the substitute also takes over if this plan's steps are not longer than its own
     traced: tuple[Any, ...] = ()  # traces of the callbacks on which steps rely, see traced_values.py
     # plan of the `parts` of Newton steps, for the solution between their ends; None: these steps are not divided
     within_newton: "Plan | None" = None

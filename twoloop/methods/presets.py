@@ -10,7 +10,7 @@ from twoloop.generate.compile_equations import GeneratedCode, generated_code
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import is_quick_to_trace, series_for
 from twoloop.generate.traced_values import Check
-from twoloop.kernels.data.indices import ACCELERATIONS, APART, VELOCITIES
+from twoloop.kernels.data.indices import ACCELERATIONS, SEPARATE, VELOCITIES
 from twoloop.methods.adams import Adams
 from twoloop.methods.auto import Auto
 from twoloop.methods.dop853 import DOP853
@@ -183,7 +183,7 @@ def _make_plans(
     plan = method.plan(system.n_q, rtol, atol, fixed)
     interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
     if plan.parts > 1:
-        interiors[APART if plan.apart else ACCELERATIONS] = (
+        interiors[SEPARATE if plan.separate else ACCELERATIONS] = (
             method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
         )
     if code is None:

@@ -10,8 +10,8 @@ from twoloop.checks.arguments import shown
 from twoloop.methods.auto import switching
 from twoloop.methods.plan import (
     INNER_TOL,
+    JUMP_RATIO,
     LEAST_ERROR,
-    ROUGH,
     Plan,
     check_choices,
     check_tolerances,
@@ -158,7 +158,7 @@ class RungeKutta:
         )
         memory = np.zeros(iterations.memory_size(tableau.stages, n_q))
         step = LazyStep("paper.fixed_point_step", "RUNGE_KUTTA")
-        plan = Plan(step, options, memory, 1.0 / (tableau.order + 1), rough=ROUGH)
+        plan = Plan(step, options, memory, 1.0 / (tableau.order + 1), jump_ratio=JUMP_RATIO)
         if self.outer == "paper":
             return plan.changed(
                 step=LazyStep("paper.fixed_point_step", "PAPER"),
@@ -166,8 +166,8 @@ class RungeKutta:
                 limit_start=1.0,
                 limit_factor=1.0,
                 limit_memory=0,
-                lands=True,
-                rough=1.0,
+                ends_at_outputs=True,
+                jump_ratio=1.0,
             )
         plan = plan.changed(least_error=LEAST_ERROR, symmetric=self.partition == "symmetric", parts=self._parts())
         if self.outer == "fixed-point":
@@ -256,9 +256,9 @@ def _jump_weights(c: Array) -> Array:
 
 
 JUMP_WEIGHTS = {"TRBDF2": np.zeros(3), "ESDIRK4": _jump_weights(_esdirk4()[0].sum(axis=1))}
-# `Plan.rough` of the formulas: the weights of ESDIRK4 differ from the embedded ones by 0.04 at most, so that the first
-# estimate is 1/300 of the error if a force jumps in the first half of a step
-ROUGH_OF_FORMULAS = {"TRBDF2": 1.0, "ESDIRK4": 300.0}
+# `Plan.jump_ratio` of the formulas: the weights of ESDIRK4 differ from the embedded ones by 0.04 at most, so that the
+# first estimate is 1/300 of the error if a force jumps in the first half of a step
+JUMP_RATIOS = {"TRBDF2": 1.0, "ESDIRK4": 300.0}
 
 
 @dataclass(frozen=True)
@@ -360,5 +360,5 @@ class ESDIRK:
             exponent=exponent,
             safety=STAGE_SAFETY,
             least_error=LEAST_ERROR,
-            rough=ROUGH_OF_FORMULAS[self.formula],
+            jump_ratio=JUMP_RATIOS[self.formula],
         )

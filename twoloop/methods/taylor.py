@@ -131,9 +131,9 @@ class Taylor:
             exponent=1.0 / highest,
             safety=1.0,
             factor_max=kernels.MAX_GROWTH,
-            watchful=True,
+            checks_within=True,
             projects=True,
-            looks_within=True,
+            evaluates_within=True,
             parts=min(max(highest // 3, MIN_PARTS), MAX_PARTS),
             traced=(program.traced,),
         )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_positive, check_tolerance
-from twoloop.kernels.data.indices import APART
+from twoloop.kernels.data.indices import SEPARATE
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.field_faults import NEAR, all_states, end_of_run, field_faults
 from twoloop.run.record import Record
@@ -19,18 +19,18 @@ from twoloop.run.signals import SignalHandlers
 
 PIECES = 200  # smallest number of intervals into which the run is divided; also limits the step size of reruns
 LIMIT = 100.0  # largest defect of a step, and largest error of a state, in tolerances, of a run that passes
-FASTEST = 10.0  # largest rate, 1/s, by which errors of velocities are divided; by this rate, if they are untested
+FASTEST = 10.0  # largest rate, 1/s, by which errors of velocities are divided; untested velocities: by this rate
 TOLERANCE_FACTOR = 0.1  # ratio of the tolerances of a reintegration to those of the run
 FINEST = 1e-13  # smallest tolerance of a reintegration, relative or absolute: rounding hides smaller errors
 SECOND_RUN_FACTOR = 0.1  # factor on the tolerances of the second run, because its errors grow over the whole run
 STIFF = 4  # number of explicit steps per step of the run above which the run did not resolve untested velocities
 CHAOTIC = 10.0  # largest ratio of an error to the growth of an initial error of one tolerance that explains this error
 ROUNDING = 1e-14  # deviation attributed to rounding, relative to the largest coordinate or velocity
-SPLIT = 100.0  # defect of an interval, in tolerances, above which its steps are checked one by one
+SPLIT = 100.0  # defect of an interval, in tolerances, above which the steps in it are checked one by one
 MAX_WRONG = 3  # number of wrong steps after which the rest of an interval is skipped
 NEGLIGIBLE = 1e-10  # singular value of the constraint rows, relative to the largest, below which it counts as zero
-USUAL_GROWTH = 10.0  # factor of error growth over an interval up to which the defect is not divided by this factor
-MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # attempts in an interval: at most the first plus the second per step
+USUAL_GROWTH = 10.0  # growth of errors over an interval above which the defect is divided by this growth
+MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # largest number of attempts in an interval: first + second * steps
 LOOSER = (10.0, 100.0)  # factors on the tolerances with which a failed reintegration is repeated
 
 
@@ -266,7 +266,7 @@ class _Checker:
         """Return the largest error of a state, in tolerances, its time, and the time from which growth explains errors.
 
         Errors are distances from a second run, which starts from the first state and uses no other stored state. The
-        last number is infinite if no error exceeds the limit, or if growth does not explain the errors.
+        last time is infinite if no error exceeds the limit, or if growth does not explain the errors.
         """
         reference, tested = self._second_run(self.states[0])
         with np.errstate(invalid="ignore"):  # states that are not finite give NaN
@@ -327,7 +327,7 @@ class _Checker:
                 return
 
     def _defect(self, i: int, j: int) -> float:
-        """Return the defect from state i to j by one method; if it is too large, the smaller defect by two methods."""
+        """Return the defect from state i to j by one method or, if it is too large, the smaller of two methods'."""
         uses_newton = bool(self.result.stats.n_jacobians) and (self.result.untested is None or self.untested[i])
         stiff = "positions" if self.untested[i] else "all"
         order = (stiff, "explicit") if uses_newton else ("explicit", stiff)
@@ -364,7 +364,8 @@ class _Checker:
         if self.sol is None or not self.t[i] < t < self.t[j]:
             return 0.0
         table = self.sol.table
-        if table.kinds[np.searchsorted(table.t, t) - 1] == APART:  # interpolation is less accurate than the states here
+        # interpolation is less accurate than the states in these intervals
+        if table.kinds[np.searchsorted(table.t, t) - 1] == SEPARATE:
             return 0.0
         interpolated = self.sol(t)
         return self._distance(state, np.concatenate([interpolated.q, interpolated.v]), i, j)

@@ -36,7 +36,7 @@ def all_states(result: Record) -> tuple[Array, Array]:
 
 
 def end_of_run(result: Record) -> float:
-    """Return the time, s, that the run claims to have reached; -inf if unknown."""
+    """Return the time, s, that the run has reached according to its fields; -inf if unknown."""
     if result.status == Status.EVENT:
         return max((float(t[-1]) for t in result.t_events or () if len(t)), default=-np.inf)
     return -np.inf if result.t_end is None else result.t_end
@@ -125,7 +125,7 @@ def _acceleration_faults(
             if not off <= SINGULAR_START * np.abs(branch.a).max():
                 yield f"a differs at the start, a singular position, by {off:.2g} from that of the branch with v0"
             t, states, stored = t[~at_start], states[~at_start], stored[~at_start]
-    row = np.append(states[0], np.full(n, np.nan))  # of a nothing is known
+    row = np.append(states[0], np.full(n, np.nan))  # the accelerations a are unknown
     ranks = ranks_at(system, float(t[0]), states[0, :n], states[0, n:], rtol)
     interpolator = Interpolator(system, float(t[0]), row, rtol, atol, ranks)
     interpolator.warns = False

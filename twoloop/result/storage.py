@@ -114,7 +114,7 @@ def checksum(array: NDArray[Any]) -> int:
     return zlib.crc32(np.ascontiguousarray(array).tobytes())
 
 
-KINDS = (indices.APART, indices.VELOCITIES, indices.ACCELERATIONS, indices.ACROSS)
+KINDS = (indices.SEPARATE, indices.VELOCITIES, indices.ACCELERATIONS, indices.ACROSS)
 INTEGER_LIMIT = 2**63  # counts must be below this, to fit an int64
 BLOCK = 1024  # number of rows of an array that are checked at a time
 MIN_INTERIOR = 2  # smallest number of stored states of a divided interval: its two ends

@@ -67,7 +67,7 @@ from twoloop.run.rerun import (
 )
 from twoloop.run.run import CONTRADICTION, Run
 from twoloop.run.signals import raised_by_handler
-from twoloop.run.singular_positions import TURN_RATIO
+from twoloop.run.singular_positions import JUMP_RATIO
 from twoloop.run.singular_start import Branch, branch_at
 from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
@@ -80,8 +80,8 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # number of calls that do not use an integrator after a callback raised an exception in it
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time, s, elapsed time is recorded, because reading CPU time takes long
-HARMLESS = 0.01  # correction of v0 that is accepted in any case, relative to the tolerances
+SHORT_RUN = 1e-3  # below this CPU time, s, elapsed time is recorded instead, because reading CPU time takes long
+HARMLESS = 0.01  # largest correction of v0, relative to the tolerances, that is always accepted
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
 
@@ -99,8 +99,8 @@ class MissedChanges:
 class CachedIntegrator:
     """Integrator that reuses one plan and the same arrays for many starts, one after another.
 
-    `run` is at its start, and used by no other object; its plan calls `code`, and its system may be a copy of `system`
-    with derived callbacks. With `shared`, the integrator serves systems with other parameters, too.
+    `run` is at its start, and no other object uses it. Its plan calls `code`. Its system is `system`, or a copy with
+    derived callbacks. `definite`: whether M is definite. `shared`: setup that systems with other parameters share.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class CachedIntegrator:
         n_attempts = max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, n_attempts
         checked = system if self.parametric is None else self.parametric.system
-        # skips: number of next calls that do not use the integrator, because a callback raised an exception
+        # skips: number of coming calls that do not use the integrator, because a callback raised an exception
         self.evaluation, self.loops, self.skips = StartEvaluation(checked), cached_run(), 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
@@ -161,7 +161,7 @@ class CachedIntegrator:
         a usual run, the fields are `status` and `later`, which computes the other fields from a copy of the arrays.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
-        due = region.is_comparison_due()
+        is_due = region.is_comparison_due()
         if self.skips > 0:
             self.skips -= 1
             return None
@@ -191,12 +191,12 @@ class CachedIntegrator:
         n_rows, timed_states = n, None  # one row for each step, unless `_finish_run` is called
         rows_differ = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent_rows
         all_steps = output.times is None and not output.dense
-        if n < 0 or rows_differ or due or not all_steps or parametric is not None:
+        if n < 0 or rows_differ or is_due or not all_steps or parametric is not None:
             if n in (loops.IN_DOUBT, loops.REFUSED):
                 return None
             interrupts.install_handlers()
             n_rows, n = arrays.filled.tolist()
-            finished = self._finish_run(system, t1, q0, v0, output, time_limit, interrupts, due, fields)
+            finished = self._finish_run(system, t1, q0, v0, output, time_limit, interrupts, is_due, fields)
             if not isinstance(finished, tuple):
                 return finished
             (timed_states,) = finished
@@ -217,14 +217,14 @@ class CachedIntegrator:
         output: OutputRequest,
         time_limit: float | None,
         interrupts: Interrupts,
-        due: bool,
+        is_due: bool,
         fields: dict[str, Any],
     ) -> dict[str, Any] | MissedChanges | tuple[tuple[Array, Array] | None] | None:
         """Check the first chunk of a run, and integrate to the end if this chunk does not reach it or is unusual.
 
-        Return the result of `integrate` for an unusual run, or None if the start needs more checks. For any other run,
-        return a tuple of one element: (output times, states), or None for output at all steps; store `sol` in `fields`
-        if it is requested.
+        If the run is unusual, return the result of `integrate`, or None if the start needs more checks. Otherwise
+        return a tuple of one element: (output times, states), or None for output at all steps; store a requested `sol`
+        in `fields`. `is_due`: see `compare_callbacks`.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -251,7 +251,7 @@ class CachedIntegrator:
             began = time.process_time()
             self.interpolation.interpolate(output.interpolated_times, t, rows, kinds, self.evaluation.pattern)
             self.cpu_time += time.process_time() - began
-        if not self._compare_callbacks(t, rows, t1, bool(report[loops.IN_CHECKED_REGION]), due):
+        if not self._compare_callbacks(t, rows, t1, bool(report[loops.IN_CHECKED_REGION]), is_due):
             arrays.last_start[loops.N_EQUAL] = loops.NEVER
             return None
         if output.dense:
@@ -288,7 +288,7 @@ class CachedIntegrator:
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
-    def _compare_callbacks(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
+    def _compare_callbacks(self, t: Array, rows: Array, t1: float, is_inside: bool, is_due: bool) -> bool:
         """Return whether callbacks are correct at states of the run, see `compare_callbacks`."""
         n = 2 * self.run.system.n_q
 
@@ -298,7 +298,7 @@ class CachedIntegrator:
             # with the extreme states of this run, the checked region contains all states of an equal run
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
-        checks = t1, self.check_derivatives, REACHED_END, "", due, inside
+        checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
         return compare_callbacks(self.run, states, *checks)[0] == REACHED_END
 
 
@@ -309,7 +309,7 @@ def fields_of(
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
     fields["t_end"] = t_end
     if (own := options.own_tolerance) is not None:  # Newmark has a tolerance of its own for positions
-        error = own ** (2.0 / 3.0)  # of a run, if each step meets this tolerance
+        error = own ** (2.0 / 3.0)  # error of a run whose steps all meet this tolerance
         fields |= {"rtol": error, "atol": np.full(system.n_q, error), "untested": np.ones(len(record.h), dtype=bool)}
     return fields
 
@@ -341,7 +341,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # `set_up` checks a start if its smallest pivot, relative to that at the first start, is smaller
+RECHECK_PIVOT = 0.1  # smallest pivot of a start, relative to that of the first start, that `set_up` need not check
 
 
 def arrays_of(
@@ -367,10 +367,10 @@ def arrays_of(
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = DependentColumns(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.choose else (none, none, 0, np.zeros(0), none, none)
-    places = np.flatnonzero(memory.view(np.int64))  # indices of numbers with nonzero bits: -0.0 must be restored, too
+    nonzero = np.flatnonzero(memory.view(np.int64))  # indices of numbers with nonzero bits: -0.0 must be restored, too
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     start_constants: tuple[float, ...]
-    start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
+    start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.checks_within else 1.0
     start_constants += (
         np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0),
         RANK_TOL,
@@ -379,18 +379,18 @@ def arrays_of(
         CONTRADICTION,
     )
     start_constants += mass_kind, RECHECK_PIVOT * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
-    step_limits = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
+    step_limits = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.evaluates_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
     block = np.empty(loops.N_HEAD + 1 + (1 + columns) * n_attempts + width * (1 + n_attempts))
     report_part, states = np.split(block, [len(block) - width * (1 + n_attempts)])
     arrays = SimpleNamespace(
         **evaluation.arrays,
         **{"numbers": numbers, "start_numbers": numbers.copy()},
-        **{"memory": memory, "memory_places": places, "start_memory": memory[places]},
+        **{"memory": memory, "memory_places": nonzero, "start_memory": memory[nonzero]},
         **{"clock": run.clock, "control": run.control, "tolerances": run.tolerances, "options": run.plan.options},
         **{"state": run.state, "new_state": run.new_state, "lasting": lasting_floats, "lasting_integers": integers},
         **{"saved": np.empty(numbers.size + lasting_floats.size + run.state.size), "saved_integers": integers.copy()},
-        **{"constants": np.array([*start_constants, *step_limits, run.near_threshold, TURN_RATIO, REPEAT_BELOW])},
+        **{"constants": np.array([*start_constants, *step_limits, run.near_threshold, JUMP_RATIO, REPEAT_BELOW])},
         lapack=np.array(lapack_addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
         **{
             "bounds": START_LIMITS,

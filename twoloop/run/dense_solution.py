@@ -60,8 +60,8 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 class Interpolator:
     """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
-    `t0` and `row`: time and [q, v, a] of a state of the run. `ranks`: those of C_q and [C_q; A]. `plans`: by kind of
-    interval, the plan that divides it into `plan.parts` equal steps; intervals of other kinds are not divided.
+    `t0` and `row`: time and [q, v, a] of a state of the run. `ranks`: ranks of C_q and [C_q; A]. `plans`: for some
+    kinds of intervals, the plan whose `parts` equal steps divide an interval. Other kinds are not divided.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Interpolator:
         self.static_form = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()
-        self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of them
+        self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of it
         # interior states of intervals, with both ends: (times, states) by the time at which the interval begins
         self.interior_states: dict[float, tuple[Array, Array]] = {}
         # memories of crossing steps, which contain their polynomials, by the times at which the intervals begin
@@ -292,7 +292,7 @@ class Interpolator:
         return times, states
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
-        """Return plan and kit of N_REPAIR_STEPS steps that divide an interval of a kind with inaccurate polynomials."""
+        """Return the plan and the kit of N_REPAIR_STEPS steps for an interval of this kind with a poor polynomial."""
         is_stiff = kind == indices.VELOCITIES
         if is_stiff not in self.repair_plans:
             from twoloop.methods.dop853 import DOP853

@@ -19,9 +19,9 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import TimedState, least_singular_value
 from twoloop.run.workspace import kit_for_plan, kit_of
 
-# limits of a ratio: shortest change of forces or drives in a run, over the longest time between two evaluations. Below
-# REPEAT_BELOW, the run is repeated, as it may have missed shorter changes. Below WARN_BELOW, a run that is not repeated
-# warns, as a change of the same duration may lie between two evaluations
+# limits of the duration of the shortest change of forces or drives, relative to the longest time between evaluations.
+# Below REPEAT_BELOW, the run may have missed shorter changes, and is repeated. Below WARN_BELOW, it may have missed
+# changes of the same duration: a run that is not repeated then warns
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
 EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations of a repetition within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
@@ -91,15 +91,16 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
 
 
-# step sizes to try across a singular position, relative to H_LONG, the longest of the last steps: several, because no
-# node of the step should be at the position
+# step sizes to try across a singular position, relative to H_LONG, the longest of the last steps. Several sizes are
+# tried until no node of the step is at the position
 STEP_RATIOS = tuple(0.85**k for k in range(28))
 # step sizes, relative to H_LONG, to try afterwards if too few nodes of a step are beyond the singular position
 LARGER_RATIOS = tuple(1.4**k for k in range(1, 7))
 # distances from a singular position: smallest pivot of C_q at a state, relative to the largest such pivot so far
 FAR_BEFORE = 0.2  # smallest distance of a base, the state at which the polynomial across a singular position begins
-# limits of steps across a singular position. STRICT: those of the run. WIDER: the longest time without an evaluation
-# is GAP_FACTOR times as long, or unlimited if forces cannot be short. LOOSER: as WIDER, with larger tolerances
+# limits of steps across a singular position. STRICT: the limits of the run. WIDER: evaluations may be GAP_FACTOR times
+# as far apart, or arbitrarily far if forces cannot be short. LOOSER: in addition, tolerances are TOLERANCE_FACTOR
+# times as large
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 STRICT, WIDER, LOOSER = range(3)
 
@@ -116,7 +117,7 @@ class Origin(NamedTuple):
 # largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times a step from the
 # current state to its mirror image beyond the singular position (see _find_base)
 MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
-# an earlier state is beyond another singular position if its distance, relative to that of the base, is smaller
+# smallest distance of an earlier state, relative to that of the base: states before it are beyond another position
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
 FAR_BEYOND = 0.3  # smallest distance beyond a singular position at which the run continues with its own method
@@ -129,7 +130,7 @@ def requires_crossing(run: Run, code: int) -> bool:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
 
         is_near = notes[indices.NEARLY_SINGULAR] == notes[indices.NEAR_NOW] == 1.0
-        return bool(is_near and run.control[a.BRIDGE] == 1.0 and run.tolerances[indices.LEAST] >= TIGHT_TOLERANCE)
+        return bool(is_near and run.control[a.MAY_CROSS] == 1.0 and run.tolerances[indices.LEAST] >= TIGHT_TOLERANCE)
     return code == a.NEAR_SINGULAR
 
 
@@ -181,8 +182,8 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
-    control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
-    control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
+    control[a.SYMMETRIC], control[a.MAY_CROSS], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
+    control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
     run.piece_ends = []  # an earlier run of a cached integrator may have ended within a polynomial
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
@@ -271,17 +272,17 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
     a, clock = run.a, run.clock
     end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # time at which the polynomial ends; -inf: none
     # the current time, with a margin because the end of a piece may have a rounding error
-    now = float(clock[a.T] + kernels.ROUNDING * run.crossing_size + 4.0 * np.spacing(abs(clock[a.T])))
-    if code in (a.PAUSED, a.RANK_LOST) and end > now:
+    t_now = float(clock[a.T] + kernels.ROUNDING * run.crossing_size + 4.0 * np.spacing(abs(clock[a.T])))
+    if code in (a.PAUSED, a.RANK_LOST) and end > t_now:
         if not run.piece_ends:
             run.piece_ends = kernels.piece_ends(plan.memory, plan.options[-kernels.S :], float(clock[a.T]))
-            if end > run.t1 - (now - clock[a.T]):
-                run.piece_ends = [*[piece for piece in run.piece_ends if piece < run.t1 - now + clock[a.T]], run.t1]
+            if end > run.t1 - (t_now - clock[a.T]):
+                run.piece_ends = [*[piece for piece in run.piece_ends if piece < run.t1 - t_now + clock[a.T]], run.t1]
             if clock[a.T] > clock[a.T_START]:
                 run.state[: 3 * run.system.n_q] = kernels.state_at(plan.memory, plan.options, float(clock[a.T]))
         elif n_accepted == 0:
             run.piece_ends.pop(0)
-        run.piece_ends = [piece for piece in run.piece_ends if piece > now]
+        run.piece_ends = [piece for piece in run.piece_ends if piece > t_now]
         if run.piece_ends:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.piece_ends[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
@@ -313,7 +314,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
     if at_singular_start:
         return run.plan, run.control, a.RANK_LOST
     if n_accepted == 0:  # all attempts failed: the run's own steps continue as far as they can
-        run.control[a.BRIDGE] = a.SUSPENDED
+        run.control[a.MAY_CROSS] = a.SUSPENDED
     run.crossings[-1].append((float(run.clock[a.T]), run.state.copy()))
     run.work.notes[indices.NEAR_NOW] = 0.0
     run.plan.memory[:] = run.memory
@@ -329,7 +330,7 @@ def apply_jump(run: Run, t1: float) -> bool:
     if state is None:
         return False
     run.new_state[: 2 * n] = state
-    run.work.notes[indices.KINK_AFTER] = t1
+    run.work.notes[indices.NEXT_JUMP] = t1
     if entry_point(run.kernels.start)(run.kit, run.work, t_after, run.new_state) != indices.DONE:
         return False
     run.jumps.append(t_after)

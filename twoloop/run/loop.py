@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.collocation import LANES
-from twoloop.kernels.data.indices import LONGEST_UNSEEN
+from twoloop.kernels.data.indices import MAX_GAP_RATIO
 from twoloop.kernels.steps.stages import load_step
 from twoloop.problem.events import SAMPLES
 from twoloop.problem.system import ConstrainedSystem
@@ -47,9 +47,9 @@ from twoloop.run.messages import (
     StiffnessMonitor,
     describe_stiffness,
     message_of,
-    reject_turned_velocities,
+    reject_velocity_jumps,
     status_and_message,
-    warn_of_passage_by_ordinary_steps,
+    warn_of_inaccurate_crossing,
     warn_user,
 )
 from twoloop.run.record import (
@@ -72,7 +72,7 @@ from twoloop.run.record import (
 from twoloop.run.rerun import checked_region_of, compare_callbacks
 from twoloop.run.run import SMALL_SYSTEM, Buffers, Run
 from twoloop.run.signals import SignalHandlers, is_in_user_function, raised_by_handler
-from twoloop.run.singular_positions import TimedState, velocities_turned_last
+from twoloop.run.singular_positions import TimedState, has_velocity_jump_at_end
 
 Array = NDArray[np.float64]
 
@@ -423,22 +423,22 @@ class IntegrationLoop:
                 status, message = status_and_message(run, code, self.t1, self.stall_detector)
             if status >= 0:
                 end = time_reached if recorder.end_event is None else recorder.end_event[1]
-                places = self._suspicious_last_step(t, table), self._suspicious_outputs(t, table)
-                status, message = reject_turned_velocities(run, *places, end, status, message)
+                jumps = self._suspicious_last_step(t, table), self._suspicious_outputs(t, table)
+                status, message = reject_velocity_jumps(run, *jumps, end, status, message)
             if code != INTERRUPTED:
                 end = time_reached
                 if recorder.end_state is not None:
                     self.sample.end_at(*recorder.end_state)
                     end = recorder.end_state[0]
                 region = checked_region_of(run, check_derivatives)
-                due = region.is_comparison_due() or run.system.called_in_python
+                is_due = region.is_comparison_due() or run.system.called_in_python
                 region.count_run()
                 states = self.sample.states()
                 status, message = compare_callbacks(
-                    run, lambda all_states: states, end, check_derivatives, status, message, due
+                    run, lambda all_states: states, end, check_derivatives, status, message, is_due
                 )
             if self.is_final_attempt and status >= 0:
-                message += warn_of_missed_changes(run) + warn_of_passage_by_ordinary_steps(run)
+                message += warn_of_missed_changes(run) + warn_of_inaccurate_crossing(run)
             if status >= 0 and run.start_warning:
                 message += warn_user(run.start_warning)
             if status in STATUSES_WITH_STIFFNESS_NOTE:
@@ -457,13 +457,13 @@ class IntegrationLoop:
         return record_of(Record, DEFAULTS | fields)
 
     def _suspicious_last_step(self, t: Array, table: Array) -> list[TimedState]:
-        """Return [state before the last step] if velocities turned in that step, as at a singular position; else []."""
+        """Return [state before the last step] if velocities jumped in that step, as at a singular position; else []."""
         run = self.run
         if self.request.times is not None or self.recorder.end_event is not None:
             return []
-        if run.plan.watchful and run.work.notes[indices.NEARLY_SINGULAR] != 1.0:
+        if run.plan.checks_within and run.work.notes[indices.NEARLY_SINGULAR] != 1.0:
             return []
-        return [(float(t[-2]), table[-2])] if velocities_turned_last(t, table, run.system.n_q) else []
+        return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
         """Return all states at which steps had to end if the run passed near a singular position; else []."""
@@ -488,8 +488,8 @@ class IntegrationLoop:
         """Return a new Recorder, with an Interpolator if states between steps are requested."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
-        spacing = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
-        max_spacing = float(run.tolerances[indices.LOOK]) if run.short_forces.by_state else spacing
+        spacing = MAX_GAP_RATIO * (self.t1 - run.t0) / SAMPLES
+        max_spacing = float(run.tolerances[indices.DEFECT_GAP]) if run.short_forces.by_state else spacing
         return Recorder(self.request, interpolator, n, run.t0, self.start, max_spacing)
 
     def _interval_kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:

@@ -25,7 +25,7 @@ from twoloop.run.singular_positions import (
     WEAK_RATIO,
     TimedState,
     describe_crossings,
-    describe_turn,
+    describe_velocity_jump,
     singular_ratio,
     unit_free_ratio,
     velocity_rounding_errors,
@@ -81,8 +81,8 @@ INITIAL_FACTOR = 0.1  # `initial_direction` times this is added to the last eige
 # the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -MIN_ALIGNMENT
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# a problem counts as stiff if the median of h * rate / limit over the samples is at least this; `rate` is the fastest
-# rate of vibration or decay, `limit` the largest stable h * rate. In smooth motion the median is 0.4
+# median of h * rate / limit over the samples from which on a problem counts as stiff. `rate`: fastest rate of vibration
+# or decay; `limit`: largest stable h * rate. In smooth motion the median is 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -193,18 +193,18 @@ def _dominant_eigenvalue(
     return eigenvalue, is_negative
 
 
-# messages call C_q (or M) singular up to this ratio of the smallest to the largest singular value (or inertia)
+# largest ratio of the smallest to the largest singular value of C_q (or inertia in M) that messages call singular
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not to be trusted if rounding errors of velocities (or accelerations) exceed this number of tolerances
 MAX_LASTING_ERROR = 100.0
-# constraints do not determine the velocities at the end of a run if the ratio of singular values is at most this
+# ratio of singular values up to which constraints do not determine the velocities at the end of a run
 MAX_RATIO_AT_END = 1e-6
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
 CROSSINGS_MARK = "\0"  # stands in a message for the description of the singular positions that were crossed
-# a message mentions that the end is near if the time left, relative to the duration of the run, is at most this
+# time left, relative to the duration of the run, up to which a message mentions that the end is near
 NEAR_END = 1e-3
 
 _FAILURE_REASONS = {
@@ -234,27 +234,27 @@ def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, 
     return fields_of("message") if system.called_in_python else {"later": fields_of}
 
 
-def reject_turned_velocities(
+def reject_velocity_jumps(
     run: "Run", last_step: list[TimedState], output_states: list[TimedState], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
     """Return `status` and `message`, or RANK_LOST and a reason if rounding or a change of branch changed velocities.
 
-    `last_step`: [state before the last step] if velocities turned in that step. `output_states`: at output times.
+    `last_step`: [state before the last step] if velocities jumped in that step. `output_states`: those at output times.
     """
-    now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
+    end_state, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(place for each in crossings for place in each), *output_states], end)
     if last_step:
         crossings.append(last_step)
     if crossings and not reason:
         rtol, atol = float(run.tolerances[indices.RTOL]), run.tolerances[indices.ATOL :]
-        reason = describe_turn(run.system, crossings, now, run.rank, rtol, atol)
+        reason = describe_velocity_jump(run.system, crossings, end_state, run.rank, rtol, atol)
     return (Status.RANK_LOST, reason) if reason else (status, message)
 
 
-def describe_rounding(run: "Run", places: list[TimedState], end: float) -> str:
-    """Return a sentence about the first of the states `places` before `end` in which rounding changed v, else ""."""
+def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
+    """Return a sentence about the first of `states` before `end` in which rounding changed v, else ""."""
     system, n = run.system, run.system.n_q
-    for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
+    for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
         at_singular_start = t == run.t0 and run.starts_singular  # positions and velocities at the start are given
         if t >= end or at_singular_start or surely_above(run.near_threshold, system.rows(t, q), run.rank):
@@ -403,7 +403,7 @@ def warn_of_singular_end(run: "Run") -> str:
     return warn_user(text)
 
 
-def warn_of_passage_by_ordinary_steps(run: "Run") -> str:
+def warn_of_inaccurate_crossing(run: "Run") -> str:
     """Warn if ordinary steps may have passed a singular position inaccurately; return the warning as a sentence."""
     ratio = float(run.clock[run.a.PIVOT_PASSED])
     if ratio == 0.0:
@@ -471,7 +471,7 @@ def describe_not_finite(run: "Run") -> str:
         reason = not_finite(run.system, instant, q, v)
         if reason is not None:
             return f"{reason} at t = {instant:.10g}"
-    if run.plan.looks_within:
+    if run.plan.evaluates_within:
         return (
             "the callbacks are finite there, but not the Taylor series of the motion: one of their functions has "
             "no derivatives at this state (a root of zero, a norm of zero velocity), or its argument is too large "

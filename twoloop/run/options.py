@@ -57,7 +57,7 @@ class Options:
 
     def set_step_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
-        run.work.notes[indices.KINK_AFTER] = t1  # next jump of C_t: none is known before t1
+        run.work.notes[indices.NEXT_JUMP] = t1  # next jump of C_t: none is known before t1
         if self.step_size is None:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 

@@ -29,7 +29,7 @@ from twoloop.run.workspace import kit_of, static_form, workspace
 
 Array = NDArray[np.float64]
 
-MIN_SINE = 1e-5  # a dead centre may be near if the sine of the angle between a row of C_q and the other rows is smaller
+MIN_SINE = 1e-5  # smallest sine of the angle between a row of C_q and the other rows away from dead centres
 # MAX_CORRECTIONS: largest number of Newton iterations; ROUNDING: correction that ends them, relative to max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
 # largest distance of a projection on the same assembly from its prediction by C_q, relative to the guess's displacement

@@ -552,7 +552,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
     """Return, for each row of `steps` by the run's plan, the kind of interval that the dense solution uses."""
-    if run.plan.apart:
-        return np.full(len(steps), indices.APART)
+    if run.plan.separate:
+        return np.full(len(steps), indices.SEPARATE)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS
     return np.where(steps[:, run.a.JACOBIANS] > 0.0, indices.VELOCITIES, explicit_kind)

@@ -46,19 +46,19 @@ def compare_callbacks(
     check_derivatives: bool,
     status: Status,
     message: str,
-    due: bool,
-    inside: bool = False,
+    is_due: bool,
+    is_inside: bool = False,
 ) -> tuple[Status, str]:
     """Return status and message of a run that ended at `end`, changed if callbacks are wrong at states of the run.
 
-    Unless `due`, callbacks are not compared again in the region where they were compared before (`CheckedRegion`), in
-    which the whole run may be (`inside`). `states(all_states)` returns states [t, q, v], latest first.
+    Unless a comparison is due (`is_due`), states in the region of earlier comparisons (`CheckedRegion`) are omitted;
+    `is_inside`: the whole run is in this region. `states(all_states)` returns states [t, q, v], latest first.
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
     region, parameters, old_status = checked_region_of(run, check_derivatives), run.varied_parameters, status
-    all_states = due or (parameters is not None and not region.contains_parameters(parameters))
-    if not all_states and (inside or end <= run.compared_until[0]):
+    all_states = is_due or (parameters is not None and not region.contains_parameters(parameters))
+    if not all_states and (is_inside or end <= run.compared_until[0]):
         run.compared_until[0] = max(run.compared_until[0], end)
         return status, message
     chosen = states(all_states)
@@ -187,9 +187,10 @@ class RerunPiece(NamedTuple):
 
 
 class IndependentRerun:
-    """Integrator that reruns pieces of a run with another method, each from a given state; t, q, v: a state of the run.
+    """Integrator that reruns pieces of a run with another method, each piece from a state of the run.
 
-    `method`: "explicit" (`DOP853`), or what a Radau method, for stiff pieces, tests: "all" or "positions".
+    (t, q, v): any state of the run. `method`: "explicit" for `DOP853`. For stiff pieces a Radau method is used, whose
+    error test includes "all" components, or only "positions".
     """
 
     def __init__(
@@ -211,7 +212,7 @@ class IndependentRerun:
         plan = chosen.plan(system.n_q, rtol, float(atol.min()), False)
         self.run = Run(system, plan, t, q, v, rtol, atol, None)
         a, control = self.run.a, self.run.control
-        control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
+        control[a.MAX_STEP], control[a.MAY_CROSS], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK_ATTEMPTS
         self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the original run has checked gamma by differences
         n_rows = max(2, min(CHUNK_ATTEMPTS, MAX_BUFFER_SIZE // len(self.run.state)))
@@ -227,7 +228,7 @@ class IndependentRerun:
             return None
         t1 = float(times[-1])
         run.clock[a.H_NEXT] = proposed_step if proposed_step < np.inf else FIRST_FRACTION * (t1 - t0)
-        run.work.notes[indices.KINK_AFTER] = t1
+        run.work.notes[indices.NEXT_JUMP] = t1
         states: list[Array] = []
         longest, n_total = 0.0, 0
         buffers, filled = self.buffers, self.n_filled

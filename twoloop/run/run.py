@@ -81,7 +81,7 @@ class Run:
         self.kit = kit_of(system, t0, q0, plan, self.static_form)
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # ranks are computed at every start; those of the last start are a guess that often saves a second workspace
+        # ranks are computed at every start; the ranks of the last start are a guess that often saves a second workspace
         self.work = self._workspace(*(system.derived.get("ranks", ()) if self.static_form is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -93,9 +93,9 @@ class Run:
         self.control[loop_state.MAX_STEP], self.control[loop_state.MAX_EVALUATION_GAP] = np.inf, 1.0
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
-        self.control[loop_state.BRIDGE], self.control[loop_state.SAMPLE_MOTION] = self.static_form is None, 1.0
+        self.control[loop_state.MAY_CROSS], self.control[loop_state.SAMPLE_MOTION] = self.static_form is None, 1.0
         rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # C_t of kinematics alone is zero
-        self.control[loop_state.DRIVEN] = bool(rate_kinds)
+        self.control[loop_state.MAY_JUMP] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # largest number of attempts per call
         self.clock = np.zeros(loop_state.N_CLOCK)
@@ -110,7 +110,7 @@ class Run:
         short_forces, steep = (ShortForces(False, False), True) if step_size is not None else short_and_steep
         self.short_forces: ShortForces = short_forces
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
-        self.may_be_steep = steep or plan.unseen == 1.0
+        self.may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
         self.mirrored_size = 0.0  # size, s, of a step that ends at the mirror image of its base
@@ -180,7 +180,7 @@ class Run:
         clock[:] = 0.0
         clock[a.T] = clock[a.T_START] = t
         clock[[a.JUMP_FROM, a.JUMP_TO, a.PIVOT_AT_OUTPUT, a.SHORTEST_CHANGE]] = np.inf
-        sample_times = a.ROUGH_TO, a.SAMPLED_TO, a.MOTION_SAMPLED_TO, a.COMPARED
+        sample_times = a.JUMP_END, a.SAMPLED_TO, a.MOTION_SAMPLED_TO, a.COMPARED
         clock[[*sample_times, a.DISCONTINUITY, a.DISCONTINUITY_OF_MOTION, a.LAST_CHANGE]] = -np.inf
         clock[a.H_LIMIT] = self.plan.limit_start
 
@@ -219,7 +219,7 @@ class Run:
     @property
     def ends_at_outputs(self) -> bool:
         """Whether steps end at all output times."""
-        return self.plan.lands or self.control[self.a.FIXED_STEP] > 0.0
+        return self.plan.ends_at_outputs or self.control[self.a.FIXED_STEP] > 0.0
 
     def write_step_control(self, plan: Plan) -> None:
         """Write the step-size control of a plan to the array `control`, and its first limit of steps to `clock`."""
@@ -227,10 +227,10 @@ class Run:
         control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
-        control[a.ROUGH], control[a.WATCHFUL] = plan.rough, plan.watchful
+        control[a.JUMP_RATIO], control[a.CHECKS_WITHIN] = plan.jump_ratio, plan.checks_within
         control[a.MAY_SWITCH] = plan.substitute is not None
-        control[a.MAKES_MANY] = getattr(plan.step, "many", None) is not None
-        control[a.TRIAL_STEPS] = TRIAL_STEPS if plan.provisional else -1.0
+        control[a.TAKES_MANY] = getattr(plan.step, "many", None) is not None
+        control[a.TRIAL_STEPS] = TRIAL_STEPS if plan.on_trial else -1.0
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
@@ -241,7 +241,7 @@ class Run:
         work = workspace(
             self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static_form, self.matrices
         )
-        work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
+        work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.checks_within else 1.0
         return work
 
     def may_succeed_in_other_form(self, code: int) -> bool:
@@ -270,9 +270,9 @@ class Run:
         self.kit = kit_of(self.system, t, q, self.plan, self.static_form)
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = old_work.counters
-        notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.KINK_BEFORE, indices.KINK_AFTER]
+        notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.LAST_JUMP, indices.NEXT_JUMP]
         self.work.notes[notes] = old_work.notes[notes]
-        self.control[self.a.BRIDGE] = self.static_form is None
+        self.control[self.a.MAY_CROSS] = self.static_form is None
         clock, a = self.clock, self.a
         if clock[a.FAILURE_CODE] != indices.DONE:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
@@ -299,7 +299,7 @@ class Run:
                 self.system.derived["static form"] = None
             self.static_form = None
             self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
-            self.control[self.a.BRIDGE] = 1.0
+            self.control[self.a.MAY_CROSS] = 1.0
             self.work = self._workspace()
             code = start(self.kit, self.work, self.t0, self.state)
         if code == indices.RANK_DIFFERS:
@@ -399,13 +399,13 @@ class Run:
 
         If forces may be steep, the step size is at most a hundredth, too: a single stage may not reveal a steep force.
         """
-        gap = 1.0 if self.may_be_steep else self.plan.unseen
-        max_size = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / gap
+        gap = 1.0 if self.may_be_steep else self.plan.max_gap
+        max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
         """Return the first step size, s, from a state; if `longest` (max_step) > 0, also limit the later step sizes."""
-        numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
+        numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size
 

@@ -186,7 +186,7 @@ class SampledRun:
         if self._parameters_changed or self.system.called_in_python:  # global variables of Python functions may change
             self._restart(t)
         run.choose_first_step(self.t0, end, run.state, run.max_step)
-        run.control[a.APART] = min(self._max_gap, run.control[a.APART])
+        run.control[a.TIME_SPACING] = min(self._max_gap, run.control[a.TIME_SPACING])
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
         run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = MAX_ATTEMPTS, np.inf
         code = run.advance(self._outputs, self._buffers, self._filled)
@@ -263,7 +263,7 @@ class SampledRun:
             record = IntegrationLoop(run, end, output, interrupts).integrate_to_end(False)
         finally:
             interrupts.restore_handlers()
-        run.control[run.a.STORE_ALL], run.work.notes[indices.KINK_AFTER] = 0.0, np.inf
+        run.control[run.a.STORE_ALL], run.work.notes[indices.NEXT_JUMP] = 0.0, np.inf
         steps = np.zeros((len(record.h), run.a.N_STEP_COLUMNS))
         steps[:, run.a.H], steps[:, run.a.JACOBIANS] = record.h, record.untested
         self.steps.append(steps)

@@ -17,6 +17,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 TimedState = tuple[float, Array]  # time and state [q, v, ...]
+Crossings = list[list[TimedState]]  # for each crossed singular position: the states before and after it
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
 LOST_RANK_RATIO = 1e-2  # messages say that constraints lose rank if a ratio of singular values is smaller than this
@@ -25,18 +26,18 @@ MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DISPLACEMENT = 1e-6
 MIN_ROW_NORM = 0.1  # smallest divisor of a row, relative to the norm expected from the derivative of the row
-# velocities count as turned if their change exceeds both TURN_RATIO times the change that accelerations explain and
-# MIN_TURN times the tolerances
-TURN_RATIO, MIN_TURN = 3.0, 10.0
+# velocities have jumped if their change exceeds both JUMP_RATIO times the change that accelerations explain and
+# MIN_JUMP times the tolerances
+JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 
 
-def describe_crossings(system: ConstrainedSystem, crossings: list[list[TimedState]], now: TimedState, rank: int) -> str:
+def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int) -> str:
     """Return sentences about the singular positions that steps crossed.
 
-    `crossings`: for each position the states before and after it; the latter is missing if the run ended, at the state
-    `now`, before the crossing was complete.
+    `crossings`: for each position the states before and after it. If the run ended before the crossing was complete,
+    its last state, `end_state`, replaces the missing state after the position.
     """
-    ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:MAX_SHOWN]}
+    ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]}
     singular = {t: ratio for t, ratio in ratios.items() if ratio < LOST_RANK_RATIO}
     regular = {t: ratio for t, ratio in ratios.items() if ratio >= LOST_RANK_RATIO}
     text = ""
@@ -76,10 +77,10 @@ def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: in
 
 
 def _least_ratio(
-    system: ConstrainedSystem, before: TimedState, behind: TimedState, rank: int, ratio: Ratio = singular_ratio
+    system: ConstrainedSystem, before: TimedState, after: TimedState, rank: int, ratio: Ratio = singular_ratio
 ) -> float:
     """Return the smallest value of `ratio` at N_POSITIONS positions of a cubic interpolation between two states."""
-    n, (t0, first), (t1, last) = system.n_q, before, behind
+    n, (t0, first), (t1, last) = system.n_q, before, after
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
     from scipy.interpolate import CubicHermiteSpline  # imported here, as that takes 0.1 s and few runs need it
@@ -88,8 +89,8 @@ def _least_ratio(
     return min(ratio(system, float(t), path(t), rank) for t in np.linspace(t0, t1, N_POSITIONS))
 
 
-def describe_turn(
-    system: ConstrainedSystem, crossings: list[list[TimedState]], now: TimedState, rank: int, rtol: float, atol: Array
+def describe_velocity_jump(
+    system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int, rtol: float, atol: Array
 ) -> str:
     """Describe where velocities changed by more than accelerations explain; return "" if there is no such place.
 
@@ -97,11 +98,11 @@ def describe_turn(
     """
     n = system.n_q
     of_q, of_v = slice(n), slice(n, 2 * n)
-    for (t0, first), (t1, last), across in _crossing_ends(crossings, now):
+    for (t0, first), (t1, last), across in _crossing_ends(crossings, end_state):
         largest_q, largest_v = (max(np.abs(first[p]).max(), np.abs(last[p]).max()) for p in (of_q, of_v))
         change = np.abs(last[of_v] - first[of_v])
         least_a = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
-        if not (change > np.maximum(MIN_TURN * (atol + rtol * largest_v), TURN_RATIO * (t1 - t0) * least_a)).any():
+        if not (change > np.maximum(MIN_JUMP * (atol + rtol * largest_v), JUMP_RATIO * (t1 - t0) * least_a)).any():
             continue
         threshold = (
             min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / largest_q)) if largest_q > 0.0 else LOST_RANK_RATIO
@@ -114,7 +115,7 @@ def describe_turn(
         largest_a = max(
             _largest_acceleration(system, t, state[of_q], state[of_v], threshold) for t, state in (here, there)
         )
-        change[change <= np.maximum(MIN_TURN * (atol + rtol * largest_v), TURN_RATIO * (t1 - t0) * largest_a)] = 0.0
+        change[change <= np.maximum(MIN_JUMP * (atol + rtol * largest_v), JUMP_RATIO * (t1 - t0) * largest_a)] = 0.0
         if change.any():
             return (
                 f"Not to be trusted beyond t = {t0:.10g}: near it the constraints lose rank "
@@ -126,26 +127,26 @@ def describe_turn(
     return ""
 
 
-def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
+def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
     """Return whether velocities changed in the last step by more than accelerations explain; `rows`: [q, v, a]."""
     largest = np.maximum.reduce  # array.max() makes three calls, which would slow down short repeated runs
     if times.size < 2:
         return False
     change = largest(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
     least_a = np.minimum.reduce(largest(np.abs(rows[-2:, 2 * n : 3 * n]), axis=1))
-    return bool(change > TURN_RATIO * (times[-1] - times[-2]) * least_a)
+    return bool(change > JUMP_RATIO * (times[-1] - times[-2]) * least_a)
 
 
-def _crossing_ends(crossings: list[list[TimedState]], now: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
+def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
     """Yield, for each crossed singular position, the states before and after, and whether crossing steps were taken."""
     before: TimedState | None = None
-    for first, *behind in crossings:
+    for first, *after in crossings:
         before = first if before is None else before
-        if behind and behind[0][0] > first[0]:
-            yield before, behind[0], True
+        if after and after[0][0] > first[0]:
+            yield before, after[0], True
             before = None
-    if before is not None and now[0] > before[0]:
-        yield before, now, False
+    if before is not None and end_state[0] > before[0]:
+        yield before, end_state, False
 
 
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:

@@ -15,10 +15,10 @@ from twoloop.kernels.data.indices import (
     DENSE_FORM,
     DIAGONAL_MASS,
     FORM,
+    IS_GENERATED,
     MULTIPLIERS,
     NULL_SPACE,
     STATIC,
-    STRAIGHT,
 )
 from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import Static, cached_run, empty_workspace, lasting_arrays
@@ -111,8 +111,8 @@ def _derivative_entries(
 
 # a direction of a body has no mass if its eigenvalue of M, relative to the largest one, is at most this
 MASSLESS_RATIO = 1e-10
-# a row can give a massless direction of a body a mass if the row's component along these directions, relative to the
-# row, has a larger norm
+# smallest norm of a row's component along massless directions, relative to the norm of the row, with which the row can
+# give a body a mass in these directions
 MIN_MASSLESS_FRACTION = 1e-3
 # Newton's matrix has sparse factors if the number of coordinates, relative to LARGE, is at least this
 MIN_SIZE_NEWTON = 1.6
@@ -360,7 +360,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
     entry = kits.get(key)
     if entry is None:
         flags = flags.copy()
-        flags[STRAIGHT] = plan is not None and plan.inner is not None
+        flags[IS_GENERATED] = plan is not None and plan.inner is not None
         functions, inner = system.functions._replace(flags=flags), inner_loop
         steps: tuple[Any, ...] = ()
         if plan is not None:

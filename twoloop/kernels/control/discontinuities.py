@@ -36,7 +36,7 @@ BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
 TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, relative to the slope times np.spacing(t)
-STEEPNESS = 4.0  # a part of a step is a ramp if the slope of C_t or b, relative to its mean over the step, is larger
+STEEPNESS = 4.0  # slope of C_t or b in a part of a step, relative to the mean slope, above which the part is a ramp
 MAX_RAMP_SHARE = 0.125  # longest ramp, relative to the step size, at which a step has to end
 MIN_SPACINGS = 8.0  # duration of an interval, in spacings of floating-point numbers, at which its bisection ends
 SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in an interval
@@ -75,7 +75,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the error in row `row` of G x that the tolerances of x (n_q coordinates or velocities) allow."""
+    """Return the error of (G x)[row] that the tolerances of x (n_q coordinates or velocities) allow."""
     largest = 0.0
     if f.form == STATIC:
         rows, columns, _ = jacobian_entries_of(f.static_program)
@@ -157,24 +157,24 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-# a change is sudden if second differences, relative to the range of the samples, are larger (pulses 4 spacings wide)
+# second difference, relative to the range of the samples, above which a change is sudden (pulses 4 spacings wide)
 SUDDEN_RATIO = 0.1
-LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
-# smallest range of samples that matters in any unit: squares of smaller values underflow, and subnormal numbers are too
-# coarsely spaced to look smooth
+LEAST_RANGE = 0.1  # smallest range of samples that is examined, relative to rtol times the largest value so far
+# smallest range of samples that is examined, in any unit: squares of smaller values underflow, and subnormal numbers
+# are too coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
-# least number of samples in a step: a force that acts for a quarter of the step may miss all stages
+# smallest number of samples in a step, because all stages may miss a force that acts for a quarter of the step
 MIN_SAMPLES_IN_STEP = 8.0
-RESAMPLE_BELOW = 0.25  # samples ahead are taken again if the required spacing, relative to the last one, is smaller
+RESAMPLE_BELOW = 0.25  # required spacing, relative to the last one, below which samples ahead are taken again
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
 EQUAL_CHANGES = 1e-5  # largest time between two changes that count as one, relative to the widest spacing of samples
-# changes sooner after the start, relative to GAP, are not recorded: rounding errors make forces that begin at zero,
-# such as 1 - cos(t), look sudden
+# time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
+# at zero, such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
 # smallest ratio of a sudden change to the changes next to it; a smooth slope has a smaller ratio
 MIN_STEEPNESS_RATIO = 2.0
-SHORT_STEP = 0.5  # a discontinuity is suspected if the step size, relative to the longest of the last steps, is smaller
+SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # an acceleration decays, see _acceleration_lasts, if it changes by more than this, relative to the largest
 # acceleration, while a velocity changes by its tolerance
@@ -281,8 +281,8 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
     """Update LAST_CHANGE and SHORTEST_CHANGE in `clock` by the sudden changes on both sides of the bend at `index`.
 
-    Sample k, from 0 to n, is at the time begin + k * spacing; `column` is the index of the component that bends; a
-    difference of two samples above `limit` may be a sudden change.
+    Sample k, from 0 to n, is at the time begin + k * spacing. `column`: index of the component that bends. `limit`:
+    largest difference of two samples that is not a sudden change.
     """
     values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
     first_recorded_time = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
@@ -304,8 +304,8 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
     """Return the time of the first sample at which a component changes suddenly (or infinity), and of the last sample.
 
-    (q, v, a) is the state at t. Samples are taken from `begin` on, at most until `last`; with `follows_motion` = 1
-    along the motion, with 0 at the state (q, v).
+    (q, v, a) is the state at t. Samples are taken from `begin` on, at most until `last`: along the motion if
+    `follows_motion` is 1, or at the state (q, v) if it is 0.
     """
     changes, n, t_first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -340,7 +340,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
     """Update SHORTEST_CHANGE in `clock` by changes within a short step, which samples ahead of the step have missed."""
-    changes, spacing, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
+    changes, spacing, begin, end = w.changes, control[at.TIME_SPACING], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
         return
@@ -367,7 +367,7 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
     """Return whether accelerations change by at most MAX_LASTING_CHANGE while a velocity changes by its tolerance.
 
-    They change more if stiff friction keeps a body at rest: the body's acceleration is then a rounding error of
+    Accelerations change more if stiff friction keeps a body at rest: then the acceleration is a rounding error of
     balanced forces, and a parabola with this acceleration would lead far from the state of rest. (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
@@ -407,7 +407,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
     clock[at.SAMPLES_MOTION] = 0.0
     # close samples along the motion also count as samples in time alone, unless these must continue at a known change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
-    if not change_found and duration <= N_SAMPLES * min(control[at.APART], size / MIN_SAMPLES_IN_STEP):
+    if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
         if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
             clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], duration / N_SAMPLES
@@ -419,10 +419,10 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
     """Return the time of the next sudden change that samples in time alone show, or `next_change` if it is earlier."""
-    max_spacing = max(min(control[at.APART], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
-    # closer samples are not needed in multistep methods (ROUGH = 1), whose error estimates show a jump, and not if C_t
-    # or b may jump (DRIVEN = 1), because such steps are checked for jumps
-    may_resample = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
+    max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
+    # closer samples are not needed with multistep methods (JUMP_RATIO = 1), because their error estimates show a jump,
+    # or if C_t or b may jump (MAY_JUMP = 1), because the steps are then checked for jumps
+    may_resample = control[at.JUMP_RATIO] > 1.0 and control[at.MAY_JUMP] == 0.0
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
@@ -454,7 +454,7 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
         next_change = _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = next_change
     size = min(size, representable_step(t, min(next_change, next_change_of_motion) - t))
-    is_short = size < SHORT_STEP * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.APART]
-    if control[at.BY_TIME] == 1.0 and is_short and size < control[at.APART] and clock[at.COMPARED] < t:
+    is_short = size < SHORT_STEP * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.TIME_SPACING]
+    if control[at.BY_TIME] == 1.0 and is_short and size < control[at.TIME_SPACING] and clock[at.COMPARED] < t:
         _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a)
     return size

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
     NEEDS_DENSE,  # the static form cannot decide whether rows are independent: the caller continues with a dense one
     NEEDS_COMPILATION,  # the step is not compiled: the caller compiles it and repeats the call
 ) = range(12)
-SUSPENDED = 0.5  # value of BRIDGE after all crossing steps across a singular position have failed
+SUSPENDED = 0.5  # value of MAY_CROSS after all crossing steps across a singular position have failed
 CONTINUE = -1  # value that functions return instead of an end code if the loop continues
 
 # indices in the rule of step-size control: the ratio of the next step size to the present one is SAFETY
@@ -43,24 +43,24 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
     SYMMETRIC,  # 1: each step uses the partition chosen at its midpoint; 0: a partition is used until it is poor
     MAX_ATTEMPTS,  # largest number of attempted steps in one call, after which the caller can check progress and time
-    # 1: stop with NEAR_SINGULAR near a singular position; 0: do not stop; SUSPENDED: do not stop until the run has left
-    # the present singular position, then 1 again
-    BRIDGE,
+    # 1: stop with NEAR_SINGULAR near a singular position; 0: do not stop; SUSPENDED: do not stop near the present
+    # singular position; the value is 1 again after the run has left this position
+    MAY_CROSS,
     SHORTEST,  # smallest allowed step size, s; steps of at most EQUAL_SPACINGS spacings of t are too short as well
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
     TRIAL_STEPS,  # stop with SWITCH_METHOD if the size after one of the first TRIAL_STEPS steps is at most GAP
-    DRIVEN,  # 1: C_t or b may jump
-    ROUGH,  # largest ratio of an error to its estimate near a jump of a force, see SUDDEN_ERROR in advance.py
+    MAY_JUMP,  # 1: C_t or b may jump
+    JUMP_RATIO,  # largest ratio of an error to its estimate near a jump of a force, see SUDDEN_ERROR in advance.py
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
-    APART,  # largest spacing of samples in time alone, which are taken ahead of short steps, too, s
+    TIME_SPACING,  # largest spacing of samples in time alone, which are taken ahead of short steps, too, s
     # 1: samples follow the motion; 0: samples stay at the state, because a callback raised an error along the motion
     SAMPLE_MOTION,
     BY_TIME,  # 1: forces may change suddenly with time
     BY_STATE,  # 1: forces may change suddenly with position or velocity: short steps are sampled along the motion, too
     FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before the first step
     MAX_EVALUATION_GAP,  # longest part of a step without an evaluation of the equations, relative to the step size
-    MAKES_MANY,  # 1: the method can take many steps in one call, without checks between them
-    WATCHFUL,  # 1: once a run has come near a singular position, check within each step whether one is near
+    TAKES_MANY,  # 1: the method can take many steps in one call, without checks between them
+    CHECKS_WITHIN,  # 1: once a run has come near a singular position, check within each step whether one is near
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
 
@@ -84,7 +84,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_FROM,  # time at the beginning of the next interval with a jump of C_t or b, s; infinite: none is known
     JUMP_TO,  # time at which this interval ends, s
     APPLIES_JUMP,  # 1: the next step goes from JUMP_FROM to JUMP_TO; new_state is the state after the jump
-    ROUGH_TO,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
+    JUMP_END,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
     PIVOT_HERE,  # static form: value of PIVOT in Work.notes at the end of the last step
     # samples in time alone (at a fixed state) and samples along the motion: see discontinuities.py
     SAMPLED_TO,  # time of the last sample in time alone, s
@@ -99,7 +99,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SAMPLES_MOTION,  # 1 while callbacks are sampled along the motion, at states that the motion may not reach
     # smallest result of min_pivot_ratio (partition.py) at output times and grid points, where steps have to end
     PIVOT_AT_OUTPUT,
-    PIVOT_PASSED,  # smallest pivot within steps since BRIDGE became SUSPENDED, relative to LARGEST_PIVOT; 0: none yet
+    PIVOT_PASSED,  # smallest pivot within steps, over LARGEST_PIVOT, since MAY_CROSS became SUSPENDED; 0: none yet
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 29)
 

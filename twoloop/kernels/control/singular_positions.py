@@ -7,44 +7,44 @@ from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_ratio, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
-# a singular position is suspected if the step size, relative to the longest of the last steps, is smaller than this
+# step size, relative to the longest of the last steps, below which a singular position is suspected
 SHORT_STEP = 0.5
-# pivots of C_q are computed anew if the step size, relative to the longest of the last steps, is smaller than this
+# step size, relative to the longest of the last steps, below which pivots of C_q are computed anew
 COLLAPSED_STEP = 0.2
-# a singular position is near if the smallest pivot of C_q, relative to its largest value so far, is smaller than this
+# smallest pivot of C_q, relative to its largest value so far, below which a singular position is near
 SINGULAR_PIVOT = 0.2
 STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
-# the static form repeats rejected steps with projected stages if the pivot, relative to the largest so far, is smaller
+# pivot, relative to the largest so far, below which the static form repeats rejected steps with projected stages
 REPEAT_PIVOT = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
 MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, relative to the longest recent step
-# if the smallest pivot, relative to its largest value so far, is smaller, rounding spoils accelerations: the run ends
+# smallest pivot, relative to its largest value so far, below which the run ends, as rounding spoils accelerations
 UNDETERMINED_PIVOT = 1e-6
 CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that generated code does not use
 # the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
 # freedom, because a check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
-# a step is checked if the pivot at one of its ends, relative to the largest pivot so far, is smaller than this
+# pivot at an end of a step, relative to the largest pivot so far, below which the step is checked
 MAX_UNCHECKED_PIVOT = 0.5
 # the smallest pivot counts as zero in a step if a sample is below this fraction of its largest change between samples
 PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: smallest and largest result of near_pivot_ratio; MAX_ROUNDING_ERROR: allowed rounding
 # error, in tolerances; EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-MIN_END_RATIO = 0.25  # static form: a step is halved if the pivot at its end, relative to that at its start, is smaller
+MIN_END_RATIO = 0.25  # static form: ratio of the pivots at both ends of a step below which the step is halved
 
 
 @merged
 def is_near_singular(f, w, control, clock, t, q):
-    """Return whether control[BRIDGE] is 1 and a singular position was near when the partition was chosen.
+    """Return whether control[MAY_CROSS] is 1 and a singular position was near when the partition was chosen.
 
     Steps of generated code do not use the partition, which may then be old: it is first renewed at (t, q) if the run
     has come near a singular position before.
     """
-    if control[at.BRIDGE] != 1.0:
+    if control[at.MAY_CROSS] != 1.0:
         return False
-    is_old = f.straight == 1 and w.nearly_singular == 1.0
+    is_old = f.is_generated == 1 and w.nearly_singular == 1.0
     if is_old and renew_partition(f, w, t, q) != DONE:
         return True
     return w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
@@ -52,9 +52,9 @@ def is_near_singular(f, w, control, clock, t, q):
 
 @merged
 def ends_near_singular(f, w, control, clock):
-    """Return whether a step of the static form ends so near a singular position that no step should begin at its end.
+    """Return whether a step of the static form ends so near a singular position that no step should begin there.
 
-    A singular position inside a step, away from both ends, does no harm.
+    A singular position within a step, far enough from both ends, does no harm.
     """
     if f.form != STATIC or control[at.FIXED_STEP] > 0.0:
         return False
@@ -94,9 +94,9 @@ def near_pivot_ratio(tolerances):
 
 @compiled
 def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
-    """Return the smallest pivot of C_q within a step, and its largest change between neighbouring samples.
+    """Return the smallest of the pivots of C_q sampled within a step, and their largest change from sample to sample.
 
-    The samples are on the cubic through the states at the ends of the step, whose pivots are `before` and `end`.
+    The samples are on the cubic through the states at both ends of the step, whose pivots are `before` and `end`.
     """
     n, least, change = w.Q.size, min(before, end), 0.0
     for k in range(1, N_CHECKED_PARTS):
@@ -113,12 +113,12 @@ def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
 
 @compiled
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
-    """Return whether an accepted step comes so near a singular position that a crossing step must replace it.
+    """Return whether an accepted step comes so near a singular position that a crossing step must replace the step.
 
-    Rounding errors of its stages may then exceed the tolerances of the result, though its error estimate is small.
+    Near the position, rounding errors of the stages may exceed the tolerances although the error estimate is small.
     """
-    bridge = control[at.BRIDGE]
-    if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.nearly_singular != 1.0 or control[at.FIXED_STEP] > 0.0:
+    bridge = control[at.MAY_CROSS]
+    if bridge == 0.0 or control[at.CHECKS_WITHIN] == 0.0 or w.nearly_singular != 1.0 or control[at.FIXED_STEP] > 0.0:
         return False
     if f.form == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return False
@@ -127,7 +127,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
     end = smallest_pivot(f, w, t + size, new_state[:n])
     w.pivot = end
     if min(before, end) > MAX_UNCHECKED_PIVOT * largest:
-        control[at.BRIDGE] = 1.0
+        control[at.MAY_CROSS] = 1.0
         return False
     least, change = _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state)
     if bridge == at.SUSPENDED:
@@ -166,7 +166,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
             w.nearly_singular = 0.0
         return at.CONTINUE
     n = w.Q.size
-    uses_generated_code = f.straight == 1 and w.by_general == 0.0
+    uses_generated_code = f.is_generated == 1 and w.used_general == 0.0
     interval = 1
     if f.form == AUGMENTED:
         interval += w.independent_v.size // FREEDOMS_PER_CHECK
@@ -178,13 +178,13 @@ def check_partition(f, w, control, clock, size, at_output, state):
     if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     # steps of generated code do not use the partition: only a new one shows whether a singular position is still near
-    if f.straight == 1 and w.near_now == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
+    if f.is_generated == 1 and w.near_now == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)
     w.near_now = 0.0
     if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
         w.nearly_singular = w.near_now = 1.0
-    if size < COLLAPSED_STEP * clock[at.H_LONG] and w.nearly_singular == 0.0 and control[at.BRIDGE] == 1.0:
+    if size < COLLAPSED_STEP * clock[at.H_LONG] and w.nearly_singular == 0.0 and control[at.MAY_CROSS] == 1.0:
         # the pivots of an old partition may not show that the motion approaches a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
@@ -195,6 +195,6 @@ def check_partition(f, w, control, clock, size, at_output, state):
         # the partition may have been chosen at a distant state: with a new one an implicit method may still continue
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        if control[at.BRIDGE] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
+        if control[at.MAY_CROSS] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step can cross the singular position, where rounding would determine velocities
     return at.NEAR_SINGULAR if short and is_near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

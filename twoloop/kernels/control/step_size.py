@@ -5,16 +5,16 @@ The next step size follows from the error of the last step. In methods with a tr
 
 Errors that the embedded formula does not show are measured in two ways:
 
-- `departure` compares the dependent positions that the formula predicts with those that satisfy the constraints. If
-  both belong to the same assembly of the mechanism, their difference is of the order of the step's error. If the step
-  has ended in another assembly, the difference is larger, however smooth the independent coordinates are. For a
-  mechanism without independent coordinates (all are prescribed) this is the only error estimate. Where two assemblies
-  come close to one another, a large step may end in the wrong assembly with a small difference. But then det C_qd
-  changes sign, which it does along a motion only at a singular position. So if the sign changes in a step, the
-  prediction must be nearly exact, as in short steps through a singular position.
+- `departure` compares the dependent positions that the formula predicts with positions that satisfy the constraints. In
+  the same assembly of the mechanism, the difference is of the order of the step's error. If the step has ended in
+  another assembly, the difference is larger, however smooth the independent coordinates are. If all coordinates are
+  prescribed, this is the only error estimate. Where two assemblies come close to one another, a large step may end in
+  the wrong assembly with a small difference. But then det C_qd changes its sign, which along a motion happens only at a
+  singular position. So if the sign changes in a step, the prediction must be nearly exact, as in short steps through a
+  singular position.
 - `defect_ratio` is the defect of a Taylor step: the difference between the accelerations of the series and those of the
   equations at the same states. A series contains the forces at the beginning of the step, but no later sudden change.
-  So the equations are evaluated at the end of the step, and within it at times at most tolerances[LOOK] apart.
+  So the equations are evaluated at the end of the step, and within it at times at most tolerances[DEFECT_GAP] apart.
 """
 
 import numpy as np
@@ -31,13 +31,13 @@ from twoloop.kernels.control.loop_state import (
     SAFETY,
 )
 from twoloop.kernels.data.common import SETTLE, allowed_error, compiled, is_beyond_gap, kernel, merged
-from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LOOK, RTOL, STATIC
+from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import representable_step
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-# methods with a trend keep the step size, which saves a factorization, if its proposed increase is below this ratio
+# ratio of step sizes below which methods with a trend keep the step size, which saves a factorization
 KEEP_BELOW_RATIO = 1.2
 
 
@@ -68,7 +68,7 @@ def record_accepted_step(rule, past, h, error):
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project (Q, V), a state near the constraints, in place, and store its accelerations in A; return a code."""
     # PROJECT is the cheapest task of generated code, and in the static form the task EVALUATE does not project
-    if (f.straight == 1 and w.Rate.size == w.C.size) or f.form == STATIC:
+    if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
 
@@ -92,7 +92,7 @@ def size_on_grid(clock, t, h, target, goal):
     margin = max(1e-6 * h, rounding)
     n_grid_steps = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + margin:
-        n_grid_steps = 0.0  # the output time is not after the last counted grid time
+        n_grid_steps = 0.0  # the step passes no grid time that is not counted yet
     end = clock[at.T_START] + (clock[at.N_FIXED] + n_grid_steps) * h
     reaches_goal = goal <= end + margin
     size = h
@@ -129,7 +129,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
         w.unchecked += 1.0
     gap = size
     if w.defect >= 0.0:
-        gap = min(size, tolerances[LOOK])
+        gap = min(size, tolerances[DEFECT_GAP])
     elif is_beyond_gap(tolerances, size):  # a step longer than GAP has closely spaced stages
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.widest_gap = max(w.widest_gap, gap)
@@ -197,8 +197,8 @@ def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the defect |predicted - a| at the end of a step of size h, relative to the largest allowed defect.
 
     The error that the defect causes in q and v must be below the tolerances. The defect of a series of order `order`
-    grows as the highest power of the time: its integral over the step is h / order times its value at the end. The
-    result is infinite if an acceleration is not finite.
+    grows as the highest power of the time, so that its integral over the step is h / order times its value at the end.
+    The result is infinite if an acceleration is not finite.
     """
     rtol, duration, largest, ratio = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

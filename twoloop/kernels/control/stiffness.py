@@ -13,11 +13,11 @@ A trial also begins at smaller h rho if
   excite such components;
 - the whole run is expected to cost a thousand times as much as a trial.
 
-A trial that may bring nothing waits until the run has cost a few times as much as a trial, or is expected to cost ten
-times as much. Costs are counted in evaluations of the explicit method; with generated code, an evaluation of the
-implicit method counts several times. The explicit method is tried again if h rho is well below the limit, or if a
-second of motion costs more than before with the explicit method. A method that brought nothing is tried again after
-twice as many estimates.
+A trial that may not pay waits until the run has cost a few times as much as a trial, or is expected to cost ten times
+as much. Costs are counted in evaluations of the explicit method; with generated code, an evaluation of the implicit
+method counts several times. The explicit method is tried again if h rho is well below the limit, or if a second of
+motion costs more than it did with the explicit method. After an unsuccessful trial, the number of estimates before the
+next trial doubles.
 
 Kernels call both methods by their addresses, so that each method is compiled in its own module.
 """
@@ -47,7 +47,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import DONE, ESTIMATE, GAP, LONGEST_UNSEEN, NOT_LOADED, OUTER_DIVERGED, STATIC
+from twoloop.kernels.data.indices import DONE, ESTIMATE, GAP, MAX_GAP_RATIO, NOT_LOADED, OUTER_DIVERGED, STATIC
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
@@ -57,29 +57,29 @@ FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if step size times eigenvalue is smaller than this
 ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
-STABILITY_LIMIT = 3.0  # stability must limit the step of the explicit method if the ratio of h rho to LIMIT is larger
-# least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
-# needs finite differences, which take about eight evaluations per coordinate
+STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limit the step of the explicit method
+# smallest cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
+# is computed by finite differences, which take about eight evaluations per coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-# a trial that may bring nothing begins only if the run has cost at least as much as this number of trials
+# smallest cost of the run so far, in trials, at which a trial that may not pay can begin
 MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
-# after k trials, another one begins, whatever the rates are, if the run has cost k + 1 times this number, in units of
-# MIN_COST_IN_TRIALS trials
+# cost of the run, in units of MIN_COST_IN_TRIALS trials, at which a trial begins whatever the rates are. After k
+# trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds the rate of the motion by more than this factor
+MIN_RATIO_TO_MOTION = 30.0  # ratio of rho to the rate of the motion above which rho is a hidden rate
 QUIET_FACTOR = 10.0  # largest velocity, in tolerances, of oscillations that steps at the stability limit excite
-# damping of a hidden rate may allow longer steps if the ratio of h rho to LIMIT is larger than this
+# ratio of h rho to LIMIT above which an implicit method may allow longer steps because a hidden rate is damped
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
-RETURN_BELOW = 0.4  # the explicit method is tried again if the ratio of h rho to LIMIT is smaller than this
+RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method
 TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # a trial has succeeded if the cost per second before it is more than this factor times that on trial
+MIN_GAIN = 1.2  # ratio of the cost per second before a trial to that on trial above which the trial has succeeded
 N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial
@@ -119,17 +119,23 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
 
 def switching_options(
-    limit: float, estimates: int, matrix_cost: float, ratio: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
+    limit: float,
+    estimates: int,
+    matrix_cost: float,
+    ratio: float,
+    rules: ArrayLike,
+    first: ArrayLike,
+    second: ArrayLike,
 ) -> NDArray[np.float64]:
     """Return the array `options` of a pair of methods.
 
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
-    `each` has one row for each method: its step-size rule and its value of REUSE. `first` and `second` are the options
+    `rules` has one row for each method: its step-size rule and its value of REUSE. `first` and `second` are the options
     of the two methods.
     """
     first = np.asarray(first)  # numbers, or expressions in the parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
-    return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
+    return np.concatenate([scalars, np.asarray(rules, dtype=np.float64).ravel(), first, np.asarray(second)])
 
 
 def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
@@ -198,7 +204,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     growth_by_q = growth_by_v = 0.0
     # with generated code the partition may be an old one, whose independent coordinates hardly move
     is_explicit = memory[PHASE] == EXPLICIT
-    if is_explicit and f.straight == 1 and renew_partition(f, w, t, state[:n]) != DONE:
+    if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
     for _ in range(N_POWER_ITERATIONS):
         growth_by_q = _power_iteration(f, w, t, state, by_q, False, Q, V, A)
@@ -307,10 +313,10 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # a trial that may bring nothing, or that needs finite differences, must cost little compared with the run so far
+    # a trial that may not pay, or that needs finite differences, must cost little compared with the run so far
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
-        counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
+        counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)
     is_cheap = counted > min_cost and (
         f.force_by_q_given == 1 or counted > MIN_COST_PER_COORDINATE * w.independent.size
     )

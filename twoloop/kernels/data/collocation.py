@@ -7,9 +7,9 @@ numbers: one number for each unknown node, or one for each of eight steps that a
 LANES = 8  # number of lanes, that is, of numbers that are computed at once
 ORDER = 12.0  # the error estimate is proportional to this power of the step size
 MAX_ROUNDING = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
-# codes for the end of the iteration of the stages. REFUSED: the step is rejected. GUESSED: the step size was a guess,
+# codes for the end of the iteration of the stages. REJECTED: the step is rejected. GUESSED: the step size was a guess,
 # and must be replaced by another guess. NOT_COMPUTED: accelerations at the nodes could not be computed
-CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
+CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
 
 (
     T,  # time at the beginning of the step, s
@@ -20,20 +20,20 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     CURRENT,  # index (0 or 1) of the polynomial of the last accepted step
     TRIED,  # 1: the polynomial that is not CURRENT is that of the attempted step
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
-    KEPT_DEGREE,  # value of DEGREE before a step was rejected, which a later step restores; 0: no step was rejected
+    OLD_DEGREE,  # value of DEGREE before a step was rejected, which a later step restores; 0: no step was rejected
     MAY_GUESS,  # 1: the step size is a guess, and is replaced if the contraction is far from its target
-    CAREFUL,  # number of coming steps that use the elimination that begins with M
-    STARTS,  # number of guesses of the first step size so far
+    N_MASS_FIRST,  # number of coming steps that use the elimination that begins with M
+    N_GUESSES,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
     LIMITED,  # number of steps whose size was limited by the convergence, minus the number of other steps; at least 0
     FAILURES,  # twice the number of steps that did not converge, minus the number of accepted steps; at least 0
     DEFECT,  # largest defect between nodes, relative to the allowed defect; -1: not evaluated
     RHO,  # contraction by a sweep: ratio of successive changes of the velocities
     SWEEPS,  # number of sweeps in the step
-    TARGETED,  # number of sweeps for which the next step size is chosen
+    N_TARGET,  # number of sweeps for which the next step size is chosen
     CHANGE,  # change of velocities by the last sweep, relative to the tolerances
     ERROR,  # error of the step, relative to the tolerances
-    CURVED,  # largest Legendre coefficient of degree 5 or 6 of the accelerations, relative to the tolerances
+    CURVATURE,  # largest Legendre coefficient of degree 5 or 6 of the accelerations, relative to the tolerances
     FACTOR,  # largest ratio of the next step size to this one that the convergence allows
     FACTOR_OF_ERROR,  # largest ratio of the next step size to this one that the error allows
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
@@ -45,7 +45,7 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE
 SCALED = 40  # offset of eight numbers: coefficients of a polynomial, multiplied by POWERS
 MOVED = 48  # offset of eight numbers: largest change of a coordinate by the last projection, for each of eight steps
-FINE = 56  # offset of eight numbers: 1 for steps whose projection succeeded
+VALID = 56  # offset of eight numbers: 1 for steps whose projection succeeded
 DEFECTS = 64  # offset of eight numbers: defects of successive steps
 WEIGHTS = 72  # offset of n_q numbers: reciprocals of the allowed errors of velocities
 

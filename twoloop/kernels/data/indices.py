@@ -27,8 +27,8 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
 # indices in Functions.flags, whole numbers that describe a system to kernels. CONSTANT_MASS and DIAGONAL_MASS: 1 if M
 # is constant, or diagonal. BANDWIDTH: -1 if linear algebra is not banded. FORM: form of the linear equations of
 # accelerations, see linalg/saddle_point.py. DENSE_FORM: value of FORM to use if sparse factors have too many entries.
-# STRAIGHT: 1 if the inner loop is code generated for the mechanism. FIRST_GIVEN: first index of the flags in GIVEN
-CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
+# IS_GENERATED: 1 if the inner loop is code generated for the mechanism. FIRST_GIVEN: first index of the flags in GIVEN
+CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, IS_GENERATED, FIRST_GIVEN = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; for STATIC see sparse_inner_loop.py
 # indices of the flags of optional callbacks: 1 if the callback is given
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
@@ -64,25 +64,25 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     GAMMA_SCALE,  # largest entry of Gamma so far
     REUSE,  # largest last correction of positions after which the factors of C_qd are not renewed
     ROUNDED,  # rounding error of positions: value of REUSE for states that may be accepted
-    GENERATION,  # number of partitions so far
+    GENERATION,  # number of partitions that have been chosen in the run
     RANK,  # rank of C_q, stored if it differs from the rank for which the workspace is allocated
     RANK_V,  # rank of C_q and A together, stored if it differs from the rank for which the workspace is allocated
     CONTRADICTION,  # index of a violated row that counted as redundant
     PIVOT,  # smallest pivot of the last full pivoting, with rows scaled to 1: small near a singular position
-    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check whether one is near
+    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check for singular positions
     NEAR_NOW,  # 1: the last check found a singular position nearby; 2: the next check must renew the partition first
     MASS_SCALE,  # factor on M in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
-    KNOWN,  # 1: the fused callback has already computed w.Rate and w.Gamma[:n_c] for the current state
-    BY_GENERAL,  # 1: the general inner loop computed the last state in place of the generated code
+    HAS_GAMMA,  # 1: the fused callback has computed w.Rate and w.Gamma[:n_c] for the current state
+    USED_GENERAL,  # 1: the general inner loop, not the generated code, computed the last state
     EXPLICIT_STEP,  # 1: the last attempted step of a pair of methods was explicit
     DEFECT,  # largest defect of the attempted step, relative to the allowed defect; -1: not evaluated
     LARGEST_DEFECT,  # largest value of DEFECT in the accepted steps
     UNCHECKED,  # number of accepted steps for which no defect was evaluated
     WIDEST_GAP,  # longest time between two evaluations within accepted steps, s
-    KINK_BEFORE,  # time of the last known jump of C_t or b, s
-    KINK_AFTER,  # time of the next known jump of C_t or b, s
-    LEANING,  # largest coefficient of an independent row in a redundant row, when the partition was chosen
+    LAST_JUMP,  # time of the last known jump of C_t or b, s
+    NEXT_JUMP,  # time of the next known jump of C_t or b, s
+    MAX_COEFFICIENT,  # largest coefficient of an independent row in a redundant row, when the partition was chosen
     SMALLEST,  # static form: smallest squared sine of the angle of a row to previous rows, see linalg/sparse_ldl.py
     TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
     N_NOTES,
@@ -105,16 +105,16 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
     ESTIMATE,  # 0 for steps of fixed size, else 1
     LEAST,  # smallest tolerance of a coordinate or a velocity
     GAP,  # longest time between two evaluations of the equations, s
-    LOOK,  # longest time between two evaluations in steps that evaluate their defect between nodes, s
+    DEFECT_GAP,  # longest time between two evaluations in steps that evaluate their defect between nodes, s
     ATOL,  # first index of the absolute tolerances: one for each coordinate and its velocity
 ) = range(6)
-LONGEST_UNSEEN = 0.01  # value of GAP, relative to the duration of the run
-REPORTED_ERROR = 30.0  # errors of velocities near a singular position are reported if they are larger, in tolerances
+MAX_GAP_RATIO = 0.01  # value of GAP, relative to the duration of the run
+REPORTED_ERROR = 30.0  # error of velocities near a singular position, in tolerances, above which it is reported
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
 # kinds of intervals between accepted states, for dense output; they tell which data the polynomials interpolate
 (
-    APART,  # q and v in one polynomial, v and a in another: errors of q and v are independent, and steps are small
+    SEPARATE,  # q and v in one polynomial, v and a in another: errors of q and v are independent, and steps are small
     VELOCITIES,  # q and v in one polynomial and its derivative: a contains the noise of stiff modes
     ACCELERATIONS,  # q, v and a in one polynomial and its derivatives
     ACROSS,  # as ACCELERATIONS, for a step across a singular position

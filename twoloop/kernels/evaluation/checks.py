@@ -17,7 +17,7 @@ from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.operations import result_of_operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
-NO_ENTRY = 1e-12  # largest entry of C_q, relative to the largest one in its row, that counts as a rounding error
+NO_ENTRY = 1e-12  # largest entry of C_q, relative to the largest entry of its row, that counts as a rounding error
 MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares in column_units
 NEGLIGIBLE = 1e-6  # largest coordinate, relative to the largest one of its row, that linear_ranges leaves out
 
@@ -34,9 +34,9 @@ def _sort(values):
 
 @exact
 def _fit_column_units(rows, columns, mask, logs):
-    """Store in `columns` the logarithms of the coordinates' units that best fit the rows' units, given in `rows`.
+    """Store in `columns` the logarithms of units of coordinates that best fit the units of the rows, given in `rows`.
 
-    `logs` has the logarithms of |entries|, `mask` has 1 for each entry. Returns whether no unit changed.
+    `logs`: logarithms of |entries|; `mask`: 1 for each entry. Returns whether no unit changed.
     """
     is_unchanged = True
     for j in range(columns.size):
@@ -53,7 +53,7 @@ def _fit_column_units(rows, columns, mask, logs):
 
 @exact
 def _fit_row_units(columns, rows, mask, logs):
-    """Store in `rows` the logarithms of the rows' units that best fit the coordinates' units, given in `columns`."""
+    """Store in `rows` the logarithms of units of rows that best fit the units of coordinates, given in `columns`."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
@@ -103,10 +103,10 @@ def column_units(matrix, typical, columns, mask, logs, rows, scratch):
 def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
     """Store in `ranges` the distance over which each row of C_q changes little, in units of the coordinates.
 
-    The distance is the row's radius, if this is at most 1 or at most the largest coordinate in the row. Otherwise it is
-    the lower median of the row's coordinates that are not NEGLIGIBLE, or 1 if none exceeds `negligible`. Row i of
-    `coordinates_in_units` has the coordinates with an entry in row i, else 0; `radius` has the norms of the rows,
-    divided by their change per unit displacement.
+    Row i of `coordinates_in_units` has the coordinates with an entry in row i, else 0. `radius`: norms of the rows,
+    divided by their change per unit displacement. The distance is the row's radius if this is at most 1, or at most the
+    largest coordinate in the row. Otherwise it is the lower median of the row's coordinates that are not NEGLIGIBLE, or
+    1 if none exceeds `negligible`.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -220,8 +220,8 @@ def _is_consistent(C, rate, rows, q, v, records, tolerance):
     """Return whether (q, v) satisfies the constraints up to rounding; `rows`: C_q with A, `rate`: C_t with b.
 
     The size of a coordinate counts as at least its size in `records` (see `evaluate_start`), and at least the rounding
-    error of the largest coordinate: if all coordinates of a constraint are rounding errors of zero, as coordinates out
-    of the plane of a planar motion are, the value of the constraint is not small relative to its terms.
+    error of the largest coordinate. Otherwise a constraint whose coordinates are all rounding errors of zero, as out of
+    the plane of a planar motion, would not be small relative to its terms.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _index_of_near_position(q, rows, C.size, records)
@@ -281,9 +281,9 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
     Flags are WELL_FORMED to INDEFINITE. Arguments:
 
     - roundings: allowed relative rounding errors of constraints, of the symmetry of M, and of its eigenvalues
-    - records: for each of several positions: the size of each coordinate, the position, and where C_q is nonzero (see
-      `keep` of checks/scales.py). Near such a position, |q_j| counts as at least the recorded size of coordinate j when
-      the rounding errors of constraints are judged
+    - records: for each of several positions, the size of each coordinate, the position, and where C_q is nonzero (see
+      `keep` of checks/scales.py). Rounding errors of constraints near such a position are judged with |q_j| at least
+      equal to the recorded size of coordinate j
     - shifts: displacements of q, relative to max|q|, at which nonzero entries of C_q and A are also recorded
     - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
     - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results, and scratch
@@ -475,9 +475,9 @@ def compare_traces(
     """Compare callbacks with their traces at `states`, which has rows [t, q, v]; return how many numbers differ.
 
     Two numbers differ if their difference exceeds MAX_DIFFERENCE times the largest value at these states, plus
-    ROUNDING_FACTOR times the error bound of the traced number. `sizes`: n_q, n_c and n_a; `is_compared`: 1 for each of
-    KINDS in traced_values.py that has to be compared. Stores the values of the callbacks in `called`, which must be
-    zero on entry, those of the traces in `traced`, and their error bounds in `bounds`; `nodes` is scratch.
+    ROUNDING_FACTOR times the error bound of the traced number. `sizes`: n_q, n_c and n_a. `is_compared`: 1 for each of
+    KINDS in traced_values.py that has to be compared. Stores the values of the callbacks in `called` (zero on entry),
+    the values of the traces in `traced`, and their error bounds in `bounds`; `nodes` is scratch.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

@@ -93,7 +93,7 @@ def gather_independent_columns(G, rate, rows, independent, D):
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
 ROUNDING_DISAGREEMENT = 1e-9  # largest relative difference of Gamma with the steps e and 2 e that rounding may cause
-# the step e is doubled if relative differences of Gamma with e and 2 e are smaller: longer steps reduce rounding errors
+# largest relative difference of Gamma with the steps e and 2 e at which e is doubled, to reduce rounding errors
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
@@ -105,7 +105,7 @@ CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less t
 
 @exact
 def representable_step(t, h):
-    """Return (t + h) - t, the step nearest to h that floating-point times allow: near 1e9 s, a multiple of 1.2e-7 s."""
+    """Return (t + h) - t, the step nearest to h that floating-point times allow: multiples of 1.2e-7 s near 1e9 s."""
     return (t + h) - t
 
 
@@ -123,8 +123,8 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return the side of t for differences: 0 (both) or, if C_t or b jumps near t, the other: 1 (after t) or -1."""
-    since_jump, until_jump = t - w.kink_before, w.kink_after - t
+    """Return the side of t for differences: 1 (after t) or -1 if C_t or b jumps on the other side, else 0 (both)."""
+    since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
     return 1.0 if until_jump >= since_jump else -1.0
@@ -134,8 +134,8 @@ def _difference_side(w, t, e):
 def _fill_gamma(f, w, t, q, v, e, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences with the steps e and 2 e; return three maxima.
 
-    The maxima are max|Gamma|, the largest disagreement of the two differences (both NaN if Gamma is not finite), and
-    the largest |term| in the sums G v.
+    These are max|Gamma|, the largest disagreement of the two differences, and the largest |term| in the sums G v. If
+    Gamma is not finite, the first two are NaN.
     """
     Gamma_coarse = w.Gamma_tried[0]
     side = _difference_side(w, t, e)
@@ -185,7 +185,7 @@ def _max_disagreement(w):
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences with the best of several steps; return a code.
 
-    Steps are divided by 4 until Gamma changes little. The best step is the one at which Gamma changes least; it is
+    Steps are divided by 4 until Gamma changes little. The step at which Gamma changes least is the best one, and is
     stored as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if even this change is too large, else DONE.
     """
     least_change = np.inf

@@ -5,8 +5,8 @@ the end of this file, one for each task. Accelerations and multipliers are those
 
 If a step integrates all coordinates, its states are off the constraints by the error of the formula. One pass of a
 projection moves positions and velocities to the nearest state on the constraints, in the metric of M, which does not
-depend on the partition. After a pass, the error of positions is about the square of their correction, but the errors of
-velocities and accelerations are about as large as this correction: if it is not near rounding, another pass follows.
+depend on the partition. After a pass, the error of positions is about the square of their correction. The errors of
+velocities and accelerations are about as large as the correction: passes are repeated until it is near rounding.
 """
 
 import numpy as np
@@ -54,7 +54,7 @@ from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm,
 def acceleration_constraint(f, w, t, q, v):
     """Store Gamma, the right-hand side of G a = Gamma, in w.Gamma; return DONE or the code of a failure."""
     n_c, n_rows = w.C.size, w.Rate.size
-    if w.known == 1.0 and n_rows == n_c:
+    if w.has_gamma == 1.0 and n_rows == n_c:
         return DONE
     has_gamma, has_gamma_a = f.gamma_given == 1, f.nonholonomic_gamma_given == 1
     first, last = 0, n_rows  # range of the rows of Gamma that no callback computes
@@ -149,7 +149,7 @@ def _factor_rows_at(f, w, t, q, v):
     """
     if f.kinematics_given == 1:
         kinematics(f, w, t, q, v)
-        w.known = 1.0
+        w.has_gamma = 1.0
         code = factor_dependent_columns(w, t, q)
     else:
         code = evaluate_and_factor_columns(f, w, t, q)
@@ -198,9 +198,9 @@ def project_state(f, w, t, q, v, theta, a, lam):
 
     Rows of A constrain velocities only; positions are corrected in directions that these rows allow.
 
-    The last pass corrects positions by at most theta, and velocities by at most theta max(1, max|v|). A pass is also
-    the last one if its correction of positions is at most theta times the smallest pivot: the inverse of this pivot
-    bounds how fast tangents turn, so that velocities are accurate, too.
+    The last pass corrects positions by at most theta, and velocities by at most theta max(1, max|v|). Passes also end
+    after a correction of positions of at most theta times the smallest pivot: the inverse of this pivot bounds how fast
+    tangents turn, so that velocities are accurate, too.
     """
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.rounded)
@@ -223,7 +223,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
         if correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v)):
             break
         if correction_q <= w.pivot * theta:
-            w.known = 0.0  # Gamma was computed at the old velocities: compute it again
+            w.has_gamma = 0.0  # Gamma was computed at the old velocities: compute it again
             break
         if correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
@@ -383,7 +383,7 @@ def check_redundant_rows(f, w, t, q, v):
 
 @merged
 def rounding_floor(q):
-    """Return the largest change that rounding of q may cause in an iteration; below it, the iteration has converged."""
+    """Return the largest change by an iteration that rounding of q may cause; below it, the iteration has converged."""
     return max(ROUNDING_OF_CORRECTIONS, ROUNDING_OF_Q * largest_of(q))
 
 
@@ -411,16 +411,16 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
                 correction = max(correction, abs(w.x[j]))
             if correction <= tolerance and k > 0:
                 w.n_evaluations += 1
-                w.by_general = 0.0
+                w.used_general = 0.0
                 return DONE
             if correction > CONTRACTION * last_correction:
                 break
             last_correction = max(correction, tolerance)
-        w.by_general = 1.0
-    elif task == tasks.CHECK_REDUNDANT and w.by_general == 0.0:
+        w.used_general = 1.0
+    elif task == tasks.CHECK_REDUNDANT and w.used_general == 0.0:
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
         f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores the rows at q in w
     elif task <= tasks.MULTIPLIERS:  # tasks with a partition, for which there is no generated code
-        w.by_general = 1.0
+        w.used_general = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)

@@ -200,7 +200,7 @@ def _adopt_pivot_order(w):
         _copy_in_ascending_order(w.order[:rank_v], w.dependent_v)
         _copy_in_ascending_order(w.order[rank_v:], w.independent_v)
     w.sensitivity = 0.0
-    w.leaning = 0.0
+    w.max_coefficient = 0.0
     w.orientation = 0.0
     w.generation += 1.0
     if w.G_of_S.size > 0:
@@ -272,12 +272,12 @@ def choose_partition(f, w, t, q):
 def adopt_partition_of_midpoint(f, w, t_mid, state, new_state):
     """Adopt the partition that full pivoting chooses at the middle of a step; return a code.
 
-    The code is PARTITION_CHANGED, DONE or SINGULAR. The reversed step has the same middle, so that the partition, and
-    with it the step by a symmetric tableau, is symmetric in time. A partition that is used until it is poor would
-    depend on the direction of time.
+    The code is PARTITION_CHANGED, DONE or SINGULAR. The reversed step has the same middle, so that the partition is
+    symmetric in time, and with it a step by a symmetric tableau. A partition that is used until it is poor would depend
+    on the direction of time.
 
-    The middle is the mean of `state` and `new_state`, the end of the attempt with the current partition. The choice is
-    not checked again after the step is repeated with the new partition. So the reversed step may choose another
+    The middle is the mean of `state` and `new_state`, the end of the attempt with the current partition. After the step
+    is repeated with the new partition, the choice is not checked again. So the reversed step may choose another
     partition if two partitions are equally good within the difference of the two attempts, O(h^(p+1)).
     """
     n = w.Q.size
@@ -359,15 +359,15 @@ def partition_is_poor(w):
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     coefficient = _largest_coefficient(w)
-    if w.leaning == 0.0:
-        w.leaning = max(coefficient, 1.0)
-    return not coefficient <= SENSITIVITY_GROWTH * w.leaning
+    if w.max_coefficient == 0.0:
+        w.max_coefficient = max(coefficient, 1.0)
+    return not coefficient <= SENSITIVITY_GROWTH * w.max_coefficient
 
 
 MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # largest ratio of a correction to the previous one at which an iteration counts as convergent
 ROUNDING_OF_CORRECTIONS = 1e-12  # largest correction due to rounding alone, relative to the largest coordinate
-# factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding, because lever arms amplify errors:
+# factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding, because small parts amplify errors:
 # the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
 AMPLIFICATION = 1e3
 ROUNDING_OF_ROWS = 2e-15  # largest |C_i| that counts as a rounding error, relative to the largest |G_ij q_j|
@@ -403,7 +403,7 @@ def factor_dependent_columns(w, t, q):
 @merged
 def evaluate_and_factor_columns(f, w, t, q):
     """Store C_q and A at (t, q) in w.G, and factor the dependent columns; return DONE, SINGULAR or NOT_FINITE."""
-    w.known = 0.0
+    w.has_gamma = 0.0
     clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
     return factor_dependent_columns(w, t, q)
@@ -425,9 +425,9 @@ def is_on_constraints(w, q):
 def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve eq. (15) by Newton's method for the dependent positions in q; return a code.
 
-    The iteration ends after a correction of at most `tolerance`. On return, the rows and factors in w are those at q.
-    If the last correction was at most `reuse_limit`, they are those at q before this correction. The fused callback
-    also stores w.Rate and w.Gamma.
+    The iteration ends after a correction of at most `tolerance`. On return, the rows and factors in w are those at q,
+    or, after a last correction of at most `reuse_limit`, at q before this correction. The fused callback also stores
+    w.Rate and w.Gamma.
     """
     last_correction = np.inf
     has_converged = w.C.size == 0
@@ -471,7 +471,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
 @merged
 def find_null_space(f, w, t, q):
     """Store in w.D the null space of G and the driven velocities (see Work), from the rows and factors in w."""
-    if f.kinematics_given == 0 or w.known == 0.0:
+    if f.kinematics_given == 0 or w.has_gamma == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
     is_driven = f.constraint_rate_given == 1 or f.nonholonomic_rate_given == 1
@@ -482,11 +482,12 @@ def find_null_space(f, w, t, q):
 def restore_velocities(f, w, t, q, v, reuse_limit):
     """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, with rows and factors in w.
 
-    If no velocity changes by more than `reuse_limit`, KNOWN stays set: w.Gamma, by the fused callback, is still valid.
+    If no velocity changes by more than `reuse_limit`, HAS_GAMMA stays set: w.Gamma, by the fused callback, is still
+    valid.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size
-    w.known = float(f.kinematics_given)
+    w.has_gamma = float(f.kinematics_given)
     if f.form == NULL_SPACE:
         find_null_space(f, w, t, q)
         for k in range(rows.size):
@@ -496,7 +497,7 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
             for k in range(rows.size):
                 w.z[k] += w.D[j, k] * speed
     else:
-        if w.known == 0.0:
+        if w.has_gamma == 0.0:
             constraint_rates(f, w, t, q, w.Rate)
         row_residual(w, v, rows)
         solve(w.index_v, w.values_v, w.z)
@@ -507,7 +508,7 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
         change = max(change, abs(v[columns[k]] - w.z[k]))
         v[columns[k]] = w.z[k]
     if not change <= reuse_limit:
-        w.known = 0.0
+        w.has_gamma = 0.0
 
 
 @compiled

@@ -1,8 +1,8 @@
 """Do the tasks of the inner loop for large systems, by sparse factors in an order of elimination that is chosen once.
 
-There is no partition: all coordinates are integrated, and evaluated without a projection. Tasks that compute dependent
-coordinates in other forms move all coordinates to the nearest state on the constraints, in the metric of M. If sparse
-factors do not show which rows are independent, a task returns NEEDS_DENSE: the run then continues with the forms of
+There is no partition: all coordinates are integrated, and evaluated without a projection. Where other forms compute
+dependent coordinates, tasks move all coordinates to the nearest state on the constraints, in the metric of M. If sparse
+factors do not show which rows are independent, a task returns NEEDS_DENSE, and the run continues with the forms of
 saddle_point.py, which methods with a partition always use. If callbacks return values of entries, no array has n_c
 times n_q numbers. Callbacks may also fill dense matrices, from which the entries are copied.
 
@@ -65,7 +65,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-# rows with smaller pivots, relative to the size of the row, are checked: such pivots may be rounding errors
+# pivot, relative to the size of its row, below which the row is checked, because the pivot may be a rounding error
 SUSPECT_PIVOT = 1e-6
 MIN_PIVOT = 1e-10  # smallest pivot, relative to the size of its row, with which factors by 1-by-1 pivots are accurate
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows is at most this
@@ -77,7 +77,7 @@ REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
 @compiled
 def fill_mass_values(f, w, t, q):
-    """Store the entries of M(t, q) in w.mass_values, unless M is constant and dense, when they are already stored."""
+    """Store the entries of M(t, q) in w.mass_values; the entries of a constant dense M are stored there already."""
     if f.mass_values_given == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
@@ -173,9 +173,9 @@ def n_refinements(w):
 
 @compiled
 def _sine_to_independent_rows(f, w, row, square):
-    """Return the sine of the angle between row g, number `row` of G, and the independent rows, in the metric of M^-1.
+    """Return the sine of the angle between a row g of G and the independent rows, in the metric of M^-1.
 
-    `square` is g M^-1 g^T.
+    `row`: index of g in G; `square`: g M^-1 g^T.
     """
     x, part = w.unknowns, 0.0
     x[:] = 0.0
@@ -239,7 +239,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose and store the independent rows at (t, q); return a code, RANK_DIFFERS if w is made for another rank."""
+    """Choose and store the independent rows at (t, q); return a code: RANK_DIFFERS if w has another rank."""
     w.n_partitions += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -254,7 +254,7 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-REGULARIZATION = 1e-11  # diagonal entries of W (see above), relative to the sums of squares of the columns of G
+REGULARIZATION = 1e-11  # diagonal entries of W (module docstring), relative to the sums of squares of the columns of G
 CONVERGED_RESIDUAL = 1e-14  # residual of G^T lam = b, relative to max|b|, at which the refinement ends
 MAX_RESIDUAL = 1e-9  # largest residual of G^T lam = b, relative to max|b|, that is accepted if it no longer decreases
 MAX_SOLUTIONS = 30  # largest number of linear solutions in the refinement of multipliers of least norm

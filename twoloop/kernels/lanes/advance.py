@@ -1,7 +1,7 @@
 """Integration loop of runs in lanes: each lane has its own step size, and starts a new run when its run has ended.
 
-A run is removed from its lane, to be repeated alone, if a condition of the generated code does not hold, or if many
-successive steps are rejected. The function `step` of `CODE` takes the steps.
+If a condition of the generated code does not hold, or many successive steps are rejected, a run is removed from its
+lane, and repeated alone later. The function `step` of `CODE` takes the steps.
 """
 
 import numpy as np
@@ -24,12 +24,12 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
         previous_run = int(work[at.RUN * LANES + k])
         # the generated code of a series method clears RUNNING without storing a reason in `status`
         if work[at.RUNNING * LANES + k] == 0.0 and previous_run >= 0 and status[previous_run] == at.UNDECIDED:
-            status[previous_run] = at.OFTEN_REFUSED if work[at.REFUSED * LANES + k] < np.inf else at.NO_VALUES
-        work[at.FINE * LANES + k] = work[at.FRESH * LANES + k] = 0.0
+            status[previous_run] = at.MANY_REJECTIONS if work[at.N_REJECTED * LANES + k] < np.inf else at.NO_VALUES
+        work[at.ACTIVE * LANES + k] = work[at.IS_NEW * LANES + k] = 0.0
         if work[at.RUNNING * LANES + k] == 0.0 and next_run < numbers.shape[0]:
-            work[at.FINE * LANES + k] = work[at.FRESH * LANES + k] = work[at.RUNNING * LANES + k] = 1.0
-            work[at.T * LANES + k] = work[at.AHEAD * LANES + k] = control[at.T0]
-            work[at.REFUSED * LANES + k] = work[at.REACHED * LANES + k] = 0.0
+            work[at.ACTIVE * LANES + k] = work[at.IS_NEW * LANES + k] = work[at.RUNNING * LANES + k] = 1.0
+            work[at.T * LANES + k] = work[at.T_NEW * LANES + k] = control[at.T0]
+            work[at.N_REJECTED * LANES + k] = work[at.N_OUTPUTS * LANES + k] = 0.0
             work[at.RUN * LANES + k] = next_run
             for j in range(n):
                 work[(new + j) * LANES + k], work[(new + n + j) * LANES + k] = q0[next_run, j], v0[next_run, j]
@@ -40,13 +40,13 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
         n_running += int(work[at.RUNNING * LANES + k])
     if n_fresh > 0:
         for k in range(LANES):
-            work[at.REQUESTED * LANES + k] = work[at.FINE * LANES + k]
+            work[at.REQUESTED * LANES + k] = work[at.ACTIVE * LANES + k]
         project_lanes(code, order, control, work)
         for k in range(LANES):
             if work[at.REQUESTED * LANES + k] == 1.0:
                 for j in range(2 * n):
                     work[(state + j) * LANES + k] = work[(new + j) * LANES + k]
-                if work[at.FINE * LANES + k] == 0.0:
+                if work[at.ACTIVE * LANES + k] == 0.0:
                     remove_run(work, status, k, at.NO_START)
                     n_running -= 1
     return next_run, n_running
@@ -58,25 +58,25 @@ def _write_states_in_steps(code, settings, control, options, work, n, new, times
     while True:
         n_requested = 0
         for k in range(LANES):
-            i_time = int(work[at.REACHED * LANES + k])
-            work[at.FINE * LANES + k] = work[at.X * LANES + k] = 0.0
+            i_time = int(work[at.N_OUTPUTS * LANES + k])
+            work[at.ACTIVE * LANES + k] = work[at.X * LANES + k] = 0.0
             if work[at.ACCEPTED * LANES + k] == 1.0 and i_time < times.size:
                 step_end = work[at.T * LANES + k] + work[at.H * LANES + k]
                 if times[i_time] < step_end and times[i_time] < control[at.T1]:
-                    work[at.FINE * LANES + k], n_requested = 1.0, n_requested + 1
+                    work[at.ACTIVE * LANES + k], n_requested = 1.0, n_requested + 1
                     work[at.X * LANES + k] = times[i_time] - work[at.T * LANES + k]
-                    work[at.AHEAD * LANES + k] = times[i_time]
-            work[at.REQUESTED * LANES + k] = work[at.FINE * LANES + k]
+                    work[at.T_NEW * LANES + k] = times[i_time]
+            work[at.REQUESTED * LANES + k] = work[at.ACTIVE * LANES + k]
         if n_requested == 0:
             return
         code.step(code, settings, control, options, work, status, n_steps, True)
         project_lanes(code, settings[at.ORDER], control, work)
         for k in range(LANES):
             if work[at.REQUESTED * LANES + k] == 1.0:
-                run, i_time = int(work[at.RUN * LANES + k]), int(work[at.REACHED * LANES + k])
-                work[at.REACHED * LANES + k] += 1.0
+                run, i_time = int(work[at.RUN * LANES + k]), int(work[at.N_OUTPUTS * LANES + k])
+                work[at.N_OUTPUTS * LANES + k] += 1.0
                 for j in range(n):
-                    is_valid = work[at.FINE * LANES + k] == 1.0
+                    is_valid = work[at.ACTIVE * LANES + k] == 1.0
                     out_q[run, j, i_time] = work[(new + j) * LANES + k] if is_valid else np.nan
                     out_v[run, j, i_time] = work[(new + n + j) * LANES + k] if is_valid else np.nan
 
@@ -115,7 +115,7 @@ def _advance_time(work, control, n_steps):
             h, t = work[at.H * LANES + k], work[at.T * LANES + k]
             n_steps[int(work[at.RUN * LANES + k])] += 1
             work[at.T * LANES + k] = control[at.T1] if h == control[at.T1] - t else t + h
-            work[at.REFUSED * LANES + k] = 0.0
+            work[at.N_REJECTED * LANES + k] = 0.0
 
 
 _ADVANCE_SIGNATURE = types.void(
@@ -137,7 +137,7 @@ def advance_lanes(
     n, n_rows, order = settings[at.N], settings[at.N_ROWS], settings[at.ORDER]
     _, new, _, _, a, _, _, _ = offsets_in_work(n, n_rows, numbers.shape[1])
     next_run, has_new_runs = 0, False
-    for field in (at.T, at.AHEAD, at.H, at.X, at.RUNNING, at.ACCEPTED):
+    for field in (at.T, at.T_NEW, at.H, at.X, at.RUNNING, at.ACCEPTED):
         fill_field(work, field, 0.0)
     fill_field(work, at.UNIT, 1.0)
     fill_field(work, at.RUN, -1.0)

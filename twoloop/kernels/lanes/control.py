@@ -20,12 +20,12 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, whose first N_RULE entries are the step-size rule. ROUGH: largest ratio of an error to its
+# indices in `options`, whose first N_RULE entries are the step-size rule. JUMP_RATIO: largest ratio of an error to its
 # estimate if a force jumps; FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest
 # tolerance of a coordinate. From N_HEAD on, `options` contains the options of the method for a single run
-ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
+JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-# a force is assumed to jump in a step that is rejected with a larger error (in tolerances), as in advance.py
+# error of a rejected step, in tolerances, above which a force is assumed to jump in the step, as in advance.py
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step, as in advance.py
 # a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `size_off_grid`
@@ -35,7 +35,7 @@ LIMIT_MEMORY = 10.0  # number of accepted steps after which H_LIMIT no longer ap
 LEAST_FIRST_STEP = 20.0 * at.SHORTEST  # lower bound of the first step size, relative to |t0|
 # number of successive rejected steps after which a run leaves its lane, because the motion may be stiff
 MAX_REJECTED = 30
-MOST_STEPS = 100_000  # largest number of steps of a run in a lane, because the user cannot interrupt runs in lanes
+MAX_STEPS = 100_000  # largest number of steps of a run in a lane: the user cannot interrupt runs in lanes
 
 
 @inlined
@@ -65,21 +65,21 @@ def _first_step_size(options, control, work, n, state, a, k):
 
 @compiled
 def begin_control(options, control, work, n, state, a, start):
-    """Initialize step-size control, and copy the accelerations at offset `a` to `start`, in lanes with FRESH = 1."""
+    """Initialize step-size control, and copy the accelerations at offset `a` to `start`, in lanes with IS_NEW = 1."""
     for k in range(LANES):
-        if work[at.FRESH * LANES + k] == 1.0:
+        if work[at.IS_NEW * LANES + k] == 1.0:
             for j in range(n):
                 work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
             work[at.H_NEXT * LANES + k] = _first_step_size(options, control, work, n, state, a, k)
             work[at.H_LIMIT * LANES + k], work[at.LIMIT_AGE * LANES + k] = np.inf, 0.0
-            work[at.ROUGH_TO * LANES + k] = -np.inf
+            work[at.JUMP_END * LANES + k] = -np.inf
             for i in range(N_PAST):
                 work[at.PAST * LANES + N_PAST * k + i] = 0.0
 
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Store the next step size, at most control[GAP], in H and X (0 in lanes without a run); copy RUNNING to FINE."""
+    """Store the next step size, at most control[GAP], in H and X (0 in lanes without a run); copy RUNNING to ACTIVE."""
     t1 = control[at.T1]
     for k in range(LANES):
         work[at.H * LANES + k], t = 0.0, work[at.T * LANES + k]
@@ -90,30 +90,30 @@ def choose_steps(work, control, status, n_steps):
                 h = time_left
             elif h > 0.5 * time_left:
                 h = 0.5 * time_left  # two equal steps rather than a long and a tiny one
-            if n_steps[int(work[at.RUN * LANES + k])] >= MOST_STEPS:
+            if n_steps[int(work[at.RUN * LANES + k])] >= MAX_STEPS:
                 remove_run(work, status, k, at.MANY_STEPS)
             elif h > at.SHORTEST * max(abs(t), abs(t1)):
-                work[at.H * LANES + k], work[at.H_FREE * LANES + k] = h, h_wanted
+                work[at.H * LANES + k], work[at.H_FULL * LANES + k] = h, h_wanted
             else:
                 last_step_failed = work[at.H_LIMIT * LANES + k] < np.inf and work[at.LIMIT_AGE * LANES + k] == 0.0
-                remove_run(work, status, k, at.NO_VALUES if last_step_failed else at.OFTEN_REFUSED)
+                remove_run(work, status, k, at.NO_VALUES if last_step_failed else at.MANY_REJECTIONS)
         work[at.X * LANES + k] = work[at.H * LANES + k]
-        work[at.FINE * LANES + k] = work[at.RUNNING * LANES + k]
+        work[at.ACTIVE * LANES + k] = work[at.RUNNING * LANES + k]
 
 
 @compiled
 def set_end(work, control):
-    """Set AHEAD, the time of NEW, to T + X; to exactly t1 at the end of the run."""
+    """Set T_NEW, the time of NEW, to T + X; to exactly t1 at the end of the run."""
     for k in range(LANES):
         t, x = work[at.T * LANES + k], work[at.X * LANES + k]
-        work[at.AHEAD * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x
+        work[at.T_NEW * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x
 
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
     """Project NEW onto the constraints; raise ERROR to the change by the projection, in tolerances, if that is larger.
 
-    If velocities change by more than the tolerances, a drive jumps or bends between the stages. Scratch: `predicted_v`.
+    Velocities change by more than the tolerances if a drive jumps or bends between stages. `predicted_v` is scratch.
     """
     n, order = settings[at.N], settings[at.ORDER]
     state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -122,30 +122,31 @@ def end_steps(code, settings, control, work, predicted_v):
         work[predicted_v * LANES + i] = work[(new + n) * LANES + i]
     project_lanes(code, order, control, work)
     if settings[at.CHECKS_REDUNDANT] == 1:
-        code.redundant(order, control, work)
-    code.departure(order, control, work)
+        code.check_redundant_rows(order, control, work)
+    code.compute_departure(order, control, work)
     for i in range(n * LANES):
         work[predicted_v * LANES + i] -= work[(new + n) * LANES + i]
     for j in range(n):
         atol = control[at.ATOL + j]
         raise_to_ratio(work, at.ERROR, predicted_v + j, at.RUNNING, state + n + j, new + n + j, atol, control[at.RTOL])
     for k in range(LANES):
-        work[at.ERROR * LANES + k] = max(work[at.ERROR * LANES + k], work[at.OFF * LANES + k])
+        work[at.ERROR * LANES + k] = max(work[at.ERROR * LANES + k], work[at.DEPARTURE * LANES + k])
 
 
 @merged
 def _accept_or_shorten(options, work, k):
     """Store the size of the next step in lane k in H_NEXT; return whether the last step in this lane is accepted."""
     h, t, error = work[at.H * LANES + k], work[at.T * LANES + k], work[at.ERROR * LANES + k]
-    if work[at.FINE * LANES + k] == 0.0 or not np.isfinite(error):
+    if work[at.ACTIVE * LANES + k] == 0.0 or not np.isfinite(error):
         work[at.H_NEXT * LANES + k], work[at.H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[at.LIMIT_AGE * LANES + k] = 0.0
         return False
-    # where a force jumps, the error estimate may be small by chance: until ROUGH_TO, multiply the estimate by ROUGH
-    error_factor = options[ROUGH] if t < work[at.ROUGH_TO * LANES + k] else 1.0
+    # where a force jumps, the error estimate may be small by chance: until JUMP_END, multiply the estimate by
+    # JUMP_RATIO
+    error_factor = options[JUMP_RATIO] if t < work[at.JUMP_END * LANES + k] else 1.0
     is_accepted = error * error_factor <= 1.0
     if error > SUDDEN_ERROR and not is_accepted:
-        work[at.ROUGH_TO * LANES + k] = t + h
+        work[at.JUMP_END * LANES + k] = t + h
     error *= error_factor
     past = _history_view(work, k)
     h_proposed = min(h * step_size_ratio(options, past, h, error), work[at.H_LIMIT * LANES + k])
@@ -153,7 +154,7 @@ def _accept_or_shorten(options, work, k):
         work[at.H_NEXT * LANES + k] = min(h_proposed, MAX_RATIO_AFTER_REJECTION * h)
         return False
     record_accepted_step(options, past, h, error)
-    h_free = work[at.H_FREE * LANES + k]
+    h_free = work[at.H_FULL * LANES + k]
     work[at.H_NEXT * LANES + k] = max(h_proposed, h_free) if h < h_free else h_proposed
     work[at.LIMIT_AGE * LANES + k] += 1.0
     if work[at.LIMIT_AGE * LANES + k] > LIMIT_MEMORY:
@@ -163,7 +164,7 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED according to ERROR and FINE; copy the final accelerations `a` of accepted steps to `start`."""
+    """Set ACCEPTED according to ERROR and ACTIVE; copy the final accelerations `a` of accepted steps to `start`."""
     for k in range(LANES):
         work[at.ACCEPTED * LANES + k] = 0.0
         if work[at.RUNNING * LANES + k] == 0.0:
@@ -173,9 +174,9 @@ def judge_steps(options, work, n, a, start, status):
             for j in range(n):
                 work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
         else:
-            work[at.REFUSED * LANES + k] += 1.0
-            if work[at.REFUSED * LANES + k] > MAX_REJECTED:
-                remove_run(work, status, k, at.OFTEN_REFUSED if work[at.FINE * LANES + k] == 1.0 else at.NO_VALUES)
+            work[at.N_REJECTED * LANES + k] += 1.0
+            if work[at.N_REJECTED * LANES + k] > MAX_REJECTED:
+                remove_run(work, status, k, at.MANY_REJECTIONS if work[at.ACTIVE * LANES + k] == 1.0 else at.NO_VALUES)
 
 
 def memory_size(s: int, n: int) -> int:
@@ -197,7 +198,7 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
         choose_steps(work, control, status, n_steps)
         copy_vectors(work, state, memory + at.BEGIN * n, 2 * n)
         copy_vectors(work, start, memory + at.SLOPES * n, n)
-    code.stages(settings[at.ORDER], control, work)
+    code.compute_stages(settings[at.ORDER], control, work)
     set_end(work, control)
     if not within:
         end_steps(code, settings, control, work, memory + at.PREDICTED_V * n)
@@ -214,21 +215,21 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
     if within:
         for k in range(LANES):
             work[at.X * LANES + k] = work[at.X * LANES + k] / work[at.UNIT * LANES + k]
-        code.evaluate(order, control, work)
+        code.evaluate_series(order, control, work)
         return
     for k in range(LANES):  # end runs with too many steps: in stiff motion, any tolerance may need many
-        if work[at.RUNNING * LANES + k] == 1.0 and n_steps[int(work[at.RUN * LANES + k])] >= MOST_STEPS:
+        if work[at.RUNNING * LANES + k] == 1.0 and n_steps[int(work[at.RUN * LANES + k])] >= MAX_STEPS:
             remove_run(work, status, k, at.MANY_STEPS)
-    code.series(order, control, work)
-    code.lengths(order, control, work)
+    code.compute_series(order, control, work)
+    code.choose_sizes(order, control, work)
     for k in range(LANES):  # count the evaluations of the defect within the step
-        if work[at.FINE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
+        if work[at.ACTIVE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
             work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0
-    code.check_within(order, control, work)
-    code.evaluate(order, control, work)
+    code.check_defect_within(order, control, work)
+    code.evaluate_series(order, control, work)
     project_lanes(code, order, control, work)
     if settings[at.CHECKS_REDUNDANT] == 1:
-        code.redundant(order, control, work)
-    code.departure(order, control, work)
-    code.defect(order, control, work)
-    code.judge(order, control, work)
+        code.check_redundant_rows(order, control, work)
+    code.compute_departure(order, control, work)
+    code.evaluate_defect(order, control, work)
+    code.accept_or_reject(order, control, work)

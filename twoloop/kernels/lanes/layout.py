@@ -17,73 +17,60 @@ from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, inlined, merged
 
 # status of a run: not ended, ended at t1, or (negative) the reason why the run has to be repeated outside the lanes,
-# for example UNLIKE: callbacks disagree with the generated code
+# for example CALLBACKS_DIFFER: callbacks disagree with the generated code
 UNDECIDED, ENDED = 0, 1
-NO_START, NO_STATE, NO_VALUES, OFTEN_REFUSED, MANY_STEPS, UNLIKE = range(-6, 0)
+NO_START, NO_STATE, NO_VALUES, MANY_REJECTIONS, MANY_STEPS, CALLBACKS_DIFFER = range(-6, 0)
 
 LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of doubles in a SIMD register
 
 # offsets in `work` of the fields, each a vector; after the fields, `work` contains the arrays of `array_offsets`
 (
     T,  # time of STATE, s
-    AHEAD,  # time of NEW, s
+    T_NEW,  # time of NEW, s
     UNIT,  # unit of time of a series, s
     H,  # size of the step, s
     X,  # time from the beginning of the step to the state to be computed, s
-    FINE,  # 1 in lanes in which a task has to run; after the task, 1 in lanes in which it has succeeded
+    ACTIVE,  # 1 in lanes in which the next task has to run; the task sets it to 0 where it fails
     DEFECT,  # defect at the end of the step, relative to the allowed defect
-    OFF,  # difference of predicted and projected positions, relative to its limit, see `departure` of step_size.py
+    DEPARTURE,  # difference of predicted and projected positions, relative to its limit, see step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
     LONGEST,  # largest allowed step size, s
     REQUESTED,  # 1 in lanes that begin a run, or in which a state within the step is to be computed
-    WORST,  # largest defect within the step, relative to the allowed defect
-    REFUSED,  # number of successive rejected steps
+    WORST_DEFECT,  # largest defect within the step, relative to the allowed defect
+    N_REJECTED,  # number of successive rejected steps
     RUNNING,  # 1 in lanes with a run
     RUN,  # index of the run in this lane
-    REACHED,  # number of output times that the run has reached
-    LEFT_TO_MOVE,  # 1 in lanes whose projection has not converged yet
-    MOVED_BEFORE,  # largest change of a position by the previous pass of a projection
+    N_OUTPUTS,  # number of output times that the run has reached
+    UNCONVERGED,  # 1 in lanes whose projection has not converged yet
+    LAST_CORRECTION,  # largest change of a position by the previous pass of a projection
     ACCEPTED,  # 1 in lanes whose step was accepted
-    FRESH,  # 1 in lanes whose run has not taken a step yet
+    IS_NEW,  # 1 in lanes whose run has not taken a step yet
     ERROR,  # error estimate of the step, in units of the tolerances
-    H_FREE,  # size of the step before it was shortened to reach the end of the run, s
+    H_FULL,  # size of the step before it was shortened to reach the end of the run, s
     H_NEXT,  # size of the next step, s
     H_LIMIT,  # upper limit of step sizes after a failed step, s; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
-    ROUGH_TO,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
+    JUMP_END,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
     SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
     EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
     PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# tasks are functions (order, control, work) that are generated for a mechanism and change `work`; these are their names
-TASKS = (
-    "approach",  # move the positions of NEW, at the time AHEAD, towards the constraints, in lanes with FINE = 1
-    "refine",  # correct NEW once in lanes with LEFT_TO_MOVE = 1; compute A and LAM; FINE is 1 if NEW has converged
-    "redundant",  # clear FINE in lanes in which redundant constraints do not hold at NEW
-    "departure",  # compute OFF, the ratio of |NEW - PREDICTED| to its limit, for a step H from STATE
-    "commit",  # copy NEW to STATE in lanes with ACCEPTED = 1
-)
-# "rows": store C, C_t and the entries of C_q at NEW and AHEAD in the method's memory; succeed if all are finite
-TASKS_OF_STARTS = ("rows",)
-TASKS_OF_STAGES = ("accelerate",)  # compute the accelerations A at the state NEW, without a projection
-# "stages": compute the state NEW at the time X after the beginning of the step, and ERROR if X is the whole step
-TASKS_OF_EXPLICIT = ("stages",)
+# names of tasks: functions (order, control, work) that are generated for a mechanism. The methods of the same names in
+# generate/lane_code.py describe them
+TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_departure", "commit")
+TASKS_OF_STARTS, TASKS_OF_STAGES, TASKS_OF_EXPLICIT = ("compute_rows",), ("compute_accelerations",), ("compute_stages",)
 TASKS_OF_SERIES = (
-    "series",  # compute the coefficients of the Taylor series about STATE, with UNIT as the unit of time
-    "lengths",  # compute LENGTH, H and X of the step; succeed if the run can continue
-    "check_within",  # compute WORST, the largest defect within a step H, and AHEAD, the time of its end
-    "evaluate",  # compute NEW, PREDICTED and the accelerations SERIES_A by the series, X units of time after T
-    "defect",  # compute DEFECT at NEW, the end of a step H: the difference of A and SERIES_A, relative to its limit
-    "judge",  # set ACCEPTED, and choose the size of the next step
+    *("compute_series", "choose_sizes", "check_defect_within"),
+    *("evaluate_series", "evaluate_defect", "accept_or_reject"),
 )
 CODE = Reference("LaneKit", {})  # numba's type for objects of the class LaneKit
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # signature of a method's step, (code, settings, control, options, work, status, n_steps, within): in each lane with a
 # run, take a step H, set ACCEPTED, and compute NEW, A and LAM at its end. If `within`, instead compute the state NEW at
-# the time X after the beginning of the last accepted step, without a projection, in lanes with FINE = 1
+# the time X after the beginning of the last accepted step, without a projection, in lanes with ACTIVE = 1
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
@@ -142,7 +129,7 @@ def fill_field(work, field, value):
 
 @merged
 def remove_run(work, status, k, reason):
-    """Remove the run from lane k; store in `status` the `reason`, such as NO_VALUES, why it is repeated alone."""
+    """Remove the run from lane k; store in `status` the `reason`, such as NO_VALUES, for which it is repeated alone."""
     work[RUNNING * LANES + k] = 0.0
     status[int(work[RUN * LANES + k])] = reason
 
@@ -217,17 +204,17 @@ def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
 
 
 @merged
-def _multiply_number(work, target, apart, x, imaginary):
+def _multiply_number(work, target, imaginary_target, x, imaginary):
     """Multiply the number `target` by x in each lane; if `imaginary` > 0, both numbers are complex.
 
-    Their imaginary parts are `apart` vectors after the real part of `target`, and `imaginary` vectors after that of x.
+    Imaginary parts are `imaginary_target` vectors after the real part of `target`, and `imaginary` vectors after x.
     """
     for k in range(LANES):
         t, p = target * LANES + k, x * LANES + k
         if imaginary == 0:
             work[t] *= work[p]
         else:
-            i, j = apart * LANES, imaginary * LANES
+            i, j = imaginary_target * LANES, imaginary * LANES
             re, im = work[t] * work[p] - work[t + i] * work[p + j], work[t] * work[p + j] + work[t + i] * work[p]
             work[t], work[t + i] = re, im
 
@@ -263,7 +250,7 @@ def _pivot_magnitude(work, entry, imaginary, k):
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
     """Exchange rows so that the pivot (c, c) is the largest entry of column c from row c on; replace it by its inverse.
 
-    Clear FINE in lanes in which the pivot is zero.
+    Clear ACTIVE in lanes in which the pivot is zero.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)
@@ -278,7 +265,7 @@ def _choose_pivot(work, matrix, pivots, n, imaginary, c):
                 if imaginary > 0:
                     _exchange_entries(work, matrix + c * n + j + imaginary, matrix + best * n + j + imaginary, k)
         if not largest > 0.0:
-            work[FINE * LANES + k] = 0.0
+            work[ACTIVE * LANES + k] = 0.0
         re = (matrix + c * n + c) * LANES + k
         if imaginary == 0:
             work[re] = 1.0 / work[re]
@@ -323,17 +310,17 @@ def solve_systems(work, matrix, pivots, n, imaginary, x):
         _multiply_number(work, x + i, imaginary_x, matrix + i * n + i, imaginary)
 
 
-MAX_PASSES = 10  # largest number of passes of a projection, each with the task "refine"
+MAX_PASSES = 10  # largest number of passes of a projection, each with the task "correct_state"
 
 
 @compiled
 def project_lanes(code, order, control, work):
-    """Project NEW onto the constraints in lanes with FINE = 1; clear FINE where the projection does not converge."""
-    code.approach(order, control, work)
+    """Project NEW onto the constraints in lanes with ACTIVE = 1; clear ACTIVE where projections do not converge."""
+    code.correct_positions(order, control, work)
     for _ in range(MAX_PASSES):
-        code.refine(order, control, work)
+        code.correct_state(order, control, work)
         n_left = 0.0
         for k in range(LANES):
-            n_left += work[LEFT_TO_MOVE * LANES + k]
+            n_left += work[UNCONVERGED * LANES + k]
         if n_left == 0.0:
             break

@@ -130,21 +130,21 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
     node, begin = middle_node(c), vector_offset(memory, n, BEGIN_Q)
     for k in range(LANES):
         x = node * work[at.X * LANES + k]
-        work[at.AHEAD * LANES + k] = work[at.T * LANES + k] + x
+        work[at.T_NEW * LANES + k] = work[at.T * LANES + k] + x
         for j in range(n):
             index = (begin + j) * LANES + k
             q, v, a0 = work[index], work[index + n * LANES], work[index + 2 * n * LANES]
             work[(new + j) * LANES + k] = q + x * (v + 0.5 * x * a0)
             work[(new + n + j) * LANES + k] = v + x * a0
-    code.approach(order, control, work)
-    code.accelerate(order, control, work)
+    code.correct_positions(order, control, work)
+    code.compute_accelerations(order, control, work)
     copy_vectors(work, new, vector_offset(memory, n, MIDDLE_Q), 2 * n)
     copy_vectors(work, a, vector_offset(memory, n, MIDDLE_A), n)
 
 
 @compiled
 def compute_derivatives(code, settings, control, c, work):
-    """Store the derivatives of the accelerations in the middle of the step by q and v, in lanes with FINE = 1.
+    """Store the derivatives of the accelerations in the middle of the step by q and v, in lanes with ACTIVE = 1.
 
     The middle is the time of a stage, because forces that act only between two stages must not affect the step.
     """
@@ -158,7 +158,7 @@ def compute_derivatives(code, settings, control, c, work):
         for k in range(LANES):
             index = (new + column) * LANES + k
             work[index] += RELATIVE_DISPLACEMENT * max(1.0, abs(work[index]))
-        code.accelerate(order, control, work)
+        code.compute_accelerations(order, control, work)
         matrix = matrix_offset(memory, n, s, DERIVATIVE_Q if column < n else DERIVATIVE_V) + column % n
         for k in range(LANES):
             per_displacement = 1.0 / (work[(new + column) * LANES + k] - work[(middle + column) * LANES + k])
@@ -228,7 +228,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations in STAGES; clear FINE in lanes with invalid values."""
+    """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations in STAGES; clear ACTIVE where values are invalid."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -253,8 +253,8 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
                 work[index_of_scale_q] = max(work[index_of_scale_q], abs(work[(new + m) * LANES + k]))
                 work[index_of_scale_v] = max(work[index_of_scale_v], abs(v))
         for k in range(LANES):
-            work[at.AHEAD * LANES + k] = work[at.T * LANES + k] + c[j] * work[at.X * LANES + k]
-        code.accelerate(order, control, work)
+            work[at.T_NEW * LANES + k] = work[at.T * LANES + k] + c[j] * work[at.X * LANES + k]
+        code.compute_accelerations(order, control, work)
         for i in range(n * LANES):
             work[(residual + j * n) * LANES + i] = work[a * LANES + i] - work[(stages + j * n) * LANES + i]
 
@@ -318,14 +318,14 @@ def _store_largest_corrections(settings, A, A2, work):
 
 @merged
 def _has_iteration_ended(options, work, memory, iteration, k):
-    """Set DONE to 1 if the iteration of lane k has converged, otherwise to 0; return whether the iteration ends."""
+    """Set DONE to 1 if the iteration in lane k has converged, otherwise to 0; return whether the iteration ends."""
     x, tolerance = work[at.X * LANES + k], options[N_HEAD + OUTER_TOL]
     rounding_limit = MAX_ROUNDING_CORRECTION * options[LEAST]
     change_v = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
     change_q = x * x * work[(memory + LARGEST_Q) * LANES + k] / work[(memory + SCALE_Q) * LANES + k]
     change, before = max(change_v, change_q), work[(memory + CHANGE_BEFORE) * LANES + k]
     work[(memory + CHANGE_BEFORE) * LANES + k] = change
-    if not np.isfinite(change_v + change_q) or work[at.FINE * LANES + k] == 0.0:
+    if not np.isfinite(change_v + change_q) or work[at.ACTIVE * LANES + k] == 0.0:
         return True
     n_left = MAX_ITERATIONS - 1 - iteration
     contraction = change / before if iteration > 0 and before > 0.0 else 0.0
@@ -345,17 +345,17 @@ def _has_iteration_ended(options, work, memory, iteration, k):
 
 @compiled
 def solve_stages(code, settings, control, options, method_options, A, A2, c, work):
-    """Solve for STAGES of a step of size X, from the prediction, in lanes with FINE = 1; clear FINE on divergence."""
+    """Solve for STAGES of a step of size X, from the prediction, where ACTIVE is 1; clear ACTIVE on divergence."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     iterating, done = memory + ITERATING, memory + DONE
     for k in range(LANES):
-        work[iterating * LANES + k] = work[at.FINE * LANES + k]
+        work[iterating * LANES + k] = work[at.ACTIVE * LANES + k]
         work[done * LANES + k] = 0.0
     for iteration in range(MAX_ITERATIONS):
         n_left = 0.0
         for k in range(LANES):
-            work[at.FINE * LANES + k] = work[iterating * LANES + k]
+            work[at.ACTIVE * LANES + k] = work[iterating * LANES + k]
             n_left += work[iterating * LANES + k]
             work[at.EVALUATED * LANES + k] += c.size * work[iterating * LANES + k]
         if n_left == 0.0:
@@ -367,7 +367,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
             if work[iterating * LANES + k] == 1.0 and _has_iteration_ended(options, work, memory, iteration, k):
                 work[iterating * LANES + k] = 0.0
     for k in range(LANES):
-        work[at.FINE * LANES + k] = work[done * LANES + k]
+        work[at.ACTIVE * LANES + k] = work[done * LANES + k]
 
 
 @compiled
@@ -465,7 +465,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
 
 @compiled
 def _velocity_error(control, work, n, velocity_error, duration, state, new, k):
-    """Return the largest error, in tolerances, that a velocity error of `duration` (s) causes in lane k."""
+    """Return the largest error, in tolerances, that a velocity error causes in `duration` (s) in lane k."""
     error = 0.0
     for j in range(n):
         weight_q = duration / _allowed_error(control, work, state, new, j, j, k)
@@ -498,7 +498,7 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
         if work[at.ERROR * LANES + k] <= 1.0:
             motion_time = _motion_time(control, work, n, memory, k)
             error = _velocity_error(control, work, n, e_v, motion_time, state, new, k)
-        work[error_field * LANES + k], work[fine_copy * LANES + k] = error, work[at.FINE * LANES + k]
+        work[error_field * LANES + k], work[fine_copy * LANES + k] = error, work[at.ACTIVE * LANES + k]
         has_large_error = has_large_error or error > 1.0
     if not has_large_error:
         return
@@ -515,10 +515,10 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
     for k in range(LANES):
         error = work[error_field * LANES + k]
         # in unstable motion, the filter may enlarge the error: use the smaller error
-        if work[at.FINE * LANES + k] == 1.0:
+        if work[at.ACTIVE * LANES + k] == 1.0:
             motion_time = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, motion_time, state, new, k))
-        work[at.FINE * LANES + k] = work[fine_copy * LANES + k]
+        work[at.ACTIVE * LANES + k] = work[fine_copy * LANES + k]
         if work[error_field * LANES + k] > 1.0:
             work[at.ERROR * LANES + k] = max(work[at.ERROR * LANES + k], error)
 
@@ -576,7 +576,7 @@ def step_by_newton(code, settings, control, options, work, status, n_steps, with
     if not within:
         begin_control(options, control, work, n, state, a, start)
         for k in range(LANES):
-            if work[at.FRESH * LANES + k] == 1.0:
+            if work[at.IS_NEW * LANES + k] == 1.0:
                 work[(memory + H_PREVIOUS) * LANES + k] = work[(memory + DURATION) * LANES + k] = 0.0
         choose_steps(work, control, status, n_steps)
         copy_vectors(work, state, begin, 2 * n)

@@ -1,4 +1,4 @@
-"""Project initial states onto the constraints by the least change, in lanes; check whether another assembly is as near.
+"""Project initial states in lanes onto the constraints by the least change; check whether another assembly is as near.
 
 The least change follows from the Cholesky factor of G G^T, with the rows of G scaled to norm 1. Redundant rows are
 linearly dependent at positions that satisfy the constraints, and nearly so at others. The rows of Z are eigenvectors of
@@ -21,7 +21,7 @@ from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, 
 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
-MAX_REDUNDANT_EIGENVALUE = 1e-4  # combinations of rows count as redundant if their eigenvalue of G G^T is smaller
+MAX_REDUNDANT_EIGENVALUE = 1e-4  # largest eigenvalue of G G^T whose combination of rows counts as redundant
 # number of inverse iterations for each row of Z: few, because redundant combinations have much smaller eigenvalues
 N_REDUNDANT_ITERATIONS = 5
 # multiples of this number, modulo 1, are irregular start values of inverse iterations
@@ -203,14 +203,14 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# no other assembly can be as near if the projection of displaced positions differs from its linear prediction by C_q by
-# at most this, relative to the displacement
+# largest difference between the projection of displaced positions and its linear prediction by C_q, relative to the
+# displacement, with which no other assembly can be as near
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
-# displacements of other guesses from the projected positions, as two factors: that of `change_from_guess`, the change
-# from the first guess to the projected positions, and that of the weakest direction
+# displacements of other guesses from the projected positions, as two factors: on the change from the first guess to the
+# projected positions, and on the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
@@ -283,31 +283,31 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
     G, x, change, _, _, _, _, row, _, factors, _ = _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors
     for k in range(LANES):
-        work[at.LEFT_TO_MOVE * LANES + k] = work[at.RUNNING * LANES + k]
+        work[at.UNCONVERGED * LANES + k] = work[at.RUNNING * LANES + k]
     for _ in range(MAX_ITERATIONS):
-        fill_field(work, at.FINE, 1.0)
-        code.rows(0, control, work)
+        fill_field(work, at.ACTIVE, 1.0)
+        code.compute_rows(0, control, work)
         factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
         copy_vectors(work, memory, x, n_rows)
         solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change)
         n_left = 0.0
         for k in range(LANES):
-            if work[at.LEFT_TO_MOVE * LANES + k] == 0.0:
+            if work[at.UNCONVERGED * LANES + k] == 0.0:
                 continue
-            if work[at.FINE * LANES + k] == 0.0 or not _largest_value(work, change, n, k) < np.inf:
-                work[at.LEFT_TO_MOVE * LANES + k] = work[at.RUNNING * LANES + k] = 0.0
+            if work[at.ACTIVE * LANES + k] == 0.0 or not _largest_value(work, change, n, k) < np.inf:
+                work[at.UNCONVERGED * LANES + k] = work[at.RUNNING * LANES + k] = 0.0
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
             # the last change is applied, too, so that the result is as accurate as possible
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
-                work[at.LEFT_TO_MOVE * LANES + k] = 0.0
+                work[at.UNCONVERGED * LANES + k] = 0.0
             else:
                 n_left += 1.0
         if n_left == 0.0:
             return
     for k in range(LANES):
-        if work[at.LEFT_TO_MOVE * LANES + k] == 1.0:
+        if work[at.UNCONVERGED * LANES + k] == 1.0:
             work[at.RUNNING * LANES + k] = 0.0
 
 
@@ -318,8 +318,8 @@ def _project_velocities(code, settings, control, pattern, moves, work):
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     G, x, change, _, _, _, _, row, factors, _, _ = _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors
-    fill_field(work, at.FINE, 1.0)
-    code.rows(0, control, work)
+    fill_field(work, at.ACTIVE, 1.0)
+    code.compute_rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
     for _ in range(2):  # the second pass removes the rounding errors of a large change
         for i in range(n_rows):
@@ -331,7 +331,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
         for j in range(n * LANES):
             work[(new + n) * LANES + j] += work[change * LANES + j]
     for k in range(LANES):
-        if work[at.FINE * LANES + k] == 0.0 or not _largest_value(work, new, 2 * n, k) < np.inf:
+        if work[at.ACTIVE * LANES + k] == 0.0 or not _largest_value(work, new, 2 * n, k) < np.inf:
             work[at.RUNNING * LANES + k] = 0.0
 
 
@@ -389,10 +389,10 @@ _START_SIGNATURE = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.f
 
 
 @kernel(_START_SIGNATURE, vectorized=True)
-def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, work):
+def start_lanes(code, settings, control, pattern, moves, numbers, q, v, valid, work):
     """Replace the states q and v (n_runs, n) by their projections onto the constraints at t0.
 
-    `fine` (n_runs,) becomes 1 for runs whose projection succeeds, otherwise 0. pattern : sparsity pattern of G, see
+    `valid` (n_runs,) becomes 1 for runs whose projection succeeds, otherwise 0. pattern : sparsity pattern of G, see
     module docstring; moves : (n,) 1 for coordinates that may change; numbers : (n_runs, n_numbers) data of the code.
     """
     n, n_rows, n_redundant, n_runs = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
@@ -400,7 +400,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
     _, _, _, nearest_positions, change_from_guess, _, _, row, _, _, _ = _memory_offsets(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
-    fill_field(work, at.AHEAD, control[at.T0])
+    fill_field(work, at.T_NEW, control[at.T0])
     for j in range(n):
         fill_field(work, memory + row + j, 0.0)
     for first in range(0, n_runs, LANES):
@@ -420,7 +420,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
                 work[(memory + change_from_guess + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
         _check_other_guesses(code, settings, control, pattern, moves, work)
         for k in range(min(LANES, n_runs - first)):
-            fine[first + k] = int(work[at.RUNNING * LANES + k])
+            valid[first + k] = int(work[at.RUNNING * LANES + k])
             for j in range(n):
                 q[first + k, j] = work[(memory + nearest_positions + j) * LANES + k]
                 v[first + k, j] = work[(new + n + j) * LANES + k]

@@ -66,8 +66,8 @@ def call_lapack(typing_context, address, arguments):
     return types.int64(address, arguments), emit_call
 
 
-# smallest number of coordinates for which Newton steps by banded algebra count as faster than by dense algebra: the
-# measured limit is 36 to 75, on chains of bandwidth 1 to 11 and on beams. Single evaluations, as in a fixed-point
+# smallest number of coordinates for which Newton steps by banded algebra count as faster than by dense algebra. The
+# limit measured on chains of bandwidth 1 to 11, and on beams, is 36 to 75. Single evaluations, as in a fixed-point
 # iteration, are faster only above about 150 coordinates; with 56 coordinates they take a third longer
 MIN_BANDED_SIZE = 56
 

@@ -15,7 +15,7 @@ def copy(source, target):
 
 @merged
 def copy_matrix(source, target):
-    """Copy the matrix `source` to `target` row by row, as many rows as the smaller of both matrices has."""
+    """Copy the matrix `source` to `target` row by row, up to the end of the smaller matrix."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]

@@ -8,11 +8,12 @@ from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, 
 
 NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries of G: always zero, constant, varying
 ROWS_SEARCHED = 4  # pivot blocks are sought only in this number of rows, those with the fewest entries, to save time
-# limits of a pivot block, in three tiers, which are tried in this order. MAX_SQUARES: largest sum of squares of the
-# changes of the block's coordinates if each other coordinate moves by 1. MIN_SINE_SQUARES: smallest squared sine of the
-# angle between the block's two columns or, for a single pivot, smallest squared pivot over the squared norm of its
-# column of G. Pivots of the first tier stay large for 98 % of a turn of a spatial four-bar, pivots of the second tier
-# for 34 %. The last tier is well above MIN_PIVOT_SQUARE of generate/null_space.py: a choice stays valid for some motion
+# limits of a pivot block, in three tiers, which are tried in this order
+# - MAX_SQUARES: largest sum of squares of the changes of the block's coordinates if each other coordinate moves by 1
+# - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
+#   squared ratio of the pivot to the norm of its column of G
+# Pivots of the first tier stay large for 98 % of a turn of a spatial four-bar, pivots of the second tier for 34 %. The
+# last tier is well above MIN_PIVOT_SQUARE of generate/null_space.py, so that a choice stays valid for some motion
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 MIN_CONSTANT_PIVOT = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
 CANCELLATION = 1e-12  # largest |a - b| of two constants that counts as zero, relative to |b|

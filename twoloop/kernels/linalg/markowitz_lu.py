@@ -319,7 +319,7 @@ def _store_program(index, counts, lists):
     return True
 
 
-# largest |multiplier| of an elimination with accurate results; if one is larger, another order of elimination is chosen
+# largest |multiplier| of an accurate elimination; beyond this limit, another order of elimination is chosen
 MAX_MULTIPLIER = 1e3
 
 

@@ -244,9 +244,9 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-# smallest number of rows, and of degrees of freedom, with which the augmented form is the fastest (measured: 7)
+# smallest number of rows, and of degrees of freedom, with which the augmented form is fastest (measured: 7)
 MIN_ROWS = 8
-# smallest number of coordinates with which the augmented form is the fastest even with fewer degrees of freedom, unless
+# smallest number of coordinates with which the augmented form is fastest with any number of degrees of freedom, unless
 # M is diagonal (measured: about 30)
 MIN_COORDINATES = 32
 

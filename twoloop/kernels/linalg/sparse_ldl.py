@@ -6,10 +6,10 @@ ratio of these two squared norms is the squared sine of the angle between the ro
 row, 0 replaces 1 / pivot, which removes the row from the solution without another program. If the smallest squared sine
 is 10^-k, solutions lose k digits, which refinement with M and G recovers.
 
-If a body's M is singular, as with four Euler parameters, rows g that involve this body alone stiffen it: M + s g g^T
-replaces M. Accelerations do not change, because g a is prescribed, and the multiplier of g decreases by s g a. So M
-need only be positive definite on the velocities that these rows allow. A row stiffens M even if it is redundant, as
-rows of loops through a hub may be; then s g^T (g a) is added to the right-hand side.
+If a body's M is singular, as with four Euler parameters, rows g that involve this body alone stiffen M: M + s g g^T
+replaces M. This does not change accelerations, because g a is prescribed; the multiplier of g decreases by s g a. So M
+need only be positive definite on the velocities that these rows allow. A redundant row, as in loops through a hub,
+stiffens M, too; then s g^T (g a) is added to the right-hand side.
 """
 
 from twoloop.kernels.data.common import compiled, merged

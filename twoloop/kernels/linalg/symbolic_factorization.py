@@ -10,9 +10,9 @@ order, then the columns of L, each downwards.
 Coordinates that M couples, or that the system declares as a group, form a body; the rows that involve the same bodies
 form a joint. Bodies with few joints are eliminated first. G M^-1 G^T remains, which is positive definite, so that any
 order of its joints is stable. A body with more joints, a hub, would couple all these joints, and is ordered among the
-joints, by constrained minimum degree. A joint that involves a hub, or that follows joints which involve a hub, may be
-eliminated before this hub only if its rows are independent even without the motion of the hub: one of its bodies must
-have no support yet. A support of a body is the ground or a hub to which eliminated joints connect the body.
+joints, by constrained minimum degree. Before a hub, a joint that involves the hub directly or through eliminated joints
+may be eliminated only if its rows are independent without the motion of the hub: one of its bodies must have no support
+yet. A support of a body is the ground or a hub to which eliminated joints connect the body.
 """
 
 import heapq
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MAX_JOINTS = 4  # a body with at most this number of joints is eliminated before them; a body with more joints is a hub
+MAX_JOINTS = 4  # largest number of joints of a body that is eliminated before its joints; with more, it is a hub
 
 Integers = NDArray[np.int64]
 
@@ -48,7 +48,7 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Supports of each part: the ground, and hubs not eliminated yet. A part: bodies connected by eliminated joints."""
+    """Supports (ground, hubs not eliminated yet) of each part, that is, of bodies connected by eliminated joints."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
@@ -187,8 +187,8 @@ def _minimum_degree_order(
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    Among the joints and hubs that may be eliminated, the next one has neighbours with the fewest rows and coordinates.
-    `pairs`: pairs of hubs that are coupled other than by joints. `lone_bodies`: see `_PartSupports`.
+    Of the joints and hubs that may be eliminated, the one with the fewest rows and coordinates in its neighbours is
+    next. `pairs`: pairs of hubs that are coupled other than by joints. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}

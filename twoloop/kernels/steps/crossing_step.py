@@ -320,7 +320,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     left_out, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
-    is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.straight == 1
+    is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.is_generated == 1
     min_node_pivot, duration = MIN_NEAR_RATIO, h
     q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
     if is_estimated:
@@ -390,7 +390,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             while True:
                 if code == DONE:
                     code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
-                if renews_partition or w.by_general == 0.0:
+                if renews_partition or w.used_general == 0.0:
                     break
                 # pivots of the generated code were too small, and the general code used the partition of another
                 # stage: repeat the projection with a partition chosen at this stage

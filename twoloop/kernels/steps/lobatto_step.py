@@ -20,7 +20,7 @@ from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.control.singular_positions import COLLAPSED_STEP, SHORT_STEP, SINGULAR_PIVOT
 from twoloop.kernels.control.step_size import count_step, departure, size_off_grid, store_prediction
 from twoloop.kernels.data import collocation as field
-from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REFUSED, array_offsets
+from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REJECTED, array_offsets
 from twoloop.kernels.data.common import (
     ATTEMPT,
     GAP_SLACK,
@@ -34,24 +34,24 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import DONE, ESTIMATE, LEAST, LOOK, OUTER_DIVERGED, SINGULAR, UNSUITED
+from twoloop.kernels.data.indices import DEFECT_GAP, DONE, ESTIMATE, LEAST, OUTER_DIVERGED, SINGULAR, UNSUITED
 from twoloop.kernels.evaluation.inner_loop import check_redundant_rows, project, renew_partition
 from twoloop.kernels.evaluation.partition import MIN_CORRECTION
 from twoloop.kernels.linalg.dense import copy
 
 # indices in `options`. THETA: largest last correction of a projection; N_ITERATED: number of coordinates whose
-# accelerations are iterated; N_ROWS: number of constraints; FREE: step size, in units of tolerances[LOOK], above which
-# nodes are too far apart to detect short forces, and the defect is evaluated between nodes
+# accelerations are iterated; N_ROWS: number of constraints; FREE: step size, in units of tolerances[DEFECT_GAP], above
+# which nodes are too far apart to detect short forces, and the defect is evaluated between nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
 START_CONTRACTION = 0.12  # contraction rho for which the first step size is chosen after its first guess is rejected
-MAX_STARTS = 4  # largest number of guesses of the first step size
+MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
 MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as stiff, and another method takes over
-MIN_CURVED = 0.1  # accelerations count as hardly varying within a step if the field CURVED is smaller than this
+MIN_CURVATURE = 0.1  # value of CURVATURE below which accelerations hardly vary within a step
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
-MIN_PIVOT_RATIO = 0.4  # a singular position is near if a pivot in a step, relative to that at its beginning, is smaller
+MIN_PIVOT_RATIO = 0.4  # pivot, relative to that at the beginning of a step, below which a singular position is near
 # after a singular position, another method takes over with smaller tolerances: five more runs of A02 would be wrong
 TIGHT_TOLERANCE = 1e-8
 # another method takes over if FAILURES reaches this; a step without convergence adds 2, an accepted step subtracts 1
@@ -80,8 +80,8 @@ def _aligned_view(memory):
 def _reuse_rejected_polynomial(f, data, state):
     """Update `data` so that the polynomial of a step rejected for its error predicts the shorter repeated step."""
     f.retry_nodes(data, state)
-    if data[field.KEPT_DEGREE] == 0.0:
-        data[field.KEPT_DEGREE] = max(data[field.DEGREE], 3.0)
+    if data[field.OLD_DEGREE] == 0.0:
+        data[field.OLD_DEGREE] = max(data[field.DEGREE], 3.0)
     data[field.DEGREE], data[field.H_BEFORE], data[field.PREDICTS] = 8.0, data[field.H], 1.0
 
 
@@ -89,24 +89,24 @@ def _reuse_rejected_polynomial(f, data, state):
 def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     """Solve for the stages of a step of size h; return a code, the error, and the ratio of the next step size to h.
 
-    The stages are stored in `data`. The code is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED. Error: in tolerances.
+    The stages are stored in `data`. The code is CONVERGED, REJECTED, GUESSED or NOT_COMPUTED. Error: in tolerances.
     """
     is_first, is_estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
-    h_max = tolerances[LOOK] / CHECKED_GAP
+    h_max = tolerances[DEFECT_GAP] / CHECKED_GAP
     if is_estimated and h > h_max * (1.0 + GAP_SLACK):
-        return REFUSED, h / h_max, h_max / h
+        return REJECTED, h / h_max, h_max / h
     data[field.T], data[field.H], data[field.DEFECT] = t, h, -1.0
     data[field.MAY_GUESS] = 0.0
     if is_first:
         data[field.H_BEFORE], data[field.DEGREE], data[field.RHO] = h, 0.0, START_CONTRACTION
-        data[field.MAY_GUESS] = 1.0 if is_estimated and data[field.STARTS] < MAX_STARTS else 0.0
+        data[field.MAY_GUESS] = 1.0 if is_estimated and data[field.N_GUESSES] < MAX_GUESSES else 0.0
     result = int(f.attempt_nodes(data, state, tolerances, f.own_numbers))
     n_sweeps = int(data[field.SWEEPS])
     w.n_outer += n_sweeps
     w.n_evaluations += LANES * n_sweeps
     w.n_factorizations += LANES * n_sweeps
     if result == GUESSED:
-        data[field.STARTS] += 1.0
+        data[field.N_GUESSES] += 1.0
         return result, 2.0, min(max(START_CONTRACTION / data[field.RHO], 0.05), 30.0)
     if result != CONVERGED:
         data[field.FAILURES] += 2.0
@@ -116,11 +116,11 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     error = data[field.ERROR]
     if not error <= 1.0:
         _reuse_rejected_polynomial(f, data, state)
-        return REFUSED, error, min(max(0.9 * data[field.FACTOR_OF_ERROR], 0.3), 0.9)
+        return REJECTED, error, min(max(0.9 * data[field.FACTOR_OF_ERROR], 0.3), 0.9)
     max_factor = GROWTH_EARLY if data[field.N_STEPS] < N_EARLY else GROWTH
     if max_factor > GROWTH and n_sweeps == 1:
         max_factor = GROWTH_ONE_SWEEP
-    if h > options[FREE] * tolerances[LOOK] * (1.0 + GAP_SLACK):
+    if h > options[FREE] * tolerances[DEFECT_GAP] * (1.0 + GAP_SLACK):
         w.n_evaluations += LANES
         defect = f.audit_nodes(data, state, f.own_numbers)
         if defect < 0.0:
@@ -128,18 +128,18 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         factor_by_defect = 0.9 * data[field.FACTOR_OF_DEFECT]
         if defect > 1.0:
             _reuse_rejected_polynomial(f, data, state)
-            return REFUSED, defect, max(0.3, factor_by_defect)
+            return REJECTED, defect, max(0.3, factor_by_defect)
         data[field.DEFECT] = defect
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
-    extra_sweeps = data[field.SWEEPS] - data[field.TARGETED]
+    extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
     # the motion may be stiff if accelerations hardly vary, but a step takes the target number of sweeps, or one less
-    is_limited = data[field.CURVED] < MIN_CURVED and extra_sweeps >= -1.0
+    is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
     factor = data[field.FACTOR]
     # extrapolate the step size that the error allows by its trend, which mostly changes little from step to step
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
-    if error > 1e-6 and data[field.CURVED] >= MIN_CURVED:
+    if error > 1e-6 and data[field.CURVATURE] >= MIN_CURVATURE:
         trend = 1.0 if is_first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
         factor = min(factor, SAFETY * trend * data[field.FACTOR_OF_ERROR])
     data[field.ALLOWED_H] = h_allowed
@@ -151,8 +151,8 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
 @merged
 def _accept_polynomial(data):
     """Update `data` so that the polynomial of an accepted step predicts the next step."""
-    if data[field.KEPT_DEGREE] > 0.0:
-        data[field.NEXT_DEGREE], data[field.KEPT_DEGREE] = data[field.KEPT_DEGREE], 0.0
+    if data[field.OLD_DEGREE] > 0.0:
+        data[field.NEXT_DEGREE], data[field.OLD_DEGREE] = data[field.OLD_DEGREE], 0.0
     data[field.CURRENT] = 1.0 - data[field.CURRENT]
     data[field.DEGREE], data[field.H_BEFORE] = data[field.NEXT_DEGREE], data[field.H]
     data[field.PREDICTS], data[field.FAILURES] = 1.0, max(0.0, data[field.FAILURES] - 1.0)
@@ -203,7 +203,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if tolerances[ESTIMATE] == 1.0 and _must_change_method(w, data, tolerances):
         return Attempt(UNSUITED, math.inf, 0.0)
     result, error, factor = _solve_collocation(f, w, options, data, tolerances, t, h, state)
-    if result == NOT_COMPUTED or (result == REFUSED and tolerances[ESTIMATE] == 0.0):
+    if result == NOT_COMPUTED or (result == REJECTED and tolerances[ESTIMATE] == 0.0):
         return Attempt(OUTER_DIVERGED, math.inf, 0.0)
     if result != CONVERGED:
         return Attempt(DONE, error, factor)
@@ -226,7 +226,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
     """Project the states in the first n_ends rows of `out_state` onto the constraints, each in one lane of `data`.
 
-    Each lane receives the projected state, accelerations, multipliers, and in FINE whether the projection converged.
+    Each lane receives the projected state, accelerations, multipliers, and in VALID whether the projection converged.
     """
     begin_ends = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
@@ -234,7 +234,7 @@ def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
         data[begin_ends + k] = out_t[row]
         for i in range(2 * n):
             data[begin_ends + LANES * (1 + i) + k] = out_state[row, i]
-        data[field.FINE + k] = 1.0
+        data[field.VALID + k] = 1.0
     tolerance = max(options[THETA], MIN_CORRECTION * w.rounded)
     f.correct_ends(data, f.own_numbers)
     for _ in range(4):
@@ -248,7 +248,7 @@ def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
             break
     for k in range(n_ends):
         if not data[field.MOVED + k] <= tolerance:
-            data[field.FINE + k] = 0.0
+            data[field.VALID + k] = 0.0
 
 
 @merged
@@ -260,7 +260,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
     tolerances, either: this would show a discontinuity of the drive between the nodes, see discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))
-    if data[field.FINE + k] == 0.0:
+    if data[field.VALID + k] == 0.0:
         return False
     for i in range(n):
         q = data[ends + LANES * (1 + i) + k]
@@ -275,7 +275,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
     for i in range(state.size - 3 * n):
         row[3 * n + i] = data[lam + LANES * i + k]
     if w.rows_v.size < w.Rate.size:
-        w.by_general = 0.0
+        w.used_general = 0.0
         if check_redundant_rows(f, w, t, row[:n], row[n : 2 * n]) != DONE:
             return False
     copy(row, state)
@@ -288,7 +288,7 @@ def _can_take_next_step(w, data, tolerances, control, clock, h):
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
-    is_near = control[at.BRIDGE] == 1.0 and w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
+    is_near = control[at.MAY_CROSS] == 1.0 and w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
     return not (is_near and h < SHORT_STEP * h_long)
 
 
@@ -308,7 +308,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
             break
         if result != CONVERGED:
             clock[at.H_NEXT] = h * factor
-            w.n_rejected_error += 1 if result == REFUSED else 0
+            w.n_rejected_error += 1 if result == REJECTED else 0
             continue
         f.end_nodes(data, state, state)
         _accept_polynomial(data)
@@ -335,12 +335,12 @@ def lobatto_steps(
     if out_t.size < LANES or w.nearly_singular == 1.0:
         return 0
     if control[at.FIRST_GIVEN] == 1.0:
-        data[field.STARTS] = MAX_STARTS
+        data[field.N_GUESSES] = MAX_GUESSES
     n_most = LANES - w.n_accepted % LANES
     if n_most > control[at.MAX_STEPS] - w.n_accepted:
         n_most = int(control[at.MAX_STEPS]) - w.n_accepted
     copy(state, new_state)
-    driven = control[at.DRIVEN] == 1.0
+    driven = control[at.MAY_JUMP] == 1.0
     n_ends = _take_steps(
         f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps
     )

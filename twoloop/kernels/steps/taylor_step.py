@@ -32,7 +32,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LOOK, NOT_FINITE, RTOL, STATIC
+from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, NOT_FINITE, RTOL, STATIC
 from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
@@ -372,7 +372,7 @@ def _compute_series(f, w, options, memory, t, state, unit, which):
     """Store series `which` about `state`, the result of the last projection, at t in `memory`; return a code."""
     n = w.Q.size
     memory[TARGET] = which
-    if f.straight == 1 and w.by_general == 0.0:  # generated code leaves no factors in w
+    if f.is_generated == 1 and w.used_general == 0.0:  # generated code leaves no factors in w
         q, v, a = state[:n], state[n : 2 * n], series_accelerations(memory, n)
         code = f.general(f, w, EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
         if code != DONE:
@@ -461,7 +461,7 @@ def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
-    max_gap, shift = tolerances[LOOK], memory[ATTEMPTS] * GOLDEN_SECTION % 1.0
+    max_gap, shift = tolerances[DEFECT_GAP], memory[ATTEMPTS] * GOLDEN_SECTION % 1.0
     n_points = 0
     if h > max_gap:
         n_points = int(np.ceil(h / max_gap))
