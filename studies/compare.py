@@ -38,8 +38,7 @@ REFERENCE_LIMIT = 300.0  # s of wall-clock time for each run of the reference
 
 
 def load_problem(where: str) -> Problem:
-    """Make the problem of FILE.py:FUNCTION, or a ready mechanism by its name. Raises StudyError if there is no such
-    file or function, or it does not return a `Problem`."""
+    """Return the problem of FILE.py:FUNCTION, or a ready mechanism by its name; raise StudyError if there is none."""
     try:
         return problem_from(where)
     except ValueError as error:
@@ -94,8 +93,7 @@ def beside(outsiders: Mapping[str, Outsider], run: Run, result: Result) -> dict[
 
 
 def rows_from(files: Iterable[str], mechanism: str, t_end: float) -> list[Row]:
-    """Read the rows of files that are of this comparison's mechanism; the word "archive" is the file that is shipped.
-    Raises StudyError if a file has none, or cannot be read."""
+    """Return the rows of files (or of the shipped "archive") for a mechanism; raise StudyError if a file has none."""
     found = []
     for file in files:
         rows = rows_of_file(file)

@@ -54,10 +54,11 @@ def windows(t: Array, error: Array, period: float, t_end: float) -> dict[str, Ar
 
 
 def drift(t: Array, mean: Array) -> tuple[float, float]:
-    """Slope of the windows' means by least squares, and its standard error from the slopes of BLOCKS parts. The scatter
-    between blocks is right for a random walk, to which the residuals of one line would be blind, and errs on the safe
-    side for an oscillation. Raises ValueError if there are fewer than two windows a block, from which no scatter can be
-    told."""
+    """Return the slope of the windows' means by least squares, and its standard error from the slopes of BLOCKS parts.
+
+    The scatter between blocks is right for a random walk, to which the residuals of one line are blind, and too large
+    for an oscillation. Raises ValueError if there are fewer than two windows in a block.
+    """
     if t.size < 2 * BLOCKS:
         raise ValueError(f"the slope of an energy error needs {2 * BLOCKS} windows or more; given {t.size}: run longer")
     slope = float(np.polyfit(t, mean, 1)[0])
@@ -67,9 +68,11 @@ def drift(t: Array, mean: Array) -> tuple[float, float]:
 
 
 def verdict(row: pd.Series) -> str:
-    """What the energy of a run does, from the numbers of its row alone. Without a slope a run is free of drift only
-    where no change above the swing could hide in the scatter of its windows: a net slope of nothing may be a walk that
-    came back."""
+    """Return what the energy of a run does, from the numbers of its row alone.
+
+    Without a slope, a run is free of drift only if the scatter of its windows cannot hide a change above the swing: a
+    net slope of zero may be a walk that came back.
+    """
     if row["status"] != "REACHED_END":
         status = str(row["status"]).lower().replace("_", " ")
         return status if pd.isna(row["t_reached"]) else f"{status} at {row['t_reached']:.4g} s"
@@ -143,8 +146,7 @@ def case_of(geometry: str, t_end: float) -> Case:
 
 
 def instants(case: Case, h: float) -> Array | None:
-    """Multiples of a fixed step h near the case's instants, and its end: landing on them changes no step. None for
-    short motions: at every step."""
+    """Return multiples of a fixed step h near the case's instants, and its end; None (all steps) for short motions."""
     if case.t_end <= QUICK:
         return None
     interval = h * max(1, round(case.t_end / case.n_instants / h))

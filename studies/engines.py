@@ -65,8 +65,7 @@ class Loop:
 
     @cached_property
     def reference(self) -> tuple[Motion, float]:
-        """Return the motion, and the largest difference of a second, unlike solution at any instant. Raises
-        RuntimeError if one of them fails."""
+        """Return the motion, and its largest difference from a second solution; raise RuntimeError if one fails."""
         if self.problem.name == PARALLEL:
             q, v, apart = parallelogram_motion(self.times)
             return self.motion(q, v), apart
@@ -266,9 +265,11 @@ def _cost(runs: pd.DataFrame, error: float) -> float | None:
 
 
 def _against(runs: pd.DataFrame, error: float) -> dict[str, Any]:
-    """Compare the default with the fastest configuration of any engine on each mechanism. `ratio`: the median of the
-    engine's time over the default's. `slower`: where it is below 1, with the engine. `compared`: mechanisms on which an
-    engine and the default reach the error. `fastest`: wins among engines."""
+    """Compare the default with the fastest configuration of any engine on each mechanism.
+
+    `ratio`: median of the engine's time over the default's. `slower`: ratios below 1, with the engine. `compared`:
+    mechanisms on which an engine and the default reach the error. `fastest`: wins among engines.
+    """
     ratios, fastest = {}, []
     for case, own in runs.groupby("case", sort=False):
         costs = {str(name): cost for name, each in own.groupby("solver") if (cost := _cost(each, error))}
@@ -319,8 +320,7 @@ def _configuration(name: str, runs: pd.DataFrame) -> dict[str, Any]:
 
 
 def _probe(rows: pd.DataFrame, group: str, ending: str, measure: str) -> float | None:
-    """Return the median error with `PROBED` steps, or with tolerance `TIGHT`; a failed run counts as infinite. None:
-    not run, or infinite."""
+    """Return the median error with `PROBED` steps, or tolerance `TIGHT`; None if not run, or infinite (failed)."""
     own = rows[(rows["group"] == group) & rows["case"].str.endswith(ending)]
     own = own[own["status"].isin(("REACHED_END", "FAILED"))]
     own = own[(own["n_steps"] == PROBED) | (own["tol"] == TIGHT)]

@@ -15,13 +15,12 @@ from references.driver import user_call
 from references.equations.many_at_once import by_cvode, by_cyrk, by_diffrax, by_heyoka, by_heyoka_ensemble
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import figures, tables
-from studies.bench.cli import Call, StudyError, processor
+from studies.bench.cli import StudyError, processor
 from studies.bench.collector import REPEATS
 from studies.bench.render import number
 from studies.bench.store import Array, Output
 from studies.bench.study import Study
 from twoloop import consistent_states, ensemble, mechanisms, solve_dae
-from twoloop.ensembles.ensemble import Runs
 from twoloop.ensembles.lanes import threads_of
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.mechanisms.four_bar import DENSITY, GRAVITY
@@ -65,8 +64,10 @@ def varied_row(n: int, block: int = 2 * BLOCK) -> dict[str, Any]:
 
 
 def assembled(n: int) -> tuple[Array, Array]:
-    """Draw n linkages, and return those that can be assembled (m, 6) with their positions (m, 9). Columns of the first:
-    those of `RANGES`, and the branch. Joint 2-3 is the third corner of a triangle with O."""
+    """Draw n linkages; return those that can be assembled (m, 6) with their positions (m, 9).
+
+    Columns of the first: those of `RANGES`, and the branch. Joint 2-3 is the third corner of a triangle with O.
+    """
     low, high = np.array(list(RANGES.values())).T
     uniform = np.random.default_rng(SEED_DRAWN).uniform(size=(n, 6))
     given = np.column_stack([low + (high - low) * uniform[:, :5], np.where(uniform[:, 5] < 0.5, -1.0, 1.0)])
@@ -94,13 +95,6 @@ def energies(lengths: Array, q: Array, v: Array) -> Array:
     return np.asarray(total / (GRAVITY * DENSITY * (lengths**2).sum(axis=1, keepdims=True)))
 
 
-def energy_errors(given: Array, q0: Array, runs: Runs) -> Array:
-    """Return the largest energy error of each run, NaN where it failed."""
-    before = energies(given[:, :3], q0[:, :, None], np.zeros((len(q0), 9, 1)))
-    errors = np.abs(energies(given[:, :3], runs.q, runs.v) - before).max(axis=1)
-    return np.where(runs.success, errors, np.nan)
-
-
 def end_error(given: Array, q: Array, t_end: float) -> float:
     """Return how far a run ends from the solution of the equation in one coordinate; NaN where that fails."""
     *lengths, ground, theta3, branch = given.tolist()
@@ -112,9 +106,11 @@ def end_error(given: Array, q: Array, t_end: float) -> float:
 
 
 def drawn_row(n: int, t_end: float = SPAN) -> dict[str, Any]:
-    """Draw, assemble and run n linkages, time it, and measure errors of energy and of some ends. `end_error_hard`: of
-    the runs of largest energy errors and most steps, and of those not made in lanes; `end_error_any`: of the first
-    ones."""
+    """Draw, assemble and run n linkages; return the times, and errors of energy and of some ends.
+
+    `end_error_hard`: of the runs with the largest energy errors and most steps, and of runs not in lanes;
+    `end_error_any`: of the first runs.
+    """
     times, system, began = np.linspace(0.0, t_end, N_TIMES + 1)[1:], four_bar().system, time.perf_counter()
     given, q0 = assembled(n)
     errors, steps, ends, singly, failed = [], [], [], [], 0
@@ -122,7 +118,9 @@ def drawn_row(n: int, t_end: float = SPAN) -> dict[str, Any]:
         some = slice(first, first + BLOCK)
         p = given[some, :4]
         runs = ensemble(system, (0.0, t_end), q0[some], np.zeros(9), parameters=p, t_eval=times)
-        errors.append(energy_errors(given[some], q0[some], runs))
+        before = energies(p[:, :3], q0[some][:, :, None], np.zeros((len(p), 9, 1)))
+        differences = np.abs(energies(p[:, :3], runs.q, runs.v) - before).max(axis=1)
+        errors.append(np.where(runs.success, differences, np.nan))
         steps.append(runs.n_steps)
         ends.append(runs.q[:, :, -1].copy())
         singly += [first + k for k in runs.reasons if k > 0]  # the first of a call checks the system
@@ -136,13 +134,6 @@ def drawn_row(n: int, t_end: float = SPAN) -> dict[str, Any]:
     for name, chosen in (("hard", sorted(hard)), ("any", range(min(N_ANY, len(given))))):
         row[f"end_error_{name}"] = float(np.nanmax([end_error(given[k], q[k], t_end) for k in chosen]))
     return row
-
-
-def linkage_rows(call: Call) -> Iterator[dict[str, Any]]:
-    """Make the rows of both groups, the larger numbers last."""
-    varied_row(16)  # compiles what is not on disk
-    for n in (200,) if call.quick else (10_000, 1_000_000):
-        yield from (make(n) for group, make in ((VARIED, varied_row), (DRAWN, drawn_row)) if call.wants(group))
 
 
 Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed
@@ -199,8 +190,7 @@ def linkages_of(n: int, t_end: float = SPAN) -> Ensemble:
 
 
 def of_starts(name: str, n: int, t_end: float) -> Ensemble:
-    """Return runs of a mechanism that differ by their velocities at the start. Raises StudyError if two unlike methods
-    do not agree where a run ends."""
+    """Return runs of a mechanism that differ by their initial velocities; raise StudyError if two methods disagree."""
     problem = getattr(mechanisms, name)()
     random = np.random.default_rng(7)
     fastest = max(1.0, float(np.abs(problem.v0).max()))
@@ -252,8 +242,7 @@ def ways(of: Ensemble) -> dict[str, Callable[[], Solve]]:
 
 
 def rows_of(of: Ensemble, names: Sequence[str], quick: bool) -> Iterator[dict[str, Any]]:
-    """Make a row for each way, tolerance and repetition: CPU time by a run, errors at the end. The calls after the
-    first are repeated in turn, so that a slow minute of the machine affects all alike."""
+    """Return a row for each way, tolerance and repetition: CPU time of a run, errors at the end."""
     setups, solves = ways(of), {}
     head = {"group": GROUP, "case": of.name, "n_runs": len(of.problems), "t_end": of.t_end}
     for name in names:
@@ -291,12 +280,14 @@ def make(output: Output) -> pd.DataFrame:
         names = [way for way in WAYS if way != DIFFRAX or (of.name == LINKAGES and not quick)]
         names = [way for way in names if output.call.wants(GROUP, of.name, way)]
         rows += list(rows_of(of, names, quick))
-    return pd.DataFrame([*rows, *linkage_rows(output.call)]).assign(processor=processor())
+    varied_row(16)  # compiles what is not on disk
+    for n in (200,) if quick else (10_000, 1_000_000):
+        rows += [draw(n) for group, draw in ((VARIED, varied_row), (DRAWN, drawn_row)) if output.call.wants(group)]
+    return pd.DataFrame(rows).assign(processor=processor())
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """Compare `ensemble` with the fastest other solver at equal error; then the random linkages. The error of a way is
-    the largest of its runs, at a tolerance at which none failed."""
+    """Compare `ensemble` with the fastest other solver at equal largest errors; then the random linkages."""
     runs = _runs(rows)
     found: dict[str, Any] = {"errors": list(ERRORS), "shown": SHOWN, "n_single": N_SINGLE, "cases": []}
     for case, own_rows in runs.groupby("case", sort=False):

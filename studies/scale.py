@@ -61,8 +61,7 @@ def evaluations(quick: bool) -> Keyed:
 
 
 def evaluation(build: Callable[[int], Assembly], n: int, repeat: int) -> Row:
-    """Time an evaluation, with its share of projections and all else of a step, and a first call. `passes` of the
-    projection in a step: many near a singular position, where stages are projected too."""
+    """Time an evaluation, its share of projections (`passes` in a step) and all else of a step, and a first call."""
     case = build.__name__.replace("_", " ")
     row: Row = {"group": EVALUATION, "case": case, "solver": f"{METHOD} (twoloop)", "n": n, "repeat": repeat}
     row |= {"evaluation_us": None, "step_us": None, "passes": None, "start_s": None, "status": "", "message": ""}
@@ -125,8 +124,7 @@ def case_of(n: int, t_end: float) -> tuple[Case, Assembly]:
 
 @cache
 def ends(n: int, t_end: float) -> tuple[np.ndarray, str]:
-    """Return where a chain ends, by two unlike routes, and the name of the second: without Pinocchio it is Adams.
-    Raises RuntimeError if they end apart."""
+    """Return the end of a chain by two routes, and the name of the second; RuntimeError if the ends differ."""
     case, made = case_of(n, t_end)
     options: dict[str, Any] = {"rtol": TIGHT, "atol": TIGHT}
     one = solve_dae(*case.start, method=METHOD, **options).q[:, -1]

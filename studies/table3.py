@@ -149,8 +149,7 @@ def beside(rows: pd.DataFrame) -> str:
 
 
 def short_figures(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
-    """Draw the paper's time over ours, of both procedures: one colour, were the machine all the difference. Nothing of
-    runs that are shorter than the paper's."""
+    """Draw the ratio of the paper's time to twoloop's, for both procedures, without runs shorter than the paper's."""
     if found["t_end"] != PAPER_END:
         return {}
     known = {group: ratios(rows, group) for group in FAMILIES}
@@ -227,8 +226,10 @@ def span(ratio: pd.Series) -> float:
 
 
 def fit(table: pd.DataFrame) -> dict[str, float]:
-    """Fit, in logs, the cost model: printed time = e (evaluations + i inner iterations + p attempted steps). i is at
-    most 1: an evaluation contains inner iterations, so that one of them cannot cost more."""
+    """Fit, in logs, the cost model: printed time = e (evaluations + i inner iterations + p attempted steps).
+
+    i is at most 1, because an evaluation contains inner iterations, none of which can cost more.
+    """
 
     def cost(x: np.ndarray) -> np.ndarray:
         scale, inner, attempt = np.exp(x)
@@ -242,8 +243,10 @@ def fit(table: pd.DataFrame) -> dict[str, float]:
 
 
 def partition_cost(rows: pd.DataFrame) -> float:
-    """Return the seconds of one partition by full pivoting, from runs with and without it in every step. The partition
-    is that of `partition="symmetric"`, in fixed steps of the midpoint rule, which has few evaluations."""
+    """Return the seconds of one partition by full pivoting, from runs with and without it in every step.
+
+    The partition is `partition="symmetric"`, in fixed steps of the midpoint rule, which has few evaluations.
+    """
     solvers = (f"fixed step, {name}" for name in ("lasting", "symmetric"))
     kept, every = (where(rows, group="partition", solver=name).iloc[0] for name in solvers)
     evaluation = kept["call_s"] / kept["n_evaluations"]
@@ -313,8 +316,7 @@ def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
 
 
 def runs(first: Case, second: Case, quick: bool) -> list[Run]:
-    """List the cells of the table, what a partition costs, both readings of (32) along err_out, and the other solvers.
-    On the second geometry only the paper's procedures: `studies.work_precision` has the others there."""
+    """List the runs for the table, a partition's cost, both readings of (32) along err_out, and the other solvers."""
     made, repeats = list[Run](), 1 if quick else REPEATS
     for test, what in READINGS.items():
         fixed, run = {"err_in": ERR_IN, "outer_test": test}, partial(_paper_irk, test)

@@ -164,8 +164,11 @@ def _beyond(
     tried: Sequence[float],
     errors: Sequence[float],
 ) -> list[float]:
-    """Settings looser and tighter than those that a solver ended with (`made`, loose to tight) where these are close.
-    Steps so long that it failed are no end: between these and the longest that it ended with it is asked, too."""
+    """Return settings looser and tighter than those in `made` (loose to tight) with which errors are close.
+
+    Steps so long that the solver failed are no limit: settings between them and the longest step that succeeded are
+    tried.
+    """
     first, last, asked = made[0], made[-1], []
     loosest, tightest, decade = LOOSEST, TIGHTEST, DECADE
     if run.solver.setting == "h":
@@ -182,8 +185,7 @@ def _beyond(
 
 
 def _repeated(todo: Sequence[Run], kept: KeptRows, always: Callable[[Run], bool]) -> list[Run]:
-    """The runs that are repeated: those that were made and ended, and whose times may decide who is the fastest. These
-    are no more than `OUTCLASSED` times the least of those of their side, ours or others', for no larger an error."""
+    """Return the runs that ended, and whose times may decide which solver is fastest, see `OUTCLASSED`."""
     sides: dict[Side, list[tuple[float, float, Run]]] = defaultdict(list)
     for run in todo:
         if run.key(0) in kept and (row := kept[run.key(0)])["error_q"] is not None:

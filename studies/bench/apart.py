@@ -27,9 +27,11 @@ def heard(call: Callable[[], Result]) -> tuple[Result | None, Row]:
 
 
 def apart(work: Callable[[], Any], limit: float | None = None) -> Any:
-    """Return what work() returns in a fork of this process, which is ended after `limit` s. Raises TimeoutError if it
-    does not come back. Raises EOFError if the process ends without an answer; its argument is the code, as of
-    `multiprocessing.Process.exitcode`."""
+    """Return the result of work() in a fork of this process, which is ended after `limit` s.
+
+    Raises TimeoutError after `limit` s, or EOFError if the process ends without a result; its argument is the exit
+    code.
+    """
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
 
@@ -53,8 +55,7 @@ class TimeLimit(Exception):
 
 
 class Alarm:
-    """Raise TimeLimit in this process when a user's call, or all around it, has used up its CPU time, where it can.
-    Compiled code is not interrupted but at its return to Python. `rang` says why the exception was raised."""
+    """Raise TimeLimit in this process when a user's call has used up its CPU time; `rang` says why."""
 
     def __init__(self, seconds: float, around: float):
         self.seconds, self.around, self.rang = seconds, around, ""

@@ -78,8 +78,7 @@ def parse(name: str, description: str | None, words: Sequence[str] | None, parts
 
 
 def main(work: Callable[[Sequence[str] | None], None], words: Sequence[str] | None = None) -> None:
-    """Run `work(words)`; a `StudyError` and Ctrl-C end the process with one line and a status that is not 0. Redundant
-    rows are named once, as in a user's loop, whatever solvers do to the filters of warnings between runs."""
+    """Run `work(words)`; a `StudyError` and Ctrl-C end the process with one line and a status that is not 0."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("once", ConstraintWarning)
@@ -159,9 +158,10 @@ PAUSE = 1.0  # s, at least, between lines that need not be printed: rows of mill
 
 
 class Progress:
-    """Print a line after each of `total` pieces of work: its number, its label, its time, what is left. The lines go to
-    stderr, so that a table on stdout can be redirected. The remaining time assumes that the pieces left take as long in
-    the mean as those that are done, without the first, which holds the compilation."""
+    """Print a line to stderr after each of `total` pieces of work: number, label, time, and remaining time.
+
+    The remaining time assumes the mean time of the finished pieces without the first, which includes the compilation.
+    """
 
     def __init__(self, total: int):
         self.total, self.done = total, 0

@@ -20,20 +20,13 @@ from twoloop.problem.problem import Array
 numbers = sys.modules[ready_andrews.__module__]  # those of the squeezer
 
 
-def _closing(one: Array, r: float, other: Array, s: float) -> Array:
-    """Return the point at distances r and s from two points, to the left of the way from one to the other."""
-    along = other - one
-    d = float(np.linalg.norm(along))
-    x = (r * r - s * s + d * d) / (2.0 * d)
-    y = math.sqrt(r * r - x * x)
-    return one + (x * along + y * np.array([-along[1], along[0]])) / d
-
-
 def _linkage(name: str, crank: float, rocker: float, base: float, angle: float) -> PlanarModel:
     """Build a four-bar linkage of uniform rods of 1 kg/m, whose coupler is 2 m long; the crank turns at 8 rad/s."""
     O, C = np.zeros(2), np.array([base, 0.0])
     A = crank * np.array([math.cos(angle), math.sin(angle)])
-    B = _closing(A, 2.0, C, rocker)
+    AC, d = C - A, float(np.linalg.norm(C - A))
+    x = (4.0 - rocker * rocker + d * d) / (2.0 * d)
+    B = A + (x * AC + math.sqrt(4.0 - x * x) * np.array([-AC[1], AC[0]])) / d  # to the left of the way from A to C
     model = PlanarModel(name=name)
     model.rod("crank", O, A, mass=crank, angular_velocity=8.0)
     model.rod("coupler", A, B, mass=2.0)
@@ -78,8 +71,10 @@ def parallelogram() -> ModelProblem:
 
 
 def parallelogram_motion(times: Array) -> tuple[Array, Array, float]:
-    """Return q and v (9, n_t) of the parallelogram that does not fold, and the difference of two solutions. Its bars
-    turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m."""
+    """Return q and v (9, n_t) of the parallelogram that does not fold, and the difference of two solutions.
+
+    All bars turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m.
+    """
 
     def rates(t: float, y: Array) -> list[float]:
         return [y[1], -3.0 * 9.81 * math.cos(y[0]) / (2.0 / 3.0 + 2.0)]

@@ -1,6 +1,8 @@
-"""The bench: a case (a mechanism and its reference) x a solver x a setting x a repetition is a row; one collector. A
-study lists `Run`s, `collect` makes the rows, `tables` summarises them. Mechanisms stand in `cases/`, solvers in
-`solvers.py`, what a row says of the quality of a run in `metrics.py`."""
+"""Collect the rows of the bench: one row for each case, solver, setting and repetition.
+
+A study lists `Run`s, `collect` makes the rows, `tables` summarises them. A case is a mechanism with its reference. The
+solvers are in `solvers.py`, the measures of the quality of a run in `metrics.py`.
+"""
 
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -99,8 +101,10 @@ class Case:
 
     @property
     def own_limit(self) -> float | None:
-        """`time_limit` of `solve_dae`: none for runs that begin later, made only after one like them has ended. A
-        thread watches the limit of a run of a large system, for 0.4 ms that no user pays who gives no limit."""
+        """Return `time_limit` of `solve_dae`: none for runs that begin later, made only after one like them has ended.
+
+        A thread watches the limit in large systems, which takes 0.4 ms that a user without a limit does not pay.
+        """
         return None if self.t0 else self.time_limit
 
     def steps(self) -> tuple[float, ...]:
@@ -296,8 +300,10 @@ def called_from(run: Run) -> str:
 
 
 def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result | None, str, str, float]:
-    """Make a run: its result, where there is one, a status, a message, and the CPU time of the user's call in s. The
-    limit is that of the user's call; all that an adapter does may take `around` s, by default AROUND times as much."""
+    """Make a run; return its result or None, a status, a message, and the CPU time of the user's call, s.
+
+    The limit applies to the user's call; the adapter may take `around` s in all, by default AROUND times as much.
+    """
     result, status, message, spent = None, "", "", 0.0
     user_call.forget()
     limit = run.case.time_limit

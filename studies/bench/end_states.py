@@ -128,9 +128,11 @@ def row_of(run: Run) -> Row:
 
 
 def outcome(row: Row, problem: Problem, tolerance: float) -> str:
-    """Judge a run: "right", "inexact" or "wrong" where it reached the end, SAID where it did not, or "not run". An
-    answer that misses its tolerance but has three digits may just mean that the tolerance was too loose. A run that the
-    adapter of another solver refuses is not run: that says nothing of the solver."""
+    """Judge a run: "right", "inexact" or "wrong" if it reached the end, SAID if it did not, or "not run".
+
+    An answer with three digits that misses its tolerance may just mean that the tolerance was too loose. A run that the
+    adapter of another solver refuses is "not run", because this says nothing about the solver.
+    """
     refused = row["status"] == "RAISED" and row["family"] != "two-loop"
     if refused or row["status"] in NOTHING_RUN:
         return "not run"

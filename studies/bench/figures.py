@@ -1,5 +1,4 @@
-"""Draw all figures in one style: a message as title, at most six lines, and labels on the lines. The default is thick
-and has the same colour in every figure. Errors grow to the right, so better is to the left."""
+"""Draw all figures in one style: a message as title, at most six labelled lines, errors that grow to the right."""
 
 import textwrap
 import tomllib
@@ -87,8 +86,7 @@ def message(figure: Figure, text: str, panels: Axes | Iterable[Axes] = ()) -> No
 
 
 def label_lines(panels: Axes | Iterable[Axes]) -> None:
-    """Write each label once, right of the panel where its line ends last; call this last, before `save`. `panels`:
-    those that share their labels, from left to right. Lines and bands without a label are left alone."""
+    """Write each label once, right of the panel where its line ends last; call this last, before `save`."""
     last: dict[str, tuple[Axes, Any]] = {}
     for axes in [panels] if isinstance(panels, Axes) else panels:
         for line, text in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -185,10 +183,12 @@ def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOS
 
 
 def lines_of(rows: pd.DataFrame, targets: Sequence[float], coded: bool | None = None) -> list[str]:
-    """Choose at most six solvers of a case whose errors can be told from that of the reference. In this order: the
-    default, the paper's procedure, the fastest of the other solvers at each target, the fastest of each of
-    `MAIN_SOLVERS`, and the fastest further methods of twoloop. Other projects have a line each. `coded`: as
-    `names.label` has it."""
+    """Choose at most six solvers of a case whose errors exceed the error of the reference.
+
+    In this order: the default, the paper's procedure, the fastest of the other solvers at each target, the fastest of
+    each of `MAIN_SOLVERS`, and the fastest further methods of twoloop. Other projects have one line each. `coded`: see
+    `names.label`.
+    """
     seen = rows[_told(rows)]
     names = list(dict.fromkeys(seen["solver"]))
     defaults = [name for name in (*COMPILED, GIVEN, DEFAULT) if COMPILED.get(name, DEFAULT) == DEFAULT]
@@ -216,8 +216,7 @@ def _told(rows: pd.DataFrame) -> pd.Series:
 
 
 def line_of(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the runs of one solver that a line connects, from its loosest setting on. Runs that failed, lost the
-    motion or have errors below that of the reference are left out."""
+    """Return the runs of one solver for a line, loosest first, without failures and errors below the reference's."""
     runs = runs[_told(runs)]
     return runs.iloc[np.lexsort((-runs["error_q"].astype(float), -setting_of(runs)))].reset_index(drop=True)
 
@@ -225,9 +224,7 @@ def line_of(runs: pd.DataFrame) -> pd.DataFrame:
 def work_precision(
     rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR, coded: bool | None = None
 ) -> Figure:
-    """Draw CPU time over the largest error of a position, a line a solver; `rows` of one case, medians. `title`: the
-    message. `error` says what the column error_q is; `coded`: as `names.label` has it. Raises ValueError if there are
-    more than six lines."""
+    """Draw CPU time over the largest error of a position; `error`: meaning of error_q, `coded`: see `names.label`."""
     if len(solvers) > MOST_LINES:
         raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
     figure, axes = plt.subplots(figsize=(7.6, 4.0), layout="constrained")

@@ -1,5 +1,7 @@
-"""The paper's first example, the four-bar linkage, in two geometries; its motion is known apart from all solvers.
-Lengths, masses and start are assumed: Table 2 is missing from the text that we worked from."""
+"""The paper's first example, the four-bar linkage, in two geometries, with its motion known without any solver.
+
+Lengths, masses and start are assumed, because Table 2 is missing from the text that was available.
+"""
 
 from functools import cache, partial
 from typing import Any

@@ -1,6 +1,8 @@
-"""How twoloop stands beside the fastest of the other solvers, on one mechanism at each error, by the time of the call.
-Four stand in for twoloop: the default, which a user gets who changes nothing; the same with and without code made for
-the mechanism, of which it is one; and the fastest of its methods, which a user finds by running them all."""
+"""Compare twoloop with the fastest of the other solvers, on one mechanism at each error, by the time of the call.
+
+Four settings represent twoloop: the default; the same with, and without, code generated for the mechanism; and the
+fastest of its methods, which a user finds only by running all of them.
+"""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -23,9 +25,11 @@ COMPARED_BY = ("solver", "family", "status", "message", "error_q", "floor", "ast
 
 
 def of_errors(rows: pd.DataFrame, errors: Iterable[float], given: str = DEFAULT) -> list[dict[str, dict[str, Any]]]:
-    """Compare each of WHOSE with the fastest other solver on one case at each of some errors. `rows`: medians, of all
-    solvers; `given`: the solver that the default is on this case. Returns for each error and name solver and call_s,
-    those of the fastest other one ("other"), and what `tables.compared` does."""
+    """Compare each of WHOSE with the fastest other solver on one case, at each of several errors.
+
+    `rows`: medians of all solvers; `given`: the solver that is the default on this case. Returns for each error and
+    name solver and call_s, those of the fastest other solver ("other"), and the result of `tables.compared`.
+    """
     rows, found = rows[[name for name in (*COMPARED_BY, *SETTINGS) if name in rows]], []
     ours = rows["family"] == "two-loop"
     solvers = {name: given if name == GIVEN else name for name in WHOSE}
@@ -57,9 +61,11 @@ def _cheapest(costs: tables.Costs) -> dict[str, Any]:
 
 
 def counted(pairs: Iterable[Mapping[str, Mapping[str, Any]]], name: str) -> dict[str, Any]:
-    """Count the verdicts on one of WHOSE over pairs of mechanism and error that any solver reaches. `faster` and
-    `slower`, which includes errors that only others reach, are what reports say; the rest are not distinguishable, or
-    only twoloop reaches them."""
+    """Count the verdicts on one of WHOSE over pairs of mechanism and error that any solver reaches.
+
+    Reports show `faster`, and `slower`, which includes errors that only other solvers reach. The rest are not
+    distinguishable, or reached only by twoloop.
+    """
     reached = [each for each in pairs if any(it["verdict"] != "none" for it in each.values())]
     verdicts = [each[name]["verdict"] for each in reached]
     count = {verdict: verdicts.count(verdict) for verdict in VERDICTS}

@@ -1,6 +1,8 @@
-"""Draw linkages at random, with their motion in one or two angles, which shares no line with the integrators. Four-bar
-linkages move by `references.paper.four_bar_minimal`; those that fold, whose bars come to lie on each other, by
-Lagrange's equations. SciPy's DOP853 integrates both at 1e-13."""
+"""Draw linkages at random, with their motion in one or two angles, computed without code of the integrators.
+
+Four-bar linkages move by `references.paper.four_bar_minimal`; linkages that fold, with bars on top of each other, by
+Lagrange's equations. SciPy's DOP853 integrates both at 1e-13.
+"""
 
 import sys
 from collections.abc import Callable
@@ -148,8 +150,10 @@ REGULAR = {
 def moved(
     name: str, seed: tuple[int, ...], size: float = 1.0, inertia: float = INERTIA, heavier: float = 1.0
 ) -> dict[str, Any]:
-    """Draw starts until a linkage folds on the way, if it can; return what a trap needs, with the end of the motion.
-    `size`: factor on lengths. `heavier`: factor on the gravity of the system, not of the motion."""
+    """Draw starts until a linkage folds on the way, if it can; return the data of a trap, with the end of the motion.
+
+    `size`: factor on lengths. `heavier`: factor on the gravity of the system, not of the motion.
+    """
     (n, joints, names, in_space, gravity), generator = (FOLDS | REGULAR)[name], np.random.default_rng(seed)
     bars, n_drawn, growth = names.split(), 0, np.inf
     mass, force = (np.tile(each, len(bars)) for each in ([MASS] * 3 + [inertia], [0.0, -MASS * gravity, 0.0, 0.0]))

@@ -51,16 +51,18 @@ def deviation(result: Result, motion: ReferenceMotion, instants: Array) -> tuple
 
 
 def correct_digits(deviation: Array, truth: Array) -> float:
-    """Significant correct digits, -log10 of the largest relative error of a component. As the Test Set for IVP Solvers
-    defines scd (F. Mazzia and C. Magherini, release 2.4, 2008), with components whose true value is 0 left out."""
+    """Return the significant correct digits: -log10 of the largest relative error of a component.
+
+    This is scd of the Test Set for IVP Solvers (F. Mazzia and C. Magherini, release 2.4, 2008), without components
+    whose true value is 0.
+    """
     known = truth != 0.0
     relative = np.abs(deviation[known] / truth[known])
     return float(-np.log10(max(relative.max(initial=0.0), 1e-17)))
 
 
 def violations(system: ConstrainedSystem, result: Result) -> tuple[Array, dict[str, Array]]:
-    """Times, and at each the largest residual of the constraints in position, velocity and acceleration. At CHECKED of
-    the stored instants at most; "a" is C_q a - Q_d with the solver's accelerations."""
+    """Return at most CHECKED times, and the largest residuals of C, C_q v + C_t and C_q a - Q_d there."""
     chosen = np.unique(np.linspace(0, result.t.size - 1, CHECKED).astype(int))
     gamma, p = compiled_gamma(system), system.functions.p
     levels = {level: np.empty(chosen.size) for level in "qva"}
@@ -100,8 +102,7 @@ def _error_lam(system: ConstrainedSystem, result: Result, motion: ReferenceMotio
 
 
 def keeps_energy(problem: Problem, motion: ReferenceMotion, instants: Array) -> bool:
-    """Whether the energy is an invariant, by the power balance of a motion that is known to its floor. False, too, of a
-    motion without kinetic energy, which shows nothing."""
+    """Return whether a known motion with kinetic energy conserves the energy, by its power balance."""
     times = np.concatenate([[0.0], instants])
     q, v = motion.states(times)
     energy = np.asarray(problem.energy(times, q, v))
@@ -111,14 +112,13 @@ def keeps_energy(problem: Problem, motion: ReferenceMotion, instants: Array) -> 
 
 
 class Scale:
-    """What one motion tells of a mechanism's size: by what "lost" and "out of phase" are judged. `kinetic`: largest
-    kinetic energy, J; None where the problem has no energy that is conserved. `ranges`: range of each coordinate."""
+    """Size of a mechanism, from one motion, by which "lost" and "out of phase" are judged."""
 
     def __init__(self, problem: Problem, motion: ReferenceMotion, instants: Array, conserved: bool):
         times = np.concatenate([[0.0], instants])
         q, v = motion.states(times)
-        self.ranges = np.ptp(q, axis=1)
-        self.kinetic = None
+        self.ranges = np.ptp(q, axis=1)  # range of each coordinate
+        self.kinetic = None  # largest kinetic energy, J, if an energy is conserved
         if conserved:
             self.kinetic = float((problem.energy(times, q, v) - problem.energy(times, q, 0.0 * v)).max())
 

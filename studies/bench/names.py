@@ -1,7 +1,8 @@
-"""How figures, tables and sentences call a solver: the one mapping from the names of rows, which CSV files keep. Of
-`method="auto"` there are three ways, "the default", "compiled=True" and "compiled=False"; other methods of ours have
-the value of `method`, with `compiled` where it is not what `solve_dae` does by itself. Other solvers have their
-names."""
+"""Names of solvers in figures, tables and sentences, by their names in rows, which CSV files keep.
+
+`method="auto"` is "the default", "compiled=True" or "compiled=False"; other methods of twoloop have the value of
+`method`, with `compiled` if it is not the default. Other solvers have their names.
+"""
 
 from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, OWN_EXPLICIT
 from twoloop.methods.presets import PRESETS
@@ -25,8 +26,7 @@ def _option(method: str, word: str, coded: bool | None) -> bool | None:
 
 
 def label(solver: str, coded: bool | None = None) -> str:
-    """A solver in figures and tables. `coded`: whether `solve_dae` by itself makes code for the mechanism; None: for
-    some of those that are meant."""
+    """Return the name of a solver in figures and tables; `coded`: whether the default generates code (None: varies)."""
     parts = _parts(solver)
     if parts is None:
         name = solver.removesuffix(SUFFIX)

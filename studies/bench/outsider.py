@@ -1,6 +1,8 @@
-"""Solvers from files: `simulate(problem, times, tolerance)` of `twoloop.testing`, each in a process of its own. The
-process is a fork of that of the study, which calls the solver whenever it is asked, and times each call: what the
-solver prints, imports or breaks stays there."""
+"""Run solvers from files, `simulate(problem, times, tolerance)` of `twoloop.testing`, each in its own process.
+
+The process is a fork of the study's process, which sends the calls and times them: what the solver prints, imports or
+breaks stays in its process.
+"""
 
 import faulthandler
 import hashlib
@@ -124,10 +126,12 @@ START = 300.0  # s that the process may take to load twoloop, the mechanism and 
 
 
 class Outsider:
-    """A solver of a file on one mechanism, in a process that is started when it is asked, and again when it has died.
-    `where`: FILE.py:FUNCTION, or a file of `references.as_shown` by its name. `mechanism`: as `problem_from` takes it.
-    `name`: in rows. `digest`: of the file. `calibrated`: s of the calibration beside the last call
-    (`twoloop.rows.row_format`). Raises StudyError if there is no such file."""
+    """Solver from a file for one mechanism, in a process that is started at a call, and again after it has died.
+
+    `where`: FILE.py:FUNCTION, or the name of a file of `references.as_shown`. `mechanism`: as `problem_from` takes it.
+    `name`: name in rows. `digest`: digest of the file. `calibrated`: time of the calibration beside the last call, s
+    (`twoloop.rows.row_format`). Raises StudyError if there is no such file.
+    """
 
     def __init__(self, where: str, mechanism: str):
         shown = SHOWN / f"{where}.py"
@@ -192,8 +196,7 @@ class Outsider:
         return Result(times, q, v, none, lam, np.empty(0), Status.REACHED_END, f"{self.name} returned.", stats)
 
     def _asked(self, ask: dict[str, Any], limit: float) -> dict[str, Any] | None:
-        """The answer of the process; None where it does not come in time. Raises RuntimeError if the process ends
-        instead."""
+        """Return the answer of the process, or None after `limit` s; raise RuntimeError if the process ends."""
         if self._pipe is None:
             self.start()
         assert self._pipe is not None and self._process is not None

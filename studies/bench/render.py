@@ -14,8 +14,7 @@ TEMPLATES = Path(__file__).parents[1] / "templates"
 
 
 def number(value: Any, digits: int = 2) -> str:
-    """A number with `digits` significant digits: 0.012, 3.4, 120, 2.4e-5; "–" for one that does not exist. Integers
-    below 10,000 are written in full, powers of ten without a mantissa of 1 (1e-9)."""
+    """Return a number as text with `digits` significant digits, "–" if it is missing: 0.012, 3.4, 120, 2.4e-5, 1e-9."""
     if value is None or value != value:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -95,9 +94,11 @@ def environment() -> jinja2.Environment:
 
 
 def render(name: str, findings: Mapping[str, Any], tables: Mapping[str, str], **more: Any) -> str:
-    """The text of templates/NAME.md.j2. `findings`: `f` in the template: the numbers and booleans that are saved as
-    NAME.json. `tables`: `tables` in the template: ready markdown. `**more`: further names, such as the stamp. Raises
-    jinja2.UndefinedError if the template uses a name that is not defined."""
+    """Return the text of templates/NAME.md.j2; raise jinja2.UndefinedError if it uses an undefined name.
+
+    `findings`: `f` in the template, the numbers and booleans of NAME.json. `tables`: ready markdown. `**more`: further
+    names, such as the stamp.
+    """
     text = environment().get_template(f"{name}.md.j2").render(f=findings, tables=tables, **more)
     text = re.sub(r"\n{3,}", "\n\n", text)  # left by conditions that did not hold
     text = re.sub(r"(?m)^\|.*\|$", lambda line: re.sub(r" *(?<!\\)\| *", "|", line[0]), text)  # rows of tables

@@ -50,8 +50,7 @@ def versions() -> dict[str, str]:
 
 
 def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapping[str, str]) -> Row:
-    """The row of a run. `run`: a line of `tables.medians`. `columns`: where it has the errors and floors of the format
-    that are known. `versions`: of the other projects' packages, and of solvers from files."""
+    """Return the row of a run, a line of `tables.medians`; `columns`: columns of its known errors and floors."""
     family, done = run["family"], run["status"] == REACHED_END
     setting = next(name for name in SETTINGS if run.get(name) == run.get(name, float("nan")))
     row = {"schema": SCHEMA, "mechanism": mechanism_of(run["case"]), "t_end": run["t_end"], "solver": run["solver"]}
@@ -76,8 +75,7 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
 
 
 def rows_of_file(file: str) -> list[Row]:
-    """The rows of a file; of the word "archive" those that are shipped. Raises StudyError if it cannot be read, has
-    none, or a mistake."""
+    """Return the rows of a file, or of the shipped "archive"; raise StudyError if there are none or one is wrong."""
     try:
         return read_rows(ARCHIVE if file == "archive" else Path(file))
     except ValueError as error:

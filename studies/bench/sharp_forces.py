@@ -1,6 +1,8 @@
-"""Everyday forces that are sharp: drags, frictions, gusts, stops, brakes, switches, noise; compiled once for all. A
-force acts along one coordinate x of a mechanism with the velocity v. What it is stands in the last places of the
-parameters of the mechanism, so that one set of compiled callbacks serves all."""
+"""Everyday forces that are sharp: drags, frictions, gusts, stops, brakes, switches, noise.
+
+A force acts along one coordinate x of a mechanism with the velocity v. The last parameters of the mechanism define it,
+so that one set of compiled callbacks serves all forces.
+"""
 
 import math
 import tomllib

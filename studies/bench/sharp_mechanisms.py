@@ -234,8 +234,10 @@ def turning(
     energies: Callable[[Any], tuple[Any, Any, Any]],
     positions: Callable[[float, Array], Array],
 ) -> Mechanism:
-    """A mechanism with one freedom, the angle s, by Lagrange's equation, under a force given with its numbers here.
-    energies(s) -> inertia, potential and the coordinate along which the force acts, for complex s, too."""
+    """Return a mechanism with one freedom, the angle s, by Lagrange's equation, under a force of given numbers.
+
+    energies(s) returns inertia, potential and the coordinate along which the force acts, for complex s, too.
+    """
     force, p = sharp
 
     def rate(t: float, y: Array) -> Array:

@@ -1,7 +1,9 @@
-"""The catalogue: every solver that the studies compare, one entry each, usable on any case. The other solvers are the
-`LINES` of `references/`, found by their place. One that needs a model of its own (Exudyn) or compiled functions (IDA
-from C) refuses a case that it cannot run, which becomes a row. Foreign packages are imported when they are used, so
-that one that is not installed is a row too."""
+"""The catalogue: every solver that the studies compare, one entry each, usable on any case.
+
+The other solvers are the `LINES` of `references/`, found by their place. A solver that needs a model of its own
+(Exudyn) or compiled functions (IDA from C) refuses cases that it cannot run, and the refusal becomes a row. Packages of
+others are imported when they are used, so that a missing one is a row, too.
+"""
 
 from collections.abc import Callable, Iterator
 from functools import partial

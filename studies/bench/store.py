@@ -1,5 +1,4 @@
-"""The folder of a report: one run at a time in it, atomic writes, rows that survive an interruption. Nothing is written
-through a symbolic link: a file is made under a new name in the folder and then renamed."""
+"""The folder of a report: one run at a time, atomic writes, no symbolic links, rows that survive interruptions."""
 
 import csv
 import fcntl
@@ -39,9 +38,11 @@ NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
 
 class Output:
-    """The files of one run of a study; a context manager that holds the folder's lock. `call`: its `out` is made if it
-    is not there. Raises StudyError if the folder cannot be written to, or another run is using it; if another full run
-    of a study that compares times goes on anywhere on the machine."""
+    """Files of one run of a study; a context manager that holds the folder's lock.
+
+    The folder `out` of `call` is created if it does not exist. Raises StudyError if the folder cannot be written or is
+    in use, or if another full run of a study that compares times goes on anywhere on the machine.
+    """
 
     def __init__(self, call: Call):
         self.call = call
@@ -96,8 +97,7 @@ class Output:
         return path
 
     def save_rows(self, rows: pd.DataFrame, line: str) -> None:
-        """Write NAME.csv; its first line says study, quick or full, and the stamp `line`. The column "series", of
-        curves by name, goes to NAME_series.npz."""
+        """Write NAME.csv, with study, quick or full, and the stamp in its first line; curves go to NAME_series.npz."""
         if "series" in rows:
             curves = {
                 f"{key(row)} {name}": np.asarray(curve, np.float32)
@@ -112,8 +112,7 @@ class Output:
         self.write(f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{text}")
 
     def load_rows(self, curves: bool = False) -> tuple[pd.DataFrame, str]:
-        """Read what `save_rows` wrote, the curves, too, where these are asked for, and the stamp. Raises StudyError if
-        there are no rows, or they are damaged, of another study, or quick where full ones are asked for."""
+        """Read the rows of `save_rows`, with the curves if requested, and the stamp; StudyError if they do not suit."""
         path = self.file(f"{self.call.study}.csv")
         rerun = f"make it again by {command_of(self.call.study)}"
         if not path.is_file():
@@ -160,8 +159,7 @@ class Output:
 
 
 def read_rows(path: Path, *columns: str) -> tuple[pd.DataFrame, str]:
-    """The rows of a file that `Output.save_rows` wrote, and its first line. Raises StudyError if the file is damaged,
-    or lacks one of these columns."""
+    """Return the rows of a file by `Output.save_rows`, and its first line; raise StudyError if it is damaged."""
     try:
         first, rest = path.read_text().split("\n", 1)
         rows = pd.read_csv(StringIO(rest), low_memory=False)
@@ -184,8 +182,7 @@ def key(row: pd.Series) -> str:
 
 
 def alone() -> int:
-    """Hold the machine for a study that compares times, by the descriptor that is returned; its end releases it. Raises
-    StudyError if another such study runs."""
+    """Hold the machine for a study that compares times, by the returned descriptor; else raise StudyError."""
     path = Path(tempfile.gettempdir(), LOCK)
     try:
         # to read is enough for a lock, and of a file that another user has made all that may be
@@ -297,8 +294,7 @@ def sources() -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON holds it: numpy's types as Python's, what is not finite as None. Raises TypeError if it is of a
-    type that JSON does not hold."""
+    """Return a value in types of JSON, with None for what is not finite; raise TypeError for other types."""
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

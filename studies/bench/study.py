@@ -1,5 +1,4 @@
-"""A study, from its command line to the index: rows, then findings, figures, tables and the report. The index is
-reports/README.md: one line a report, with its question, its answer, date and processor."""
+"""A study from its command line to the index, reports/README.md: rows, findings, figures, tables, report."""
 
 import importlib
 import json
@@ -34,8 +33,7 @@ def run_rows(
     curves: bool = False,
     parts: bool = False,
 ) -> None:
-    """Make rows, or with --redraw read those that were saved; `report(output, rows, stamp)` writes all else. `parts`:
-    `make` leaves out what `Call.wants` does not want."""
+    """Make rows, or with --redraw read saved ones; `report(output, rows, stamp)` writes everything else."""
 
     def work(words: Sequence[str] | None) -> None:
         with Output(cli.parse(name, about, words, parts)) as output:
@@ -57,8 +55,7 @@ def saved(output: Output, make: Make, curves: bool = False) -> tuple[pd.DataFram
 
 
 def renewed(old: pd.DataFrame, line: str, make: Callable[[], pd.DataFrame], call: Call) -> tuple[pd.DataFrame, str]:
-    """Put new rows of some names in the place of the old ones, with commit and processor; tell the stamp. Raises
-    StudyError if the new rows have no group, case, family or solver of a name."""
+    """Replace the rows of some names by new ones; return them and the stamp; StudyError if a name has no new rows."""
     columns = [column for column in NAMED if column in old]
     replaced = old[columns].isin(call.only).any(axis=1)
     commit, (_, _, _, machine, *_) = re.search(r"commit (\w+)", line), line.split("; ")
@@ -176,8 +173,7 @@ def run_study(name: str, words: Sequence[str]) -> None:
 
 
 def line_of(folder: Path, name: str) -> dict[str, Any] | None:
-    """Read what the index says of a report; None where it has not been written, or its findings give no answer. Raises
-    StudyError if a file is damaged."""
+    """Return the entry of a report in the index, or None if it has no answer; raise StudyError if a file is damaged."""
     path = folder / f"{name}.json"
     if not (path.is_file() and (folder / f"{name}.md").is_file()):
         return None

@@ -58,9 +58,11 @@ UNLIKE = 3.0  # times the median time of the repetitions of a run: such a one wa
 
 
 def medians(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one row a run: the repetition of median error, with the median of the times of the calls. The rows are
-    those of `collect`, in its order: the repetitions of a run one below the other. A run of which any repetition failed
-    is represented by a failed one if half of them or more failed. `times`: of all that are `alike`."""
+    """Return one row for each run: the repetition of median error, with the median of the times of the calls.
+
+    The rows are those of `collect`, with the repetitions of a run one after another. If at least half of the
+    repetitions failed, a failed one represents the run. `times`: times of all repetitions that are `alike`.
+    """
     firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
     errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["call_s"].to_numpy(float)
     chosen, kept = [], []
@@ -74,9 +76,11 @@ def medians(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def alike(times: Array, errors: Array) -> NDArray[np.bool_]:
-    """Which repetitions of a run took a time of the same thing; all that have a time, if fewer than three are left. Not
-    those that failed where most ended (a limit of ours), whose error is a decade from the median (another path of
-    steps), or that took UNLIKE times the median (code was built, or the machine was busy)."""
+    """Return a mask of the repetitions whose times are comparable; all that have a time, if fewer than three remain.
+
+    Not comparable: failures where most repetitions ended (by the time limit); an error that is a decade from the median
+    (another path of steps); UNLIKE times the median time (code was generated, or the machine was busy).
+    """
     known = ~np.isnan(times)
     if known.sum() < FEWEST:
         return known
@@ -95,10 +99,12 @@ def where(rows: pd.DataFrame, **equal: Any) -> pd.DataFrame:
 
 
 def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
-    """Time of a call (or another cost) of one solver for an error of at most `target`. Between two runs less than a
-    decade apart, on the log-log line through them: solvers whose settings lie apart are not made to look expensive by
-    it. NaN where no run is so good, where the solver was not asked for about so much, and where the target is below
-    what the reference resolves."""
+    """Return the time of a call (or another cost) of one solver for an error of at most `target`.
+
+    Between two runs less than a decade apart it is interpolated on a log-log line, so that solvers with few settings do
+    not seem expensive. NaN if no run is accurate enough, if no run had such an error, or if the reference is less
+    accurate.
+    """
     solver = str(rows["solver"].iloc[0]) if len(rows) and "solver" in rows else ""
     runs = Runs(_columns(rows, what), np.arange(len(rows)), what, solver)
     place = leaderboard.locate_target(runs, target)
@@ -109,10 +115,11 @@ Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and dr
 
 
 def costs_at(rows: pd.DataFrame | Mapping[str, Runs], target: float, doubt: bool = False) -> Costs:
-    """Of the solvers of one case that get to an error, what the cheapest run takes that is good enough. `rows`: as a
-    table, or grouped by `by_solver` where several errors are asked for. `doubt`: of those that were not asked for about
-    so much, the next looser run counts as good enough, so that no solver is ahead of another for want of a run. A run
-    out of phase does not."""
+    """Return the cost of the cheapest run that reaches an error, for each solver of one case.
+
+    `rows`: a table, or rows grouped by `by_solver`. `doubt`: for solvers without a run near the error, the next looser
+    run counts as accurate enough, so that no solver wins because a run is missing. A run out of phase does not.
+    """
     found = {}
     for solver, runs in (by_solver(rows, "call_s") if isinstance(rows, pd.DataFrame) else rows).items():
         place = leaderboard.locate_target(runs, target, include_unaimed=True)
@@ -172,9 +179,11 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
 
 
 def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
-    """Rank the solvers of one case that reach an error, cheapest first; others' only where asked for about so much.
+    """Rank the solvers of one case that reach an error, cheapest first; others only if they have runs near it.
+
     Returns solver, family, called_from, keeps_constraints, call_s, n_evaluations for this error (on the log-log line
-    between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it."""
+    between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
+    """
     told = {name: rows[name].to_numpy() for name in (*RANKED, *SETTINGS) if name in rows and name not in COSTS}
     lines = []
     for solver, runs in by_solver(rows, *COSTS).items():
@@ -204,8 +213,7 @@ def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
 def work_precision(
     rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] = (), coded: bool | None = None
 ) -> list[list[str]]:
-    """Return lines of a table: solver, called from, CPU time in seconds for each target, "–" where it has none.
-    `coded`: as `names.label` has it."""
+    """Return lines of a table: solver, called from, CPU time for each target, s; `coded`: see `names.label`."""
     lines = []
     for solver in solvers or list(dict.fromkeys(rows["solver"])):
         if len(runs := rows[rows["solver"] == solver]):
@@ -225,8 +233,7 @@ def setting(row: Mapping[str, Any]) -> str:
 
 
 def failures(rows: pd.DataFrame, coded: bool | None = None) -> list[list[str]]:
-    """Lines of a table of runs that did not reach the end: solver, setting, status, first sentence of the message.
-    `coded`: as `names.label` has it."""
+    """Return lines of a table of failed runs: solver, setting, status, first sentence of the message."""
     lines = []
     for _, row in rows[rows["status"] != "REACHED_END"].iterrows():
         what = [f"{key} {power(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]

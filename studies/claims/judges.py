@@ -1,5 +1,4 @@
-"""What a claim is, and its judges: from the rows of the other studies to a verdict and the numbers that decide. All
-that depends on how another study writes its rows stands here."""
+"""Claims and their judges: from the rows of other studies to a verdict and the numbers that decide."""
 
 import itertools
 import tomllib
@@ -68,8 +67,7 @@ class Rows:
         return float(self.experiments[key])
 
     def pick(self, study: str, least: float = 0.0, named: str = "", **equal: Any) -> pd.DataFrame:
-        """Select the rows in which each column named has that value, or one of a tuple of values. Of solvers whose name
-        contains `named`; not run if none covers `least` seconds."""
+        """Select rows by columns (values or tuples) and part of the solver's name; not run if none covers `least` s."""
         if study not in self.tables:
             raise NotRun(f"there is no {study}.csv")
         found = self.tables[study]
@@ -524,9 +522,11 @@ def _along(rows: Rows, solver: str, problem: str) -> pd.DataFrame:
 
 
 def _newmark_over_irk(rows: Rows) -> dict[str, list[float]]:
-    """Divide times of Newmark, both beta, by Runge-Kutta's: at equal errors on linkages, of runs as good on beams. On
-    the beams Runge-Kutta has no run as bad as the errors, so that the errors compared are not equal: of each the
-    cheapest run counts that is at least as good."""
+    """Divide times of Newmark, both beta, by Runge-Kutta's: at equal errors on linkages, of runs as good on beams.
+
+    On the beams no run of Runge-Kutta has errors as large, so that errors are not equal: the cheapest run of each that
+    is at least as accurate counts.
+    """
     ratios: dict[str, list[float]] = {"linkage": [], "soft": [], "stiff": []}
     for name in (NEWMARK, QUARTER):
         for problem in dict.fromkeys(rows.long("table3_full")["problem"]):

@@ -161,8 +161,7 @@ def without_tangent(problem: Problem) -> ConstrainedSystem:
 
 
 def outer_loops() -> dict[str, float]:
-    """Compare the evaluations of Newton's method, Jacobian by differences, with those of the fixed point. Both with
-    Sun's tableau, at the least number of equal steps for an error of `CLOSE` in q at the end."""
+    """Compare evaluations of Newton's method, Jacobian by differences, and of the fixed point, at an error `CLOSE`."""
     found = {}
     known = (("linkage", four_bar(), 1.0), ("very flexible", very_flexible_beam(), BEAM_END))
     for name, problem, t_end in (*known, ("moderately stiff", moderately_stiff_beam(), BEAM_END)):
@@ -197,8 +196,7 @@ def orders() -> dict[str, float]:
 
 
 def passing(geometries: Sequence[tuple[float, float, float, float]]) -> dict[str, float]:
-    """Count the linkages, released with bar 3 horizontal, that pass y3 = 0. The first of the first geometry is the one
-    assumed for the paper's."""
+    """Count linkages, released with bar 3 horizontal, that pass y3 = 0; the first is the one assumed for the paper."""
     tops = []
     for *lengths, ground in geometries:
         for theta3, branch in ((0.0, -1), (0.0, 1), (math.pi, -1), (math.pi, 1)):

@@ -222,15 +222,6 @@ def parts_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {"default": rows[default], "own": rows[own & ~default], "others": rows[others]}
 
 
-def table_of(ran: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Count the silent failures of each kind of trap that has rows."""
-    lines: dict[str, dict[str, Any]] = {}
-    for key, (words, which) in TABLE.items():
-        if len(rows := ran[which(ran)]):
-            lines[key] = {"trap": words} | {who: graded(own) for who, own in parts_of(rows).items()}
-    return lines
-
-
 def best_limited(ran: pd.DataFrame, shape: str) -> dict[str, Any] | None:
     """Return the solver with a largest step that misses the fewest short forces of a shape."""
     own = ran[ran["trap"].str.startswith(shape) & ran["solver"].str.endswith(LIMITED)]
@@ -240,22 +231,20 @@ def best_limited(ran: pd.DataFrame, shape: str) -> dict[str, Any] | None:
     return min(lines, key=lambda line: line["wrong"] / line["n"], default=None)
 
 
-def pulses_of(ran: pd.DataFrame) -> dict[str, Any]:
-    """Count the pulses of each width that the default misses."""
-    own = ran[ran["solver"] == DEFAULT]
-    by_width = {width: graded(own[own["trap"] == traps.name_of("pulse", width)]) for width in traps.WIDTHS}
-    missed = [(width, each["wrong"]) for width, each in by_width.items() if each["wrong"]]
-    return {"n": max(each["n"] for each in by_width.values()), "wrong": missed}
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Count silent failures by kind of trap, and those under sharp forces by kind of solver."""
     ran = rows[rows["outcome"] != NOT_RUN]
     forces, short, mistakes, singular = (ran[ran["group"] == group] for group in GROUPS)
-    found: dict[str, Any] = {"table": table_of(ran)}
+    found: dict[str, Any] = {"table": {}}
+    for key, (words, which) in TABLE.items():
+        if len(own := ran[which(ran)]):
+            found["table"][key] = {"trap": words} | {who: graded(part) for who, part in parts_of(own).items()}
     of = {kind: forces[forces["solver"].map(kind_of) == kind] for kind in KINDS}
     found["kinds"] = [{"kind": words} | graded(of[kind]) for kind, words in KINDS.items() if len(of[kind])]
-    found["pulses"] = pulses_of(short)
+    own = short[short["solver"] == DEFAULT]
+    by_width = {width: graded(own[own["trap"] == traps.name_of("pulse", width)]) for width in traps.WIDTHS}
+    missed = [(width, each["wrong"]) for width, each in by_width.items() if each["wrong"]]
+    found["pulses"] = {"n": max(each["n"] for each in by_width.values()), "wrong": missed}
     found["n"] = int((~ran["group"].isin((PUBLISHED, AUTHORS))).sum())
     found |= {f"best_{shape}": best_limited(short, shape) for shape in traps.SHAPES}
     found["limited"] = graded(forces[forces["solver"].str.endswith(LIMITED)])
@@ -323,8 +312,7 @@ BUILT = (HEYOKA, CVODE_C, PROJECTED, CYRK, CYRK_RADAU)
 
 
 def right_answer(trap: Trap) -> Array | None:
-    """Compute the positions at the end by two unlike methods, from one break of the forces to the next, if there are.
-    Raises StudyError if the two agree at no tolerance."""
+    """Return the positions at the end by two methods, from break to break of forces; StudyError if they differ."""
     if trap.positions is not None:
         return trap.positions(trap.t_end)
     if trap.sane is None:

@@ -1,5 +1,8 @@
-"""Traps: systems and starts on which a solver goes wrong unless it notices. All traps on chains of point masses share
-the compiled callbacks of `sharp_mechanisms`, with a force of its own: the parameters say what the trap is."""
+"""Traps: systems and starts on which a solver goes wrong unless it notices.
+
+All traps on chains of point masses share the compiled callbacks of `sharp_mechanisms`, with a force of its own: the
+parameters define the trap.
+"""
 
 import math
 import signal

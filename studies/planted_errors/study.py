@@ -131,8 +131,7 @@ def row_of(fault: Fault) -> Row:
 
 
 def check_sound(faults: Sequence[Fault]) -> int:
-    """Run every check without a fault, and count them. Raises StudyError if one of them fails: it would catch
-    anything."""
+    """Run every check without a fault, and count the checks; raise StudyError if one fails."""
     foreign = Run(case_of(mechanisms.double_pendulum()), CATALOGUE[SCIPY], TOLERANCE, repeats=1)
     warm_up(foreign, 0, set())  # here, so that the processes of the checks need not compile
     seen = set()
@@ -161,16 +160,10 @@ def make(output: Output) -> pd.DataFrame:
         return pd.DataFrame([kept.made(fault.name, partial(row_of, fault)) for fault in faults])
 
 
-def catcher(caught_by: str) -> str:
-    """Say who catches a fault."""
-    if caught_by == NONE:
-        return NONE
-    return next((who for who, begins in BEGINS.items() if caught_by.startswith(begins)), TESTS)
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Count the faults by who catches them, in all and by their place."""
-    who = rows["caught_by"].map(catcher)
+    checks = {name: [who for who, begins in BEGINS.items() if name.startswith(begins)] for name in rows["caught_by"]}
+    who = rows["caught_by"].map(lambda name: NONE if name == NONE else (*checks[name], TESTS)[0])
 
     def counts(own: pd.DataFrame) -> dict[str, int]:
         return {each: int((who[own.index] == each).sum()) for each in (*BEGINS, TESTS, NONE)}

@@ -1,5 +1,7 @@
-"""Figs. 9-14 of the paper: the flexible beam on a moving base, very flexible and moderately stiff. The start is
-assumed, the paper's text does not tell it: straight along x, gravity across it, only the base node moving."""
+"""Figs. 9-14 of the paper: the flexible beam on a moving base, very flexible and moderately stiff.
+
+The paper does not give the start. Assumed: straight along x, gravity across it, only the base node moving.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -37,9 +39,11 @@ TIME_LIMIT = 30.0  # s, of a call; the paper's procedure takes a third of it on 
 
 
 def _known(problem: Problem, t_end: float) -> ReferenceMotion:
-    """DOP853 (twoloop), its own steps joined by quintics; the floor is its distance from two other ways. Gauss12 shares
-    the equations and not the method; SciPy's DOP853 on the equations without constraints shares the forces and the
-    tableau, and nothing of the two-loop procedure."""
+    """Return the motion by DOP853 of twoloop, its steps joined by quintics, with its distance from two others as floor.
+
+    Gauss12 shares the equations but not the method. SciPy's DOP853 on the equations without constraints shares the
+    forces and the tableau, and nothing of the two-loop procedure.
+    """
     span, start = (0.0, t_end), (problem.q0, problem.v0)
     first = solve_dae(problem.system, span, *start, method="DOP853", rtol=TIGHT, atol=TIGHT)
     other = solve_dae(problem.system, span, *start, method="Gauss12", rtol=CHECK, atol=CHECK)
@@ -82,9 +86,11 @@ def frequencies(problem: Problem) -> Array:
 
 
 def gauss_seidel_limit(tableau: Tableau) -> float:
-    """Find the largest h w_max at which the paper's iteration on [v, q] converges, which uses the latest stages. With
-    K_j = B (K_j's sum over A), B = x [[0, -1], [1, 0]] and L the part of A below its diagonal, one iteration is K_new =
-    B (L K_new + (A - L) K_old)."""
+    """Return the largest h w_max at which the paper's iteration on [v, q] converges, which uses the latest stages.
+
+    With K_j = B (K_j's sum over A), B = x [[0, -1], [1, 0]] and L the part of A below its diagonal, one iteration is
+    K_new = B (L K_new + (A - L) K_old).
+    """
     lower = np.tril(tableau.A, -1)
 
     def rate(x: float) -> float:

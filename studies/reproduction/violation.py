@@ -82,15 +82,6 @@ def grows(row: pd.Series) -> bool:
     return bool(row["growth_q"] >= SLOPE and row["late_q"] > TIMES * row["early_q"])
 
 
-def time_ratios(rows: pd.DataFrame, kept: str, drifting: str) -> list[float]:
-    """Divide CPU times of the first solver by those of the second at the errors that both reach."""
-    first, second = (rows[rows["solver"] == name] for name in (kept, drifting))
-    # where all runs of a solver are better than a target, its cost at the target is not known
-    targets = [target for target in TARGETS if target <= min(first["error_q"].max(), second["error_q"].max())]
-    ratios = [float(tables.time_for(first, error) / tables.time_for(second, error)) for error in targets]
-    return [ratio for ratio in ratios if not np.isnan(ratio)]
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     line_up, loops, along = (rows[rows["group"] == group] for group in ("line-up", "loops", "tolerances"))
     line_up = line_up[line_up["growth_q"].notna()].set_index("solver")
@@ -106,7 +97,13 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["ours_grow"] = [name for name, row in ours.iterrows() if grows(row)]
     stabilised = along[along["solver"].str.contains("Baumgarte")]["violation_q"]
     found["baumgarte"] = [stabilised.min(), stabilised.max()] if len(stabilised) else None
-    ratios = [ratio for pair in PAIRS for ratio in time_ratios(along, *pair)]
+    ratios: list[float] = []
+    for pair in PAIRS:
+        kept, drifting = (along[along["solver"] == name] for name in pair)
+        # where all runs of a solver are better than a target, its cost at the target is not known
+        targets = [target for target in TARGETS if target <= min(kept["error_q"].max(), drifting["error_q"].max())]
+        ratios += [float(tables.time_for(kept, error) / tables.time_for(drifting, error)) for error in targets]
+    ratios = [ratio for ratio in ratios if not np.isnan(ratio)]
     found["cost"] = [min(ratios), max(ratios)] if ratios else None
     shown = line_up.loc[[name for name in SHOWN if name in line_up.index]]
     columns = ["violation_q", "violation_v"]

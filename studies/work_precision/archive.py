@@ -1,5 +1,4 @@
-"""The rows of work_precision.csv in the wheel: one a run, in the format of `twoloop.rows`. `python -m
-studies.work_precision.archive` makes `twoloop/rows/archive.jsonl.gz` of reports/work_precision.csv."""
+"""Write the rows of reports/work_precision.csv to twoloop/rows/archive.jsonl.gz, in the format of `twoloop.rows`."""
 
 import gzip
 import json

@@ -1,7 +1,9 @@
-"""Run every mechanism whose end is verified with every solver, and find which is the fastest at which error. Errors are
-those at the end of the reference, which is known there to more digits than by any motion between: the largest of a
-coordinate, over the largest coordinate where that exceeds 1. A part of `studies.work_precision`. heyoka, CyRK and CVODE
-in minimal coordinates are a group of rows of their own, which no ranking of DAE solvers sees."""
+"""Run every mechanism whose end is verified with every solver, and find which is fastest at which error.
+
+Errors are those at the end of the reference, which is known to more digits than any motion before it: the largest error
+of a coordinate, over the largest coordinate if that exceeds 1. A part of `studies.work_precision`. heyoka, CyRK and
+CVODE in minimal coordinates are rows of their own, which are not in the ranking of DAE solvers.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,7 +17,7 @@ import pandas as pd
 from references.minimal.solvers import has_minimal
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import adaptive, headline
-from studies.bench.cli import Call, StudyError
+from studies.bench.cli import StudyError
 from studies.bench.collector import Run, Warm, warm_up
 from studies.bench.end_states import case_of, row_of
 from studies.bench.four_bar import SECOND
@@ -74,8 +76,7 @@ def singular() -> frozenset[str]:
 
 
 def _end_of_second(problem: Problem) -> Reference:
-    """Compute its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits. Raises StudyError
-    if a run fails, or the equation in one coordinate, which shares nothing with them, does not agree to FAR."""
+    """Return the state after 10 s by Gauss14; StudyError if DOP853 or the equation in one coordinate disagrees."""
     t_end, ends = 10.0, []
     for method in ("Gauss14", "DOP853"):
         span = (0.0, t_end)
@@ -204,8 +205,10 @@ def reached(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def drift(made: Standings, rows: pd.DataFrame) -> dict[str, float] | None:
-    """Measure how far the fastest other solvers leave the constraints where they are faster than the default. |C| of
-    the cheapest run that is accurate enough over the error compared; None: all of them keep the constraints."""
+    """Return the violations by the fastest other solvers that are faster than the default; None: there are none.
+
+    A violation is |C| of the cheapest run that is accurate enough, over the error that is compared.
+    """
     known = rows.reindex(columns=list(dict.fromkeys([*rows.columns, "violation_q", "keeps_constraints"])))
     leaves = known[known[["error_q", "violation_q"]].notna().all(axis=1) & known["keeps_constraints"].eq(False)]
     ratios = []
@@ -243,15 +246,8 @@ def minimal_runs(quick: bool) -> list[Run]:
     return found
 
 
-def collect_minimal(kept: KeptRows, call: Call) -> pd.DataFrame:
-    """Make the rows of the runs in minimal coordinates, the repetitions interleaved."""
-    todo, errors = call.wanted(minimal_runs(call.quick)), () if call.quick else RESOLVED
-    return adaptive.collect(todo, kept, row_at_end, lambda run: True, errors)
-
-
 def minimal_findings(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:
-    """Compare the ODE in minimal coordinates with the best of twoloop with constraints, by kind of mechanism. `rows`
-    and `everywhere` (of all solvers): medians."""
+    """Compare the ODE in minimal coordinates with the best of twoloop, by kind of mechanism, on medians."""
     if not len(rows):
         return []
     cases = rows["case"].astype(str)

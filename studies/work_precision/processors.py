@@ -1,6 +1,8 @@
-"""Compare verdicts between processors: who is faster on a mechanism at an error. `studies.work_precision` adds the
-processor that it ran on to processors.csv; rows that it made on another machine are added by `python -m
-studies.work_precision.processors FOLDER`, the folder of reports from there."""
+"""Compare verdicts between processors: which solver is faster on a mechanism at an error.
+
+`studies.work_precision` adds its own processor to processors.csv. Rows from another machine are added by `python -m
+studies.work_precision.processors FOLDER`, the folder of that machine's reports.
+"""
 
 import re
 import sys
@@ -58,8 +60,10 @@ def kept(output: Output, rows: pd.DataFrame, stamp: str, known: Standings) -> li
 
 
 def findings_of(table: pd.DataFrame, who: str = headline.OWN_CODE) -> list[dict[str, Any]]:
-    """Count for each two processors the pairs of mechanism and error in which twoloop is faster, and slower. `who`: the
-    default where it makes code. `turned`: pairs in which one processor has it faster, the other slower."""
+    """Count for each two processors the pairs of mechanism and error in which twoloop is faster, and slower.
+
+    `who`: the default with generated code. `turned`: pairs with opposite verdicts on the two processors.
+    """
     found, own = [], table[table["who"] == who]
     for pair in combinations(dict.fromkeys(own["processor"]), 2):
         sides = [own[own["processor"] == name] for name in pair]

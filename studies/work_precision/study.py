@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from studies.bench import figures, headline, study, tables
+from studies.bench import adaptive, figures, headline, study, tables
 from studies.bench.render import number, power, render
 from studies.bench.row_files import versions
 from studies.bench.store import Output
@@ -24,8 +24,9 @@ MARKS = {"alone": "ours", "missed": "others", "none": "–"}  # cells of the pic
 def make(output: Output) -> pd.DataFrame:
     call = output.call
     with output.kept() as kept:
-        made = [mechanisms.collect(call.wanted(mechanisms.runs(call.quick)), kept)]
-        made += [first_calls.collect(kept, call), mechanisms.collect_minimal(kept, call)]
+        made = [mechanisms.collect(call.wanted(mechanisms.runs(call.quick)), kept), first_calls.collect(kept, call)]
+        minimal, errors = call.wanted(mechanisms.minimal_runs(call.quick)), () if call.quick else RESOLVED
+        made += [adaptive.collect(minimal, kept, mechanisms.row_at_end, lambda run: True, errors)]
     # the time of a fixed calculation, by which times of several processors can be compared
     return pd.concat(made, ignore_index=True).assign(calibration=CALIBRATION, calibration_s=calibration_s())
 
@@ -77,8 +78,10 @@ def versions_of(output: Output) -> dict[str, str]:
 
 
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
-    """Count the commits and processors of the rows, and the sessions in which a mechanism was measured, at most.
-    `speeds`: the largest time of the calibration over the least between the sessions of a mechanism, at most."""
+    """Count commits and processors of the rows, and sessions in which a mechanism was measured, at most.
+
+    `speeds`: largest ratio of the times of the calibration between the sessions of a mechanism.
+    """
     made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
     told: dict[str, Any] = {"commits": made["commit"].nunique(), "sessions": 1, "speeds": None}
     told["processors"] = sorted(map(short, made["processor"].unique()))
