@@ -7,9 +7,10 @@ import pytest
 from studies import compare
 from studies.bench import reference_motion
 from studies.bench.collector import Case, Run, called_from
+from studies.bench.linkages import moved
 from studies.bench.solvers import CATALOGUE
 from twoloop import solve_dae
-from twoloop.mechanisms import n_four_bar
+from twoloop.mechanisms import Problem, n_four_bar
 
 MECHANISMS = """
 import dataclasses
@@ -79,17 +80,33 @@ def test_without_a_reference_the_report_says_why(mechanisms, monkeypatch):
     assert "no reference for 'heavy top'" in (mechanisms.parent / "top" / "compare.md").read_text()
 
 
-def test_the_reference_where_rows_are_singular_is_the_ode_in_minimal_coordinates(monkeypatch):
+@pytest.fixture
+def only_own_methods_pass(monkeypatch):
     def singular(*run, **options):
-        raise RuntimeError("singular")
+        raise RuntimeError("singular")  # which SciPy's DOP853 says after a minute
 
     monkeypatch.setattr(reference_motion, "_explicit", singular)
+
+
+@pytest.mark.usefixtures("only_own_methods_pass")
+def test_the_reference_where_rows_are_singular_is_the_ode_in_minimal_coordinates():
     problem = n_four_bar(2)
     known = reference_motion.make_reference(problem, 0.5)
     assert "minimal coordinates" in known.source and known.floor < 1e-10
     result = solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
     q, v = known.states(result.t)
     assert np.abs(q - result.q).max() < 1e-8 > 0.1 * np.abs(v - result.v).max()
+
+
+@pytest.mark.usefixtures("only_own_methods_pass")
+@pytest.mark.filterwarnings("ignore:the constraint Jacobian has lost rank")
+def test_a_rhombus_of_ones_own_has_a_reference_across_its_folds():
+    drawn = moved("rhombus", (9,))
+    span = (0.0, drawn["t_end"])
+    own = Problem("own", drawn["system"], drawn["q0"], drawn["v0"], span, lambda t, q, v: 0.0)
+    known = reference_motion.make_reference(own, span[1])
+    assert "Taylor and DOP853" in known.source and known.floor < 1e-9
+    assert np.abs(known.states(np.array(span))[0][:, 1] - drawn["positions"](span[1])).max() < 1e-9
 
 
 def test_functions_that_raise_are_named(mechanisms):
