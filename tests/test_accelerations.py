@@ -196,7 +196,7 @@ def test_neighbouring_starts_have_the_same_code_and_any_start_its_own():
     """A call gets the code of its start, whatever ran before it."""
     problem = mechanisms.four_bar()
     known = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, t_eval=np.linspace(0.0, 5.0, 201))
-    blocks = [PivotChoice.for_position(problem.system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
+    blocks = [PivotChoice.choose(problem.system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
     assert 1 < len(set(blocks)) <= 3  # pairs of three bars
     assert sum(one != other for one, other in pairwise(blocks)) < 20
     first = next(k for k, each in enumerate(blocks) if each != blocks[0])
@@ -218,7 +218,7 @@ def test_in_lanes_no_run_depends_on_those_beside_it():
     problem = mechanisms.four_bar()
     system, n = problem.system, problem.system.n_q
     known = solve_dae(system, (0.0, 5.0), problem.q0, problem.v0, t_eval=np.linspace(0.0, 5.0, 801))
-    equations = Elimination(system, PivotChoice.for_position(system, 0.0, problem.q0))
+    equations = Elimination(system, PivotChoice.choose(system, 0.0, problem.q0))
     module, numbers = Module(), Coefficients()
     for outputs in equations.accelerations:
         list(numbers.structure(outputs))
@@ -274,9 +274,9 @@ def test_little_inertia_on_long_bars(inertia):
 def test_digits_that_a_projection_loses_are_found(monkeypatch):
     """Accelerations alone are right there: they take other pivots."""
     problem = mechanisms.spatial_slider_crank()
-    choice = PivotChoice.for_position(problem.system, 0.0, problem.q0)
+    choice = PivotChoice.choose(problem.system, 0.0, problem.q0)
     changed = replace(choice, scales=tuple(2.0**45 * scale for scale in choice.scales), is_refined=None)
-    monkeypatch.setattr(PivotChoice, "for_position", lambda *position: changed)
+    monkeypatch.setattr(PivotChoice, "choose", lambda *position: changed)
     with pytest.raises(ValueError, match="loses the digits of little inertia"):
         generated_code(problem.system, 0.0, problem.q0)
 

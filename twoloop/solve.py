@@ -22,7 +22,7 @@ from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import begin_folder, check_folder, end_folder
-from twoloop.run.cached import STEPS, MissedChanges, cached_result, fields_of, set_up
+from twoloop.run.cached import STEPS, RepeatRequest, cached_result, fields_of, set_up
 from twoloop.run.fallbacks import MAX_REPETITIONS, gap_for_repetition, may_have_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_fields
 from twoloop.run.options import options_of
@@ -210,7 +210,7 @@ def solve_dae(
                 if rows_warning:
                     warnings.warn(rows_warning, ConstraintWarning, stacklevel=2)
                 return record_of(Result, fields)
-            if isinstance(outcome, MissedChanges):
+            if isinstance(outcome, RepeatRequest):
                 every, spent, repeats = outcome.max_gap, outcome.cpu_time, MAX_REPETITIONS - 1
             elif isinstance(outcome, Run):
                 run = outcome

@@ -156,7 +156,7 @@ def test_programs_grow_with_the_bodies_and_no_faster():
             pairs = [(k, k - 1) for k in range(1, n)] if make is not tree else [(k, (k - 1) // 2) for k in range(1, n)]
             system = sprung(made.bodies, made.q, pairs[: 1 if make.__name__ in ("ladder", "star") else None])
             form = static_module.static_form(system, 0.0, made.q)
-            form = static_module.with_newton(system, 0.0, made.q, form)
+            form = static_module.add_newton_program(system, 0.0, made.q, form)
             updates.append(int(form.newton_program[N_UPDATES]))
             assert form.matrix_cost() < 3.0 + system.n_q / 8.0  # what a dense one is taken to cost
         assert updates[1] <= (5.2 if make is grid else 3.6) * updates[0]  # of a grid like n^1.5, at best

@@ -69,7 +69,7 @@ def check_callback(system: ConstrainedSystem, kind: str, t: float, state: list[A
         filled = ", ".join(f"{name} has shape {x.shape}" for (name, _), x in zip(KINDS[kind].outputs, out, strict=True))
         sizes = [f"{name} has {array.size} entries" for name, array in zip(KINDS[kind].state, state, strict=True)]
         raise ValueError(
-            f"{kind} of {system.name!r} goes out of bounds: {error}{place_of(error)}. {', '.join(sizes)}, p has "
+            f"{kind} of {system.name!r} goes out of bounds: {error}{source_location(error)}. {', '.join(sizes)}, p has "
             f"{p.size}, {filled} (n_q = {system.n_q}, n_c = {system.n_c})"
             + (". Give more `parameters`: it reads more of them than there are" if too_short else "")
         )
@@ -80,13 +80,13 @@ def _index_error(
     function: Dispatcher, t: float, state: list[Array], p: Array, out: list[Array], changed: list[int] | None = None
 ) -> IndexError | None:
     """Return the first index error, or None; append the indices of changed arrays (`state`, then `p`) to `changed`."""
-    for wrap in (_in_python, _with_bounds_checked):
+    for wrap in (_leave_in_python, _compile_with_bounds_checks):
         given = [array.copy() for array in (*state, p)]
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                is_own = wrap is _in_python and is_twoloop(function.__module__ or "")
-                copy = _own_in_python(function) if is_own else FunctionCopier(wrap).replacement_of(function)
+                is_own = wrap is _leave_in_python and is_twoloop(function.__module__ or "")
+                copy = _own_callback_in_python(function) if is_own else FunctionCopier(wrap).replacement_of(function)
                 copy(t, *given, *(np.zeros(array.shape) for array in out))
         except IndexError as error:
             return error
@@ -100,21 +100,21 @@ def _index_error(
     return None
 
 
-def _in_python(function: types.FunctionType, _: Any) -> Any:
+def _leave_in_python(function: types.FunctionType, _: Any) -> Any:
     return function
 
 
 @lru_cache(256)
-def _own_in_python(function: Dispatcher) -> Any:
+def _own_callback_in_python(function: Dispatcher) -> Any:
     """Return a copy of a callback of twoloop, cached for all systems because its globals never change."""
-    return FunctionCopier(_in_python).replacement_of(function)
+    return FunctionCopier(_leave_in_python).replacement_of(function)
 
 
-def _with_bounds_checked(function: types.FunctionType, _: Any) -> Any:
+def _compile_with_bounds_checks(function: types.FunctionType, _: Any) -> Any:
     return njit(boundscheck=True, error_model="numpy")(function)
 
 
-def place_of(error: BaseException) -> str:
+def source_location(error: BaseException) -> str:
     """Return the line and the file of a callback in which an error arose, as text; "" if Python does not know it."""
     trace, frames = error.__traceback__, []
     while trace is not None:

@@ -15,7 +15,7 @@ from twoloop.checks.callbacks import UNSYMMETRIC, check_bounds, unsymmetric_mass
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.scales import EPS, NONE, Scales, defined, generic_factors, scales_of, signs
 from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
-from twoloop.checks.structure import SINGULAR_MASS, not_finite, pattern_of, place_of_mass, shifts
+from twoloop.checks.structure import SINGULAR_MASS, mass_key, not_finite, pattern_of, shifts
 from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: flo
     return np.where(np.isfinite(noise), np.minimum(noise, limit), 0.0)
 
 
-def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array, columns: Array) -> Array:
+def _unconstrained_accelerations(system: ConstrainedSystem, t: float, q: Array, v: Array, columns: Array) -> Array:
     """Return the accelerations M^-1 Q without constraints; zero in directions without inertia, as of Euler parameters.
 
     The constraints exclude these directions. Rounding may give such an M an inverse of 1e16. So small singular values
@@ -104,7 +104,7 @@ class Violation:
         self.allowed_left = CONSISTENT * per_row + ROUNDING * EPS * terms / scales.rows
 
     @classmethod
-    def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
+    def measure_q(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
         """Measure the violation of C(t, q) = 0 at a position."""
         values, size = system.constraint(t, q), np.abs(q)
 
@@ -118,7 +118,7 @@ class Violation:
         return cls(system, t, "C(t, q)", values, terms, jacobian, scales, scales.reach, np.abs(q))
 
     @classmethod
-    def of_velocity(
+    def measure_v(
         cls,
         system: ConstrainedSystem,
         t: float,
@@ -136,7 +136,7 @@ class Violation:
         # entries that are zero only at this position count, too: bars may be in line with an axis
         pattern = pattern_of(system, t, q)[: len(jacobian)]
         fastest = (pattern * (np.abs(v) / scales.columns)).max(axis=1)
-        pull = _without_constraints(system, t, q, v, scales.columns)
+        pull = _unconstrained_accelerations(system, t, q, v, scales.columns)
         falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
         speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
         equation, values = "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)", jacobian @ v + rate
@@ -190,11 +190,11 @@ def is_consistent(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bo
     jacobian, scales = rows[: system.n_c], scales_of(system, t, q, rows)
     if not is_at_rounding(C, jacobian, q):
         scales_of_c = scales if system.n_a == 0 else scales_of(system, t, q, jacobian)
-        if Violation.of_position(system, t, q, jacobian, scales_of_c).excess > 1.0:
+        if Violation.measure_q(system, t, q, jacobian, scales_of_c).excess > 1.0:
             return False
         scales_of_c.keep(system, q, jacobian)
     at_rounding = is_at_rounding(rows @ v + rate, rows, v, rate)
-    return at_rounding or Violation.of_velocity(system, t, q, v, rows, scales).excess <= 1.0
+    return at_rounding or Violation.measure_v(system, t, q, v, rows, scales).excess <= 1.0
 
 
 ROUNDINGS = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # limits in the order in which the kernel reads them
@@ -252,7 +252,7 @@ def check_start(
     if not is_at_rounding(system.constraint(t0, q0), jacobian, q0):
         full = system.jacobian(t0, q0)
         scales = scales_of(system, t0, q0, full)
-        Violation.of_position(system, t0, q0, full, scales).refuse("q0")
+        Violation.measure_q(system, t0, q0, full, scales).refuse("q0")
         scales.keep(system, q0, full)
     if derivatives:
         check_derivatives(system, t0, q0, exact)
@@ -266,7 +266,7 @@ def check_start(
     if not is_at_rounding(rows @ v0 + rate, rows, v0, rate):
         full = system.rows(t0, q0)
         scales = scales_of(system, t0, q0, full)
-        Violation.of_velocity(system, t0, q0, v0, full, scales, harmless).refuse("v0")
+        Violation.measure_v(system, t0, q0, v0, full, scales, harmless).refuse("v0")
 
 
 class StartEvaluation:
@@ -317,5 +317,5 @@ def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) 
     system.remember_at("pattern", place, evaluation.pattern)
     system.remember_at("mass and rows", place, (evaluation.mass, evaluation.rows))
     if bits & (flags.DEFINITE | flags.INDEFINITE):  # neither if M is constant, or if rounding would decide
-        system.remember_at("definite mass", place_of_mass(system, t, q), bool(bits & flags.DEFINITE))
+        system.remember_at("definite mass", mass_key(system, t, q), bool(bits & flags.DEFINITE))
     return bool(bits & flags.CONSISTENT)

@@ -391,18 +391,14 @@ def differentiate(
             )
             tried += 1
             still = ~moved & (given == 0.0) & (tried >= FLAT)
-            if (_settled(best, given, largest) | still).all():
+            difference = np.abs(given - best.slope)
+            confirmed = difference + best.error <= SETTLED * np.maximum(np.abs(given), np.abs(best.slope))
+            zero = (np.abs(given) <= TINY * largest) & (difference <= 4.0 * best.error)
+            if (confirmed | (zero & (best.error <= SETTLED * largest)) | still).all():
                 return best
         if tried:  # the function is defined on this side: others would hide a kink at the place
             return best
     return Estimate(np.zeros(m), np.full(m, np.inf), np.full(m, np.inf), 0)
-
-
-def _settled(best: Estimate, given: Array, largest: Array) -> NDArray[np.bool_]:
-    apart = np.abs(given - best.slope)
-    confirmed = apart + best.error <= SETTLED * np.maximum(np.abs(given), np.abs(best.slope))
-    zero = (np.abs(given) <= TINY * largest) & (apart <= 4.0 * best.error) & (best.error <= SETTLED * largest)
-    return confirmed | zero
 
 
 def confirms(

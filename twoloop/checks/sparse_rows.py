@@ -14,13 +14,13 @@ class SparseRows:
     """Sparse matrix (m, n) stored by entries, without duplicates, with the array operations that checks need."""
 
     def __init__(self, rows: Integers, columns: Integers, values: Array, shape: tuple[int, int]):
-        places, self.place_of = np.unique(rows * shape[1] + columns, return_inverse=True)
-        self.rows, self.columns, self.shape = places // shape[1], places % shape[1], shape
+        keys, self.entry_indices = np.unique(rows * shape[1] + columns, return_inverse=True)
+        self.rows, self.columns, self.shape = keys // shape[1], keys % shape[1], shape
         self.values = self.added(values)
 
     def added(self, values: Array) -> Array:
         """Return values, given in the constructor's order, in the order of entries; add up the values of an entry."""
-        return np.bincount(self.place_of, values, len(self.rows)).astype(np.float64)
+        return np.bincount(self.entry_indices, values, len(self.rows)).astype(np.float64)
 
     @property
     def size(self) -> int:

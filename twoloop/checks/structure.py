@@ -37,7 +37,7 @@ WEAK = 1e-9  # singular value, relative to the largest, above which a direction 
 NO_DIRECTION = 1e-12  # remainder of a row, relative to the row, without its dependent components, that counts as zero
 
 
-def surely_above(ratio: float, rows: Array, rank: int) -> bool:
+def certainly_exceed(ratio: float, rows: Array, rank: int) -> bool:
     """Return whether `rank` singular values certainly exceed `ratio` times the largest, by bounds, without an SVD."""
     from twoloop.kernels.linalg.rank import independent_rows, norm_of_inverse, singular_values_exceed
 
@@ -61,7 +61,7 @@ def redundant_rows(scaled: Array) -> list[int]:
     return sorted(order[rank:].tolist())
 
 
-def in_words(jacobian: Array, redundant: list[int]) -> str:
+def describe_dependence(jacobian: Array, redundant: list[int]) -> str:
     """Describe which rows depend on which others; few coefficients are listed, because many vary between starts."""
     from twoloop.kernels.linalg.rank import express_other_rows
 
@@ -75,10 +75,10 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
         np.ascontiguousarray(jacobian), order, RANK_TOLERANCE, rest, *room, shares, lengths
     ):
         shares[:] = np.linalg.lstsq(rest.T, jacobian[shown].T, rcond=None)[0].T
-    return equations_in_words(redundant, others, shares, lengths)
+    return describe_equations(redundant, others, shares, lengths)
 
 
-def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
+def describe_equations(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
     """Describe the first redundant rows, by their coefficients `shares` (SHOWN, n) and the lengths of all rows."""
     equations = []
     counts = np.abs(shares) * lengths[others] > 1e-9 * lengths[redundant[: len(shares)], None]
@@ -124,7 +124,7 @@ def mass_and_rows(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
 
 def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
     """Return whether M has an inverse at a position, not only on the velocities that the constraints allow."""
-    return system.remembered_at("definite mass", place_of_mass(system, t, q), lambda: is_definite(system.mass(t, q)))
+    return system.remembered_at("definite mass", mass_key(system, t, q), lambda: is_definite(system.mass(t, q)))
 
 
 def is_definite(mass: Array) -> bool:
@@ -132,7 +132,7 @@ def is_definite(mass: Array) -> bool:
     return bool(lapack.dsyevd(mass, compute_v=0)[0][0] > SINGULAR_MASS * np.abs(mass).max())
 
 
-def place_of_mass(system: ConstrainedSystem, t: float, q: Array) -> Any:
+def mass_key(system: ConstrainedSystem, t: float, q: Array) -> Any:
     """Return the key of a mass matrix in a cache: the position on which it depends, or None if it is constant."""
     return None if system.constant_mass else (t, q.tobytes())
 
@@ -156,7 +156,7 @@ def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
     jacobian = system.rows(t, q)
     rows = redundant_rows(scales_of(system, t, q, jacobian).scaled(jacobian))
     if rows:
-        return in_words(jacobian, rows)
+        return describe_dependence(jacobian, rows)
     values = np.linalg.svd(jacobian, compute_uv=False)
     return (
         "or so nearly that Newton cannot tell: its smallest singular value at the last state is "

@@ -173,7 +173,7 @@ class LaneEnsemble:
         try:
             result = solve_dae(system, (self.starts.t0, self.t1), *start, **options)
         except ValueError as error:
-            raise with_run_number(run, error) from error
+            raise add_run_number(run, error) from error
         if result.status is Status.INTERRUPTED:  # Ctrl-C ends all runs, as it does in lanes
             raise KeyboardInterrupt
         for out, states in ((self.q, result.q), (self.v, result.v)):
@@ -225,10 +225,10 @@ def _check_start(system: ConstrainedSystem, starts: Starts, run: int) -> None:
     try:
         check_start(system_of(system, starts, run), starts.t0, starts.q[run], starts.v[run], derivatives=False)
     except ValueError as error:
-        raise with_run_number(run, error) from error
+        raise add_run_number(run, error) from error
 
 
-def with_run_number(run: int, error: ValueError) -> ValueError:
+def add_run_number(run: int, error: ValueError) -> ValueError:
     """Return the error of a single run with the number of the run, and with `consistent_states` in its advice."""
     return ValueError(f"run {run}: {error}".replace("twoloop.consistent_state(", "twoloop.consistent_states("))
 

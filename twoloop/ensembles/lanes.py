@@ -60,10 +60,7 @@ class ForceSampling:
         )
 
     def has_short_forces(self, times: Array, rtol: float, parameters: Array, q: Array, v: Array) -> NDArray[np.bool_]:
-        """Return a mask of the runs with a change that lasts less than two samples, or a value that is not finite.
-
-        q, v : (n_runs, n), one state of each run.
-        """
+        """Return a mask of runs, at states q, v (n_runs, n), whose forces jump twice in two samples or are infinite."""
         is_short = np.zeros(len(q), dtype=bool)
         size = max(1, BLOCK_VALUES // max(1, len(times) * len(self._program.expressions)))
         for begin in range(0, len(q), size):
@@ -78,10 +75,7 @@ class ForceSampling:
 
 
 def _have_short_changes(values: Array, rtol: float) -> NDArray[np.bool_]:
-    """Return a mask of the runs in which a value jumps twice within two samples, or is not finite.
-
-    values : (n_times, n_runs, n)
-    """
+    """Return a mask of the runs in `values` (n_times, n_runs, n) that jump twice in two samples, or are not finite."""
     if not values.size:
         return np.zeros(values.shape[1], dtype=bool)
     is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=(0, 2)))
@@ -241,7 +235,7 @@ class LaneRuns:
         gap = 1.0 if may_be_steep(generic_copy, force_was_traced=True) else method.max_gap
         self.n_gaps = N_SHORT if any(short_forces) else N_SAMPLES * gap  # smallest number of steps in a run
         self.sampling = ForceSampling(system, generic, varying) if short_forces.by_time else None
-        choice = PivotChoice.for_position(system_of(system, starts, 0), starts.t0, starts.q[0])
+        choice = PivotChoice.choose(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # key of the cached code
 
         def generate() -> GeneratedLanes[LaneCode]:

@@ -193,6 +193,7 @@ class CollocationCode:
         self.structure = hashlib.sha256(repr([shared.digest, description]).encode()).hexdigest()
 
     def _find_iterated(self) -> list[int]:
+        """Return the coordinates on whose positions or velocities the accelerations depend."""
         graph, exprs = self.equations.graph, []
         for program in self.equations.accelerations:
             exprs += program.expressions
@@ -257,7 +258,7 @@ class CollocationCode:
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
-            inner_emit, (work, state, tolerances, numbers) = emit.for_builder(builder), builder.arguments
+            inner_emit, (work, state, tolerances, numbers) = emit.copy_for_builder(builder), builder.arguments
             inner_emit.numbers = inner_emit.constants = numbers
             self._call(inner_emit, "begin_nodes", self._predict_nodes, [work, state, tolerances])
             mass_first, not_computed = self._evaluator(inner_emit, work, -1), constant(DOUBLE, float(mem.NOT_COMPUTED))
@@ -293,7 +294,7 @@ class CollocationCode:
         module = emit.builder.module
         if not module.defines(name):
             builder = module.function(name, VOID, [each.type for each in arguments], internal=True)
-            write(emit.for_builder(builder), *builder.arguments)
+            write(emit.copy_for_builder(builder), *builder.arguments)
             builder.ret(None)
         emit.builder.call_void(name, arguments)
 
@@ -453,8 +454,8 @@ class CollocationCode:
         all_valid = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [store_others()])
         with self._returning_if(emit, builder.operation("xor", all_valid, Value(BIT, "true"))):
             builder.ret(fallback())
-        for value, place in ((sweep, mem.SWEEPS), (change, mem.CHANGE), (target, mem.N_TARGET), (rho_now, mem.RHO)):
-            num.store(value, work, place)
+        for value, index in ((sweep, mem.SWEEPS), (change, mem.CHANGE), (target, mem.N_TARGET), (rho_now, mem.RHO)):
+            num.store(value, work, index)
         code = builder.select(has_converged, number(mem.CONVERGED), number(mem.REJECTED))
         code = builder.select(was_guessed, number(mem.GUESSED), code)
         with builder.if_then(
@@ -648,9 +649,9 @@ class CollocationCode:
         lowering, arrays = lower_program(emit, program, inputs, self.numbers)
         values = dict(zip(program.arrays, arrays, strict=True))
         is_valid = lowering.is_valid(program, [value for array in arrays for value in array])
-        for name, place in self._end_offsets().items():
+        for name, index in self._end_offsets().items():
             for k, value in enumerate(values.get(name, [])):
-                store_lanes(emit, value, work, place + LANES * k)
+                store_lanes(emit, value, work, index + LANES * k)
         self._store_largest_move(emit, work, values["moved"], is_valid)
 
     def _project_in_parts(
@@ -658,9 +659,9 @@ class CollocationCode:
     ) -> None:
         """Project states at the ends of eight steps by `write`, a method of SplitFunctions that fills `names`."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
-        places = {name: num.pointer(work, place) for name, place in self._end_offsets().items()} | {"moved": moved}
-        state = load_lanes(emit, work, self.end_offset), places["q"], places["v"]
-        is_valid = write(emit, *state, numbers, *(places[name] for name in names))
+        indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
+        state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
+        is_valid = write(emit, *state, numbers, *(indices[name] for name in names))
         self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], is_valid)
 
     def _end_offsets(self) -> dict[str, int]:
@@ -698,12 +699,12 @@ class CollocationCode:
         """Store velocities and positions of coordinate i, the k-th iterated one, at nodes; return the velocities."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
-        place, begin = num.pointer(work, vector_index(emit, k)), num.pointer(state, i)
+        index, begin = num.pointer(work, vector_index(emit, k)), num.pointer(state, i)
         q0, v0 = (emit.broadcast(num.load(begin, m * self.n)) for m in range(2))
         v = emit.fma(h, sums[0], v0)
         displacement_rate = emit.fma(h, sums[1], emit.multiply(constants(tables().nodes), v0))
-        store_lanes(emit, v, place, self.v_offset)
-        store_lanes(emit, emit.fma(h, displacement_rate, q0), place, self.q_offset)
+        store_lanes(emit, v, index, self.v_offset)
+        store_lanes(emit, emit.fma(h, displacement_rate, q0), index, self.q_offset)
         return v
 
     def _node_accelerations(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:

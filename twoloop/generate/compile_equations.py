@@ -145,7 +145,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
         n, pointers = equations.system.n_q, _coefficient_pointers(emit)
         kinds = [emit.double_type, DOUBLE_POINTER, DOUBLE_POINTER, *[DOUBLE_POINTER] * len(pointers), DOUBLE_POINTER]
         builder = module.function(name, emit.bit_type, kinds, internal=True)
-        inner_emit = emit.for_builder(builder)
+        inner_emit = emit.copy_for_builder(builder)
         t, q, v, *coefficients, out = builder.arguments
         for attribute, pointer in zip(("numbers", "constants"), coefficients, strict=False):
             setattr(inner_emit, attribute, pointer)
@@ -232,18 +232,18 @@ class SplitFunctions:
             name = f"{part}_{emit.suffix}"
             if not module.defines(name):
                 builder = module.function(name, emit.bit_type, [value.type for value in arguments], internal=True)
-                builder.ret(self._part_writers[part](emit.for_builder(builder), *builder.arguments))
+                builder.ret(self._part_writers[part](emit.copy_for_builder(builder), *builder.arguments))
             valid = emit.builder.call(name, emit.bit_type, arguments)
             all_valid = valid if all_valid is None else emit.builder.bitwise_and(all_valid, valid)
         assert all_valid is not None
         return all_valid
 
-    def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], places: Mapping[int, Location]) -> Lowering:
+    def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
         """Return the Lowering that writes a part; `args` begin with the inputs of `graph` and the coefficients."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]
-        lowering = Lowering(emit, self.numbers, places)
+        lowering = Lowering(emit, self.numbers, stored)
         lowering.define_inputs(graph, inputs)
         return lowering
 
@@ -251,17 +251,17 @@ class SplitFunctions:
         """Write the part that stores factors and shared quantities in arguments[4]; return whether all are valid."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
-        places = {i: (stored, place) for i, place in solution.stored_indices.items()}
-        for i, place in places.items():
+        locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
+        for i, location in locations.items():
             if graph.operations[i] is None:  # this entry is t or a coordinate
-                emit.store(lowering.value(i), *place)
-        lowering.run(graph, graph.quantities_by_use(solution.factor_program.expressions), places)
+                emit.store(lowering.value(i), *location)
+        lowering.run(graph, graph.quantities_by_use(solution.factor_program.expressions), locations)
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
         """Write the part that computes a program, with quantities `stored` in memory; return whether they are valid."""
-        places = {i: (arguments[4], place) for i, place in stored.items()}
-        lowering = self._lowering(emit, program.graph, arguments, places)
+        locations = {i: (arguments[4], index) for i, index in stored.items()}
+        lowering = self._lowering(emit, program.graph, arguments, locations)
         results = program.run(lowering)
         for array, values in zip(arguments[-len(results) :], results, strict=True):
             for j, value in enumerate(values):
@@ -400,10 +400,10 @@ class SharedCode:
         # optimization passes of LLVM do not make the code faster, and take up to a quarter of the time to compile
         self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, optimise=False)
 
-    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
+    def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
         """Return the GeneratedCode of one system, with coefficients for its parameters."""
         return GeneratedCode(
-            self, evaluate(self.numbers.formulas), self.equations.traced.for_system(system, evaluate), evaluate
+            self, evaluate(self.numbers.formulas), self.equations.traced.specialize(system, evaluate), evaluate
         )
 
     def _programs(self) -> dict[str, Program]:
@@ -453,7 +453,7 @@ class GeneratedCode(NamedTuple):
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
         """Return whether a run from (t0, q0) may use this code: whether it was generated for the PivotChoice there."""
         try:
-            return PivotChoice.for_position(system, t0, q0) == self.shared.equations.choice
+            return PivotChoice.choose(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
             return False
 
@@ -464,7 +464,7 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
     Raises ValueError if code for the equations cannot be generated.
     """
     try:
-        choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: PivotChoice.for_position(system, t0, q0))
+        choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: PivotChoice.choose(system, t0, q0))
 
         def make(cache: TraceCache) -> SharedCode:
             return SharedCode(Elimination(system, choice, cache.equations(system)), cache)

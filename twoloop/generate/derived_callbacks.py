@@ -34,7 +34,7 @@ class DerivedPrograms:
     def __init__(self, programs: dict[str, tuple[OperationTable, list[int]]], traced: CallbackTraces):
         self.programs, self.traced, self.kinds = programs, traced, traced.kinds
 
-    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
+    def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
         """Return a system with these programs in place of its missing callbacks."""
         functions: dict[str, Any] = {}
         for name, (program, indices) in self.programs.items():
@@ -42,7 +42,7 @@ class DerivedPrograms:
             functions |= dict(zip((f"{name}_program", f"{name}_numbers"), vectors, strict=True))
         derived = copy.copy(system)
         derived.functions = system.functions._replace(**functions)
-        return DerivedSystem(derived, self.traced.for_system(system, evaluate))
+        return DerivedSystem(derived, self.traced.specialize(system, evaluate))
 
 
 class DerivedSystem(NamedTuple):

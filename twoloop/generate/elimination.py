@@ -92,7 +92,7 @@ class PivotChoice:
     is_refined: bool | None = None
 
     @classmethod
-    def for_position(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
+    def choose(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
         """Return the PivotChoice for the values of M and G at time t and position q.
 
         Raises Untraceable if M is singular on velocities that the constraints allow.
@@ -174,7 +174,7 @@ class PivotChooser:
         """Return the PivotChoice, without blocks, for M (n_q, n_q) and G (n_c + n_a, n_q).
 
         `nearby` returns M and G at another position, at which only entries that are always zero are zero. The
-        exceptions are those of `PivotChoice.for_position`.
+        exceptions are those of `PivotChoice.choose`.
         """
         system, scratch, chosen = self.system, self._scratch, self._row_indices
         is_definite = system.constant_mass and system.derived.get("no weak mass", False)
@@ -422,7 +422,7 @@ class Elimination:
         """Return a list of the accelerations and the multipliers of the independent rows, at velocities v."""
         return self._solve(*self._right_sides(v))
 
-    def _for_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
+    def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
         """Return a list with one value for each row of G: those of `independent`, and 0 for dependent rows."""
         values = [self.zero] * len(self.all_rows)
         for k, value in zip(self.choice.rows, independent, strict=True):
@@ -433,7 +433,7 @@ class Elimination:
     def position_errors(self) -> Program:
         """Return the program for "c", the right-hand sides -C of position corrections; 0 for dependent rows and A."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
-        return Program(self.graph, {"c": self._for_all_rows([errors[k] for k in self.choice.rows])})
+        return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
@@ -444,7 +444,7 @@ class Elimination:
             for entry, u in zip(row, self.v, strict=True):
                 total = total + entry * u
             errors.append(-total)
-        return Program(self.graph, {"c": self._for_all_rows(errors)})
+        return Program(self.graph, {"c": self._expand_to_all_rows(errors)})
 
     @cached_property
     def position_projection(self) -> Program:
@@ -471,7 +471,7 @@ class Elimination:
         self._check_length()
         return Program(
             self.graph,
-            {"a": solution[:n], **position, "v": v, "lam": self._for_all_rows(solution[n:])},
+            {"a": solution[:n], **position, "v": v, "lam": self._expand_to_all_rows(solution[n:])},
             self.conditions,
         )
 

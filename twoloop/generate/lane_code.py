@@ -193,8 +193,8 @@ class LaneSteps:
         for j, each in enumerate(a):
             defect = emit.function("fabs", emit.subtract(emit.load(memory.series_a, j), each))
             of_q, of_v = (
-                emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(memory.new, place))))
-                for place in (j, n + j)
+                emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(memory.new, index))))
+                for index in (j, n + j)
             )
             allowed = emit.minimum_or_nan(of_v, emit.multiply(of_q, per_duration))
             max_defect = emit.maximum_or_nan(emit.divide(emit.subtract(defect, noise), allowed), max_defect)
@@ -293,7 +293,7 @@ class LaneSteps:
         series_memory = emit.pointer(work, series)
         n_coefficients = emit.builder.add(order, integer(1))
         scratch = emit.pointer(series_memory, emit.builder.mul(n_coefficients, integer(self.n)))
-        state, new, predicted, series_a, a, lam = (emit.pointer(work, place) for place in fixed)
+        state, new, predicted, series_a, a, lam = (emit.pointer(work, index) for index in fixed)
         return LaneMemory(order, work, state, new, predicted, series_a, a, lam, series_memory, scratch)
 
 
@@ -431,7 +431,7 @@ class _Coordinate:
     def __init__(self, stages: LaneStages, emit: LaneEmitter, memory: LaneMemory, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(memory.new, j), stages.n
         series_pointer = emit.pointer(memory.series, j)
-        self.old_state = tuple(emit.load(series_pointer, lanes.BEGIN * n + place) for place in (0, n))
+        self.old_state = tuple(emit.load(series_pointer, lanes.BEGIN * n + index) for index in (0, n))
         self._acceleration_locations = [(series_pointer, (lanes.SLOPES + k) * n) for k in range(count)]
         self._loaded: dict[int, Value] = {}
         if count > 1:  # the acceleration of the last stage was just computed, and is not stored yet
@@ -461,8 +461,8 @@ class _Coordinate:
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
         q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(position_weights)))))
         v = emit.add(v, emit.multiply(x, self.sum(weights)))
-        for value, place in ((q, 0), (v, self.n)):
-            emit.store(value, self.new, place)
+        for value, index in ((q, 0), (v, self.n)):
+            emit.store(value, self.new, index)
         return q, v
 
 

@@ -46,7 +46,7 @@ class LaneEmitter(Emitter):
         self.lanes, self.suffix = lanes, f"v{lanes}f64" if lanes > 1 else Emitter.suffix
         self.double_type, self.integer_type, self.bit_type = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
 
-    def for_builder(self, builder: Builder) -> "LaneEmitter":
+    def copy_for_builder(self, builder: Builder) -> "LaneEmitter":
         """Return an emitter with the same number of lanes that writes to another function, that of `builder`."""
         return LaneEmitter(builder, self.lanes)
 
@@ -72,23 +72,23 @@ class LaneEmitter(Emitter):
         """Return a vector with the integer `whole`, converted to double, in all lanes."""
         return self.broadcast(super().to_double(whole))
 
-    def pointer(self, base: Value, *places: Value | int) -> Value:
-        """Return the pointer `base` advanced by the sum of `places`, counted in vectors."""
-        for place in places:
+    def pointer(self, base: Value, *indices: Value | int) -> Value:
+        """Return the pointer `base` advanced by the sum of `indices`, counted in vectors."""
+        for index in indices:
             offset = (
-                integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
+                integer(index * self.lanes) if isinstance(index, int) else self.builder.mul(index, integer(self.lanes))
             )
             base = self.builder.advance(base, offset)
         return base
 
-    def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Return vector number `place` of the array at `base`, loaded from memory."""
-        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double_type}*")
+    def load(self, base: Value, index: int = 0, constant: bool = False) -> Value:
+        """Return vector number `index` of the array at `base`, loaded from memory."""
+        pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{self.double_type}*")
         return self.builder.load(pointer, constant=constant)
 
-    def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Store `value` as vector number `place` of the array at `base`."""
-        self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double_type}*"))
+    def store(self, value: Value, base: Value, index: int = 0) -> None:
+        """Store `value` as vector number `index` of the array at `base`."""
+        self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, index), f"{self.double_type}*"))
 
     def function(self, name: str, x: Value) -> Value:
         """Return f(x) in each lane, by one LLVM intrinsic for all lanes, or by a function of libm lane by lane."""
@@ -149,14 +149,14 @@ def vector_index(emit: LaneEmitter, k: Value) -> Value:
     return emit.builder.mul(k, integer(STAGES))
 
 
-def load_lanes(emit: LaneEmitter, base: Value, place: int = 0) -> Value:
-    """Return the vector of STAGES numbers that begins at `base`[place], where `place` counts numbers."""
-    return Emitter(emit.builder).load_vector(base, place, STAGES)
+def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
+    """Return the vector of STAGES numbers that begins at `base`[index], where `index` counts numbers."""
+    return Emitter(emit.builder).load_vector(base, index, STAGES)
 
 
-def store_lanes(emit: LaneEmitter, value: Value, base: Value, place: int = 0) -> None:
-    """Store a vector of STAGES numbers that begins at `base`[place], where `place` counts numbers."""
-    Emitter(emit.builder).store_vector(value, base, place)
+def store_lanes(emit: LaneEmitter, value: Value, base: Value, index: int = 0) -> None:
+    """Store a vector of STAGES numbers that begins at `base`[index], where `index` counts numbers."""
+    Emitter(emit.builder).store_vector(value, base, index)
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
@@ -249,6 +249,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
+        """Return terms and constant of each expression in `sums`; `rows`: their indices, to which `sums.row` refers."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -260,10 +261,12 @@ class LaneSeries:
             for row, i, c, constant in first_terms
         ]
 
-    def _row_expressions(self, sums: Sums, places: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        return list(zip(places.tolist(), self._expressions(sums, places.tolist()), strict=True))
+    def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
+        """Return pairs of a row's index and its expression, terms and constant, in `sums`."""
+        return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
+        """Return the Operations of a table whose first result is `quantity`."""
         firsts, seconds = (self._expressions(each, range(len(each.column))) for each in (table.first, table.second))
         operations = []
         for kind, begin, end in table.groups[:, :3].tolist():
@@ -317,14 +320,14 @@ class LaneSeries:
 
     def write_order_0(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
         """Write code for order 0 at `inputs`, [t, q, v]; `scratch` already has the factors of the linear equations."""
-        for place in (*range(self.rhs_offset, self.divisor_offset), *range(self.carried_offset, self.row_0_offset)):
-            emit.store(emit.constant(0.0), scratch, place)
+        for index in (*range(self.rhs_offset, self.divisor_offset), *range(self.carried_offset, self.row_0_offset)):
+            emit.store(emit.constant(0.0), scratch, index)
         row = _Row(self, emit, emit.pointer(scratch, self.row_0_offset))
         quantities = Quantities(emit, lambda i: inputs[i])
         self._write_order_0(emit, quantities, self.early, row, scratch)
         self._write_order_0(emit, quantities, self.late, row, scratch)
-        for place, expr in self.balance:
-            emit.store(quantities.sum(*expr), scratch, self.rhs_offset + place)
+        for index, expr in self.balance:
+            emit.store(quantities.sum(*expr), scratch, self.rhs_offset + index)
 
     def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
         """Write code for order k > 0: it stores the coefficients k + 1 of q in `out`, and the factors in `scratch`."""
@@ -343,15 +346,15 @@ class LaneSeries:
         partial_sums = _PartialSums(sums, first_row, self._row_pointer(emit, scratch, integer(1)), row_before)
         self._write_order(emit, quantities, self.early, row, scratch, partial_sums, order, per_order)
         next_sums = {pair: partial_sums.sum_of_next_order(pair, row) for pair in self.carried_pairs}
-        for place, pair in enumerate(self.carried_pairs):
-            emit.store(next_sums[pair], scratch, self.carried_offset + place)
+        for index, pair in enumerate(self.carried_pairs):
+            emit.store(next_sums[pair], scratch, self.carried_offset + index)
         per_unit = emit.divide(emit.constant(1.0), unit)
         for result, pair in self._carried_sums.items():
             quantities.define(result, emit.multiply(per_unit, next_sums[pair]))
         minus_rate = emit.negate(emit.divide(order, unit))
         c = [zero] * self.n_rows
-        for place, (terms, _) in self.rows:
-            c[place] = emit.multiply(minus_rate, quantities.sum(terms))
+        for index, (terms, _) in self.rows:
+            c[index] = emit.multiply(minus_rate, quantities.sum(terms))
         r = [emit.load(scratch, self.rhs_offset + i) for i in range(n)]
         stored = [emit.load(scratch, i) for i in range(self.solution.n_stored)]
         solution = self.solution
@@ -370,8 +373,8 @@ class LaneSeries:
                 if operation.kind == PENDING and operation.results[0] not in self._carried_sums:
                     target_row.store(operation.second, values.sum(operation.second[0]))
         self._write_order(emit, quantities, self.late, row, scratch, partial_sums, order, per_order)
-        for place, (terms, _) in self.balance:
-            emit.store(quantities.sum(terms), scratch, self.rhs_offset + place)
+        for index, (terms, _) in self.balance:
+            emit.store(quantities.sum(terms), scratch, self.rhs_offset + index)
 
     def _row_pointer(self, emit: LaneEmitter, scratch: Value, order: Value) -> Value:
         return emit.pointer(scratch, self.row_0_offset, emit.builder.mul(order, integer(self.row_length)))
@@ -435,11 +438,11 @@ class LaneSeries:
                 row_before = self._row_pointer(emit, scratch, builder.sub(j, integer(1)))
                 loaded: dict[tuple[Value, int], Value] = {}
                 for ((x, y), for_next_order), total in zip(group, totals, strict=True):
-                    places = ((up, x), (down, y)) if for_next_order else ((down, x), (row_before, y))
-                    for base, place in places:
-                        if (base, place) not in loaded:
-                            loaded[base, place] = emit.load(base, place)
-                    new.append(emit.add(total, emit.multiply(*(loaded[each] for each in places))))
+                    indices = ((up, x), (down, y)) if for_next_order else ((down, x), (row_before, y))
+                    for base, index in indices:
+                        if (base, index) not in loaded:
+                            loaded[base, index] = emit.load(base, index)
+                    new.append(emit.add(total, emit.multiply(*(loaded[each] for each in indices))))
             sums |= dict(zip(group, new, strict=True))
         return sums
 
@@ -511,14 +514,14 @@ class _Row:
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
         """Store the value of the factor `key` at its index; if `when` is "if used", skip a factor without an index."""
-        place = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
-        if place is not None and place not in self._stored:
-            self._stored[place] = value
-            self.emit.store(value, self.base, place)
+        index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
+        if index is not None and index not in self._stored:
+            self._stored[index] = value
+            self.emit.store(value, self.base, index)
 
-    def load(self, place: int) -> Value:
-        """Return the value of the factor with index `place`."""
-        return self._stored[place] if place in self._stored else self.emit.load(self.base, place)
+    def load(self, index: int) -> Value:
+        """Return the value of the factor with index `index`."""
+        return self._stored[index] if index in self._stored else self.emit.load(self.base, index)
 
 
 class _PartialSums(NamedTuple):

@@ -58,7 +58,7 @@ class Emitter:
         self.builder = builder
         self.numbers: Any = None
 
-    def for_builder(self, builder: Builder) -> "Emitter":
+    def copy_for_builder(self, builder: Builder) -> "Emitter":
         """Return an emitter of the same class that writes to another function, that of `builder`."""
         return type(self)(builder)
 
@@ -141,38 +141,38 @@ class Emitter:
         intrinsic = INTRINSICS.get(name)
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
-    def pointer(self, base: Value, *places: Value | int) -> Value:
-        """Return the pointer `base` advanced by the sum of `places`, counted in doubles."""
-        for place in places:
-            base = self.builder.advance(base, integer(place) if isinstance(place, int) else place)
+    def pointer(self, base: Value, *indices: Value | int) -> Value:
+        """Return the pointer `base` advanced by the sum of `indices`, counted in doubles."""
+        for index in indices:
+            base = self.builder.advance(base, integer(index) if isinstance(index, int) else index)
         return base
 
-    def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Return base[place], loaded from memory; `constant`: this number does not change during a call."""
-        return self.builder.load(self.pointer(base, place), constant=constant)
+    def load(self, base: Value, index: int = 0, constant: bool = False) -> Value:
+        """Return base[index], loaded from memory; `constant`: this number does not change during a call."""
+        return self.builder.load(self.pointer(base, index), constant=constant)
 
-    def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Store a number in base[place]."""
-        self.builder.store(value, self.pointer(base, place))
+    def store(self, value: Value, base: Value, index: int = 0) -> None:
+        """Store a number in base[index]."""
+        self.builder.store(value, self.pointer(base, index))
 
-    def load_vector(self, base: Value, place: int, width: int) -> Value:
-        """Return the vector that begins at base[place]; this address must be aligned to the size of the vector.
+    def load_vector(self, base: Value, index: int, width: int) -> Value:
+        """Return the vector that begins at base[index]; this address must be aligned to the size of the vector.
 
         The load is slow just after the elements were stored one by one: the processor waits until all are stored.
         """
-        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{vector_of(DOUBLE, width)}*")
+        pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{vector_of(DOUBLE, width)}*")
         return self.builder.load(pointer, 8 * width)
 
-    def store_vector(self, value: Value, base: Value, place: int) -> None:
-        """Store a vector that begins at base[place]; this address must be aligned to the size of the vector."""
-        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{value.type}*")
+    def store_vector(self, value: Value, base: Value, index: int) -> None:
+        """Store a vector that begins at base[index]; this address must be aligned to the size of the vector."""
+        pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{value.type}*")
         self.builder.store(value, pointer, 8 * width_of(value.type))
 
     def vector(self, values: Sequence[Value]) -> Value:
         """Return the vector whose elements are `values`."""
         vector = undefined(vector_of(DOUBLE, len(values)))
-        for place, value in enumerate(values):
-            vector = self.builder.insert(vector, value, place)
+        for index, value in enumerate(values):
+            vector = self.builder.insert(vector, value, index)
         return vector
 
     @contextmanager
@@ -333,18 +333,18 @@ NO_LOCATIONS: Mapping[int, Location] = {}  # no memory locations
 class Lowering(Algebra[Value]):
     """Algebra that writes the operations of programs to an LLVM function; its values are values of this function.
 
-    places : memory locations of quantities that are stored already.
+    locations : memory locations of quantities that are stored already.
     """
 
-    def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Location] = NO_LOCATIONS):
+    def __init__(self, emit: Emitter, numbers: Coefficients, locations: Mapping[int, Location] = NO_LOCATIONS):
         super().__init__()
-        self.emit, self.numbers, self._locations = emit, numbers, dict(places)
+        self.emit, self.numbers, self._locations = emit, numbers, dict(locations)
         self.angles: list[Value] = []  # arguments of sines and cosines, to be compared with LARGEST_ANGLE by `is_valid`
         self.functions = {kind: partial(emit.function, name) for kind, name in FUNCTIONS.items()}
         self.functions[RECIPROCAL] = lambda x: emit.divide(emit.constant(1.0), x)
         self._quantities = Quantities(emit, lambda quantity: emit.load(*self._locations[quantity]))
         self._sines_and_cosines: dict[Any, tuple[Value, Value]] = {}  # sines and cosines, by the keys of their angles
-        self._computed_quantities = set(places)
+        self._computed_quantities = set(locations)
 
     def define(self, quantity: int, value: Value) -> None:
         """Define the value of a quantity."""
@@ -385,15 +385,15 @@ class Lowering(Algebra[Value]):
             self._sines_and_cosines[first.key] = sine_and_cosine(self.emit, angle)
         return self._sines_and_cosines[first.key][kind == COSINE]
 
-    def run(self, graph: Graph, quantities: Iterable[int], places: Mapping[int, Location] = NO_LOCATIONS) -> None:
-        """Write code that computes quantities in the given order, and stores those that have a location in `places`."""
-        if not places:
+    def run(self, graph: Graph, quantities: Iterable[int], locations: Mapping[int, Location] = NO_LOCATIONS) -> None:
+        """Write code that computes quantities in the given order, and stores those that have one of `locations`."""
+        if not locations:
             return super().run(graph, quantities)
         for i in quantities:
             super().run(graph, [i])
-            if i in places:
-                self.emit.store(self.value(i), *places[i])
-                self._locations[i] = places[i]
+            if i in locations:
+                self.emit.store(self.value(i), *locations[i])
+                self._locations[i] = locations[i]
                 self._quantities.mark_stored(i)
         return None
 

@@ -351,6 +351,7 @@ def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -
 
 
 def _add_products(total: Affine, pairs: Any) -> Affine:
+    """Return `total` plus the sum of the products of `pairs`."""
     for x, y in pairs:
         if not is_zero(x) and not is_zero(y):
             total = total + x * y

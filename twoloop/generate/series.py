@@ -85,7 +85,7 @@ class SeriesProgram:
         """Return the number of operations, including the products of G v and G^T lam + M a."""
         return len(self.early.first.column) + len(self.late.first.column)
 
-    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
+    def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
         """Return a copy of the program with coefficients for the parameters of one system."""
 
         def sums(exprs: Sums) -> Sums:
@@ -98,7 +98,7 @@ class SeriesProgram:
         )
         rows, balance = sums(self.rows), sums(self.balance)
         assert self.traced is not None
-        traced = self.traced.for_system(system, evaluate)
+        traced = self.traced.specialize(system, evaluate)
         return replace(self, early=early, late=late, rows=rows, balance=balance, traced=traced)
 
     @property
@@ -245,6 +245,7 @@ def _assemble_program(
     row_products: dict[Any, Any],
     reaction_products: dict[Any, Any],
 ) -> SeriesProgram:
+    """Return the SeriesProgram that computes `rows` and `balance`, given the products in them."""
     early: list[Any] = []
     late: list[Any] = []
     factors = [expr for group in (row_products, reaction_products) for _, *exprs in group.values() for expr in exprs]
@@ -332,6 +333,7 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
 
 
 def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> OperationGroups:
+    """Return the OperationGroups of groups (kind, operations); `nodes`: node of each quantity."""
     members = [member for _, group in groups for member in group]
     sums = [_as_sums([member[k] for member in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
@@ -344,6 +346,7 @@ def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> 
 
 
 def _as_sums(exprs: list[Affine], nodes: dict[int, int]) -> Sums:
+    """Return expressions as Sums; `nodes`: node of each quantity."""
     terms = [[(nodes[i], c) for i, c in expr.terms.items()] or [(0, 0.0)] for expr in exprs]
     further_terms = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]
     return Sums(

@@ -55,7 +55,7 @@ class Dependence(NamedTuple):
     is_steep: bool  # whether forces or drives may be steep, see `may_be_steep`
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
-    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
+    def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
         """Return this result: it is the same for all systems of the trace cache."""
         return self
 
@@ -84,6 +84,7 @@ def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
 
 
 def _dependence(system: ConstrainedSystem, force_was_traced: bool) -> Dependence | None:
+    """Return the cached analysis of a system; None if its callbacks cannot, or should not yet, be traced."""
     if system.called_in_python and not force_was_traced:
         return None
     try:
@@ -182,6 +183,7 @@ class DerivativeBounds(DegreeAlgebra):
 
 
 def _has_time_pulses(graph: Graph, needed: list[int]) -> bool:
+    """Return whether a quantity in `needed` may have short pulses as a function of time."""
     dependent = [i for i in needed if graph.input_masks[i] & TIME_MASK]
     degrees = DegreeAlgebra([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
     degrees.run(graph, dependent)
@@ -189,6 +191,7 @@ def _has_time_pulses(graph: Graph, needed: list[int]) -> bool:
 
 
 def _has_state_pulses(graph: Graph, needed: list[int], n_q: int) -> bool:
+    """Return whether a quantity in `needed` may have short pulses as a function of q or v."""
     dependent = [i for i in needed if graph.input_masks[i] & ~TIME_MASK]
     inputs = range(1, 2 * n_q + 1)
     degrees, vibrations, growth = DegreeAlgebra(inputs), TrigonometricDegrees(), GrowthExponents(inputs)

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.callbacks import place_of
+from twoloop.checks.callbacks import source_location
 from twoloop.generate.graph import FUNCTIONS, Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.parameter_expressions import (
     OPERATORS,
@@ -70,12 +70,12 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
         try:
             value = _CallbackCopier(lambda copy, _: copy).callback(function)(t, *arguments)
         except (Refusal, Untraceable) as refusal:
-            raise Untraceable(f"{graph.refusal_reason or refusal}{place_of(refusal)}") from None
+            raise Untraceable(f"{graph.refusal_reason or refusal}{source_location(refusal)}") from None
         except Exception as error:  # a callback may raise anything on symbols
             if not graph.refusal_reason:
                 text = str(error).partition("\n")[0].replace("twoloop.generate.graph.", "").replace("Affine", "symbol")
                 text = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {text}"
-                raise Untraceable(f"{text}{place_of(error)}") from error
+                raise Untraceable(f"{text}{source_location(error)}") from error
     return value
 
 
@@ -156,7 +156,7 @@ def _refuse_symbols(value: Any, verb: str) -> None:
         symbol.graph.refuse(f"it {verb} what depends on t, q or v")
 
 
-def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]:
+def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]:
     """Return a wrapper of a function that refuses symbols, because the function might not handle them like numbers."""
 
     @functools.wraps(function_of_numbers)
@@ -256,7 +256,7 @@ class _Mathematics:
             return _symbolic_norm
         if self._module is np and name in NUMPY_FUNCTIONS:
             return original
-        return _for_numbers_only(original, f"{self._module.__name__}.{name}")
+        return _numeric_function(original, f"{self._module.__name__}.{name}")
 
 
 # order in which callbacks are traced
@@ -331,6 +331,7 @@ class Equations:
         )
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
+        """Return a missing C_q or gamma as derivatives, or the trace of any other callback."""
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:
@@ -343,6 +344,7 @@ class Equations:
         return kind not in self.system.given and kind in ("jacobian", *GAMMA_SOURCES)
 
     def _trace_callback(self, kind: str, v: Sequence[Affine]) -> Any:
+        """Run a callback on symbols and return its result as expressions; zeros if it is missing."""
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
         out, shape, p = out.astype(object), out.shape, self.parameters.copy()
         arrays = [symbol_array({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
@@ -514,7 +516,7 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, key: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return the result of `make` for a trace cache, converted for one system by the result's method `for_system`.
+    """Return the result of `make` for a trace cache, converted for one system by the result's method `specialize`.
 
     The trace cache is shared with other systems. If callbacks cannot be traced with variable parameters, or `check`
     raises Untraceable (a callback may treat variable parameters differently from numbers), it is a cache for this
@@ -540,7 +542,7 @@ def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make:
     """Return the result of `derive_cached` from one trace cache, or the exception that says why there is none."""
     try:
         result = cache.remembered(key, partial(make, cache))
-        return result.for_system(
+        return result.specialize(
             system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters))
         )
     except Untraceable as error:

@@ -68,7 +68,7 @@ class CallbackTraces:
         self.nonzero_kinds = frozenset(self.entry_indices[k][0] for k in results)
         self.program = OperationTable.from_results(graph, 1 + 2 * system.n_q, results)
 
-    def for_system(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
+    def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
         """Return a copy for another system of the same trace cache; `evaluate` computes the system's coefficients."""
         traced = self.with_coefficients(evaluate)
         traced.name = system.name

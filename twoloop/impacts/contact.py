@@ -60,13 +60,13 @@ class Gaps:
                     f"{function} of {stop.name!r} must be a number computed from t and q by numpy functions, without "
                     f"branches: {error}"
                 ) from None
-            outputs += _with_derivatives(graph, gap, t, q, v)
+            outputs += _gap_derivatives(graph, gap, t, q, v)
         program = OperationTable.from_results(graph, 1 + 2 * self._n_q, dict(enumerate(outputs)))
         self._p = np.array(program.as_floats())
         self._last: tuple[Any, Gap] | None = None
         self._compare(stops, t0, q0)
 
-    def at(self, t: float, q: Array, v: Array) -> Gap:
+    def evaluate(self, t: float, q: Array, v: Array) -> Gap:
         """Evaluate the gaps at a state."""
         from twoloop.bodies.read_tables import results  # compiled on import
 
@@ -84,7 +84,7 @@ class Gaps:
         displacements[0] = 0.0
         for k, displacement in enumerate(displacements):
             t, q = t0 + TIME_SPACING * k, q0 + displacement
-            traced = self.at(t, q, np.zeros_like(q)).g
+            traced = self.evaluate(t, q, np.zeros_like(q)).g
             for stop, traced_value in zip(stops, traced, strict=True):
                 value: Any = getattr(stop, self._function)(t, q.copy())
                 if k == 0 and not (np.ndim(value) == 0 and np.isfinite(value)):
@@ -98,7 +98,7 @@ class Gaps:
                     )
 
 
-def _with_derivatives(graph: Graph, gap: Affine, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
+def _gap_derivatives(graph: Graph, gap: Affine, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
     """Return a gap, its rate, its second derivative without the term in v', and its gradient."""
     unit = Affine(graph, 1.0, {})
     (t_input,), q_inputs = t.terms, [next(iter(coordinate.terms)) for coordinate in q]
@@ -141,10 +141,10 @@ class ContactSystem:
 
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
         """Return a field of the `Gap` of closed stops, followed by the same field for constant displacements."""
-        rows = getattr(self._gaps.at(t, q, v), part)[self._closed]
+        rows = getattr(self._gaps.evaluate(t, q, v), part)[self._closed]
         if not self._sticking:
             return rows
-        return np.concatenate([rows, getattr(self._slides.at(t, q, v), part)[self._sticking]])
+        return np.concatenate([rows, getattr(self._slides.evaluate(t, q, v), part)[self._sticking]])
 
     def _call(self, kind: str, t: float, *state: Array) -> Array:
         (values,) = self._system.arrays_of(kind)
@@ -176,7 +176,7 @@ class ContactSystem:
         Q = self._call("force", t, q, v)
         if not self._slipping:
             return Q
-        system, slides = self._derived, self._slides.at(t, q, v).W
+        system, slides = self._derived, self._slides.evaluate(t, q, v).W
         rows = np.vstack([system.rows(t, q), self._rows("W", t, q, v)])
         right_sides = [system.gamma(t, q, v)] if system.n_c else []
         right_sides += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
@@ -227,7 +227,7 @@ class Accelerations:
         self._n = system.n_q
         self._last: tuple[tuple[float, bytes, bytes], Array] | None = None
 
-    def at(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+    def evaluate(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the accelerations a (n_q,) and the multipliers [lam; mu]; NaN if they do not exist."""
         run, n, key = self._run, self._n, (t, q.tobytes(), v.tobytes())
         if self._last is None or self._last[0] != key:  # the events of all rows evaluate the same state

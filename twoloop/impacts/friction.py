@@ -343,7 +343,7 @@ class StopFriction:
     ) -> tuple[list[int], Gap, Tangents]:
         """Return those of the closed stops that have friction, the Gap of their displacements, and their Tangents."""
         stops = [k for k in closed if k in self.slide_index]
-        slides = Gap(*(part[[self.slide_index[k] for k in stops]] for part in self.slides.at(t, q, v)))
+        slides = Gap(*(part[[self.slide_index[k] for k in stops]] for part in self.slides.evaluate(t, q, v)))
         at_rest = np.array([k in self.resting_stops or k in self.released_stops for k in stops], dtype=bool)
         is_sliding = ~at_rest & (np.abs(slides.u) > REST_RATE * (np.abs(slides.W) @ speeds))
         signs = (np.sign(slides.u) * is_sliding).astype(int)

@@ -146,7 +146,7 @@ def join_arcs(
         h=np.concatenate([arc.h for arc in arcs]),
         status=status,
         message=message + (failure_link(status) if stagnated else ""),
-        stats=_sum_statistics([arc.stats for arc in arcs]),
+        stats=Statistics(**{f.name: sum(getattr(arc.stats, f.name) or 0 for arc in arcs) for f in fields(Statistics)}),
         rank=arcs[0].rank,
         redundant=arcs[0].redundant,
         **counts,
@@ -167,9 +167,3 @@ def join_arcs(
 def _concatenated(arcs: Sequence[Result], name: str) -> Any:
     parts = [getattr(arc, name) for arc in arcs]
     return None if any(part is None for part in parts) else np.concatenate(parts)
-
-
-def _sum_statistics(parts: Sequence[Statistics]) -> Statistics:
-    return Statistics(
-        **{field.name: sum(getattr(part, field.name) or 0 for part in parts) for field in fields(Statistics)}
-    )

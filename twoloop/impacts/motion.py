@@ -118,9 +118,9 @@ class Motion:
         self.rebound_height = max(
             REBOUND_HEIGHT * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max()))
         )
-        closed = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.rebound_height)
+        closed = np.flatnonzero(self.gaps.evaluate(t, q, v).g < -100.0 * self.rebound_height)
         if closed.size:
-            gap = float(self.gaps.at(t, q, v).g[closed[0]])
+            gap = float(self.gaps.evaluate(t, q, v).g[closed[0]])
             raise ValueError(f"gaps must not be negative at q0; that of {stops[closed[0]].name!r} is {gap:.3g}")
         self.arcs: list[Result] = []
         self.impacts: list[Impact] = []
@@ -195,18 +195,18 @@ class Motion:
 
     def _resolve_contacts(self) -> Mode:
         """Apply an impact; return the mode after it: which joints and stops slide or stick, which stops are closed."""
-        gap = self.gaps.at(self.t, self.q, self.v)
+        gap = self.gaps.evaluate(self.t, self.q, self.v)
         near_stops = np.flatnonzero(gap.g <= self.rebound_height)
         is_slow = np.zeros(near_stops.size, dtype=bool)
         if near_stops.size:
             if self._follow_impacts(gap, near_stops):
-                gap = self.gaps.at(self.t, self.q, self.v)
+                gap = self.gaps.evaluate(self.t, self.q, self.v)
                 # stops that are still open will be hit later, in impacts of their own
                 open_stops = (gap.g > self.noise) & (gap.u < -REST_RATE * (np.abs(gap.W) @ self.speeds))
                 near_stops = np.flatnonzero((gap.g <= self.rebound_height) & ~open_stops)
             for _ in range(MAX_STALLED_ARCS if near_stops.size else 0):
                 is_slow = self._apply_impulses(gap, near_stops)
-                gap = self.gaps.at(self.t, self.q, self.v)
+                gap = self.gaps.evaluate(self.t, self.q, self.v)
                 # the law may let a stop close that had opened: it is hit next
                 if not (gap.u[near_stops] < -REST_RATE * (np.abs(gap.W[near_stops]) @ self.speeds)).any():
                     break
@@ -217,7 +217,7 @@ class Motion:
         if not closing_stops.size and not resting_joints:
             return Mode(signs)
         a, c_joints = self._free_accelerations(signs, resting_joints, self.v)
-        gap = self.gaps.at(self.t, self.q, self.v)
+        gap = self.gaps.evaluate(self.t, self.q, self.v)
         friction_stops, slide, tangents = self.friction.contact_rows(
             closing_stops.tolist(), self.t, self.q, self.v, self.speeds
         )
@@ -371,7 +371,7 @@ class Motion:
         """Return a mask of the stops that rebound by less than `rebound_height`, pressed by forces and other stops."""
         signs, resting_joints = self._sliding_directions(v)
         a, c_joints = self._free_accelerations(signs, resting_joints, v)
-        gap = self.gaps.at(self.t, self.q, v)
+        gap = self.gaps.evaluate(self.t, self.q, v)
         u, c = gap.u[near], gap.W[near] @ a + gap.bias[near]
         rounding = ROUNDING * np.abs(v).max() ** 2
         is_pressed = u * np.abs(u) <= PRESSED_RATIO * self.rebound_height * np.abs(c).max() + rounding
@@ -392,7 +392,7 @@ class Motion:
 
     def _free_accelerations(self, signs: Signs, resting_joints: list[int], v: Array) -> tuple[Array, Array]:
         """Return accelerations of coordinates and of joints at rest, without contact forces and friction at rest."""
-        a = self._accelerations(self.modes.sliding_system(signs, self.t, self.q)).at(self.t, self.q, v)[0]
+        a = self._accelerations(self.modes.sliding_system(signs, self.t, self.q)).evaluate(self.t, self.q, v)[0]
         return a, self.modes.joint_accelerations(signs, resting_joints, self.t, self.q, v, a)
 
     def _accelerations(self, system: ConstrainedSystem, cached: bool = True) -> Accelerations:
@@ -413,7 +413,7 @@ class Motion:
             return self._contact_systems[key][1]
         sticking = {k for group in mode.sticking_groups.values() for k in group}
         names = ", ".join(f"{self.stops[k].name}{' (sticks)' if k in sticking else ''}" for k in resting)
-        displacements = friction.slides.at(self.t, self.q, self.v).g
+        displacements = friction.slides.evaluate(self.t, self.q, self.v).g
         sticks = {friction.slide_index[k]: float(displacements[friction.slide_index[k]]) for k in mode.sticking_groups}
         sliding_stops = [
             (resting.index(k), friction.slide_index[k], sign * friction.coefficient(k))
@@ -437,12 +437,12 @@ class Motion:
         if self.arcs or resting:
             self.q[np.abs(self.q) < NEGLIGIBLE_VALUE] = 0.0
             self.v[np.abs(self.v) < max(NEGLIGIBLE_VALUE, 1e-16 * float(self.speeds.max()))] = 0.0
-        start = self.gaps.at(self.t, self.q, self.v)
+        start = self.gaps.evaluate(self.t, self.q, self.v)
         accelerations = self._accelerations(system, cacheable) if resting or STICKS in signs else None
 
         def multiplier(row: int, t: float, q: Array, v: Array) -> float:
             assert accelerations is not None
-            return float(accelerations.at(t, q, v)[1][row])
+            return float(accelerations.evaluate(t, q, v)[1][row])
 
         def friction(k: int, t: float, q: Array, v: Array) -> float:
             return -multiplier(rows[k], t, q, v) * self.modes.row_sign(k, system, rows[k], t, q)
@@ -511,7 +511,7 @@ class Motion:
         """Project the state onto the constraints of a mode, from which it deviates by less than the tolerances."""
         self.q = corrected_positions(system, self.t, self.q)
         if resting:
-            gap = self.gaps.at(self.t, self.q, self.v)
+            gap = self.gaps.evaluate(self.t, self.q, self.v)
             W, u = gap.W[list(resting)], gap.u[list(resting)]
             X = responses(self.system, self.t, self.q, W)
             self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE_RATIO)[0]
@@ -525,7 +525,7 @@ class Motion:
         noise, closing = self.noise, u0 < -REST_RATE * float(np.abs(start.W[k]) @ self.speeds)
 
         def gap_function(t: float, q: Array, v: Array) -> float:
-            g = float(self.gaps.at(t, q, v).g[k])
+            g = float(self.gaps.evaluate(t, q, v).g[k])
             if g0 > low or (closing and g0 > noise):
                 return g
             if opens:
@@ -533,29 +533,25 @@ class Motion:
             return g - min(g0, 0.0) + low
 
         event = make_terminal(gap_function)
-        event.gap_rate = lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
+        event.gap_rate = lambda t, q, v: float(self.gaps.evaluate(t, q, v).u[k])
         return event
 
     def _joint_event(self, k: int, sign: int | None, friction: Any) -> Any:
         """Return the event that ends the state of a joint: sliding, sticking or idle."""
         if sign is IDLE:
             return make_terminal(lambda t, q, v: 1.0)
-        if sign != STICKS:
-            return make_terminal(self._joint_rest_event(k, sign))
+        if sign != STICKS:  # sliding: the event is rest; if sliding has just begun, its rate is zero initially
+            u0 = sign * float(self.modes.gradients(self.q, k) @ self.v)
+            offset = u0 - self.rebound_height if k in self.resting_joints or k in self.released_joints else 0.0
+            return make_terminal(lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset)
         return make_terminal(self._slip_event(lambda t, q, v: (friction(k, t, q, v), self.modes.static_friction[k])))
 
     def _stop_rest_event(self, k: int, sign: int) -> Any:
         """Return the event at which a stop ceases to slide; if sliding has just begun, its rate is zero initially."""
         slide, slides = self.friction.slide_index[k], self.friction.slides
-        u0 = sign * float(slides.at(self.t, self.q, self.v).u[slide])
+        u0 = sign * float(slides.evaluate(self.t, self.q, self.v).u[slide])
         offset = u0 - self.rebound_height if k in self.friction.resting_stops | self.friction.released_stops else 0.0
-        return lambda t, q, v: sign * float(slides.at(t, q, v).u[slide]) - offset
-
-    def _joint_rest_event(self, k: int, sign: int) -> Any:
-        """Return the event at which a joint comes to rest; if sliding has just begun, its rate is zero initially."""
-        u0 = sign * float(self.modes.gradients(self.q, k) @ self.v)
-        offset = u0 - self.rebound_height if k in self.resting_joints or k in self.released_joints else 0.0
-        return lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset
+        return lambda t, q, v: sign * float(slides.evaluate(t, q, v).u[slide]) - offset
 
     def _slip_event(self, balance: Any) -> Any:
         """Return the event at which the friction needed exceeds that available; balance(t, q, v) returns both."""

@@ -114,7 +114,7 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
     if code == DONE and np.isfinite(error) and control[at.SYMMETRIC] == 1.0:
         code = adopt_midpoint_partition(f, w, t + 0.5 * size, state, new_state)
         if code == PARTITION_CHANGED:
-            f.settle(f, w, options, memory, tolerances, False)
+            f.commit(f, w, options, memory, tolerances, False)
             code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
     if code == DONE and not np.isfinite(error):
         code = NOT_FINITE
@@ -289,30 +289,30 @@ def advance(
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
         if w.time_is_up == 1.0:  # discard this attempt, in which evaluations may be missing
-            f.settle(f, w, options, memory, tolerances, False)
+            f.commit(f, w, options, memory, tolerances, False)
             return at.PAUSED
         # where a force jumps, an error estimate may be small by chance: `error_factor` increases it until JUMP_END
         error_factor = control[at.JUMP_RATIO] if t < clock[at.JUMP_END] else 1.0
         accepted = code == DONE and error * error_factor <= 1.0
         if accepted and not reaches_goal and ends_near_singular(f, w, control, clock):
-            f.settle(f, w, options, memory, tolerances, False)
+            f.commit(f, w, options, memory, tolerances, False)
             w.n_rejected_error += 1
             if not prepare_projected_repetition(f, w, control, clock, size):
                 clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.pivot
             continue
         if accepted and not jumps and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
-            f.settle(f, w, options, memory, tolerances, False)
+            f.commit(f, w, options, memory, tolerances, False)
             w.n_rejected_error += 1
             clock[at.FAILURE_CODE] = SINGULAR
             return at.NEAR_SINGULAR
         checks_rates = control[at.MAY_JUMP] == 1.0 and not jumps
         if checks_rates and _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-            f.settle(f, w, options, memory, tolerances, False)
+            f.commit(f, w, options, memory, tolerances, False)
             w.n_rejected_error += 1
             clock[at.FAILURE_CODE] = DONE
             continue
         if not jumps:
-            f.settle(f, w, options, memory, tolerances, accepted)
+            f.commit(f, w, options, memory, tolerances, accepted)
         if code != DONE:
             end_code = _handle_failure(f, w, control, clock, t, size, code, t_repeated, state)
             if end_code != at.CONTINUE:

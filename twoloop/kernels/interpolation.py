@@ -352,7 +352,7 @@ def fill_intervals(f, w, options, memory, memory_0, tolerances, state, new_state
                 if code != DONE and renew_partition(f, w, t_before, state[:n]) == DONE:
                     copy(memory_0, memory)
                     code, _, _ = f.attempt(f, w, options, memory, t_before, h, tolerances, state, new_state)
-                f.settle(f, w, options, memory, tolerances, True)
+                f.commit(f, w, options, memory, tolerances, True)
             copy(new_state, state)
             copy(new_state[: 3 * n], out[r])
         if code != DONE:

@@ -177,6 +177,7 @@ def _create_layout(
     static: Static | None,
     n_matrices: int,
 ) -> Layout:
+    """Return the Layout for `Sizes`, whose numbers are the arguments."""
     n_rows = n_c + n_a
     n_redundant = n_rows - r_v
     n_dof = n_q - r_v if reduced else 0

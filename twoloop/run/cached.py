@@ -89,7 +89,7 @@ STEPS = OutputRequest()  # output at the ends of all steps
 
 
 @dataclass(frozen=True)
-class MissedChanges:
+class RepeatRequest:
     """Request to repeat a run that may have missed short changes of forces."""
 
     max_gap: float  # largest time between two evaluations in the repetition, s
@@ -154,7 +154,7 @@ class CachedIntegrator:
         output: OutputRequest,
         time_limit: float | None,
         interrupts: Interrupts,
-    ) -> dict[str, Any] | MissedChanges | None:
+    ) -> dict[str, Any] | RepeatRequest | None:
         """Integrate a system from a start; return the fields of the result, or a request to repeat the run.
 
         Return None if the start needs more checks, or if a callback raised: `set_up` then describes the problem. After
@@ -219,7 +219,7 @@ class CachedIntegrator:
         interrupts: Interrupts,
         is_due: bool,
         fields: dict[str, Any],
-    ) -> dict[str, Any] | MissedChanges | tuple[tuple[Array, Array] | None] | None:
+    ) -> dict[str, Any] | RepeatRequest | tuple[tuple[Array, Array] | None] | None:
         """Check the first chunk of a run, and integrate to the end if this chunk does not reach it or is unusual.
 
         If the run is unusual, return the result of `integrate`, or None if the start needs more checks. Otherwise
@@ -243,7 +243,7 @@ class CachedIntegrator:
             loop.add_first_chunk(int(report[loops.END_CODE]), t[1:], rows[1:], steps, self.cpu_time)
             record = loop.integrate_to_end(self.check_derivatives)
             if record.status >= 0 and may_have_missed_changes(run):
-                return MissedChanges(gap_for_repetition(run), record.stats.cpu_time)
+                return RepeatRequest(gap_for_repetition(run), record.stats.cpu_time)
             return fields_of(record, self.options, system, self.run_fields[-1], t1)
         timed_states = None
         kinds = interval_kinds(run, steps) if output.dense or output.interpolated_times is not None else NO_KINDS
@@ -271,7 +271,7 @@ class CachedIntegrator:
         if run.rows_warning:  # rounding may decide which of several dependent rows is left out
             independent = self.arrays.start_rows.tobytes()
             if independent not in self.redundancy:
-                new_run = run.from_start(run.t0, q0, v0)
+                new_run = run.copy_to_start(run.t0, q0, v0)
                 if new_run is None:
                     return False
                 self.redundancy[independent] = new_run.redundant, new_run.rows_warning
@@ -454,7 +454,7 @@ def cached_result(
     output: OutputRequest,
     time_limit: float | None,
     interrupts: Interrupts,
-) -> tuple[dict[str, Any], str] | MissedChanges | Run | None:
+) -> tuple[dict[str, Any], str] | RepeatRequest | Run | None:
     """Integrate with a cached integrator for a system and options; create it at the first call.
 
     Return the fields of the result and a warning about redundant rows (or ""); or a request to repeat the run; or, if
@@ -486,7 +486,7 @@ def cached_result(
         if len(entry.idle) < MAX_IDLE:
             entry.idle.append(integrator)
         if outcome is not None:
-            return outcome if isinstance(outcome, MissedChanges) else (outcome, rows_warning)
+            return outcome if isinstance(outcome, RepeatRequest) else (outcome, rows_warning)
     return None
 
 
@@ -571,7 +571,7 @@ def _copy_for_start(
     _check_start(system, t0, q0, v0, options)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None
-    run = entry.run.from_start(t0, q0, v0) if has_definite_mass(system, t0, q0) == entry.definite else None
+    run = entry.run.copy_to_start(t0, q0, v0) if has_definite_mass(system, t0, q0) == entry.definite else None
     if run is not None:
         options.set_step_sizes(run, t1)
     return run
@@ -591,12 +591,12 @@ def _new_run(
         traced.refuse_if_wrong(system, t0, t1, q0, v0)
 
     system, derived = with_derived_callbacks(system, check)
-    run, code = _run_from(system, t0, q0, v0, options, derived, check)
+    run, code = _create_run(system, t0, q0, v0, options, derived, check)
     if run.static_form is None:
         branch = branch_at(system, t0, run.state, run.rank, options.atol + options.rtol * np.abs(v0).max())
         run.starts_singular = branch is not None
         if isinstance(branch, Branch) and not has_fixed_step:
-            beside, other = _run_from(system, t0, branch.q, branch.v, options, derived, check)
+            beside, other = _create_run(system, t0, branch.q, branch.v, options, derived, check)
             if beside.rank == branch.rank and beside.static_form is None:
                 run, code = beside, other
                 run.move_to_singular_start(t0, q0, v0, branch.a, branch.first_size)
@@ -614,7 +614,7 @@ def _new_run(
     return run, code
 
 
-def _run_from(
+def _create_run(
     system: ConstrainedSystem,
     t: float,
     q: Array,

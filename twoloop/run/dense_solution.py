@@ -186,6 +186,7 @@ class Interpolator:
         return row_at
 
     def _record_failures(self, failures: int, n_times: int) -> None:
+        """Store the number of failed projections, and warn of them if `self.warns`."""
         self.failures = failures
         if failures > 0 and self.warns:
             _warn_of_lost_rank(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)

@@ -286,7 +286,9 @@ class IntegrationLoop:
             else:
                 self.code, self.callback_error = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:
-                    error.add_note(_error_note(run.system.name, float(run.clock[a.T]), error))
+                    hint = ": it reads beyond the end of an array, such as a table" * isinstance(error, IndexError)
+                    step = f"a step from t = {float(run.clock[a.T]):.10g}"
+                    error.add_note(f"raised by a compiled callback of system {run.system.name!r} in {step}{hint}")
         if self.interrupts.handlers is not None:
             self.interrupts.handlers.call_delayed()
 
@@ -502,9 +504,3 @@ class IntegrationLoop:
         if across:
             return np.full(len(steps), indices.ACROSS)
         return interval_kinds(run, steps)
-
-
-def _error_note(name: str, t: float, error: Exception) -> str:
-    """Return the note to be added to an exception of a compiled callback: name of the system, and time."""
-    hint = ": it reads beyond the end of an array, such as a table" * isinstance(error, IndexError)
-    return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{hint}"

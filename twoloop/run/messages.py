@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import ConstraintWarning
-from twoloop.checks.structure import dependent_rows, in_words, least_inertia, not_finite, surely_above
+from twoloop.checks.structure import certainly_exceed, dependent_rows, describe_dependence, least_inertia, not_finite
 from twoloop.kernels.control.loop_state import DISPLACEMENT, INNER_TOL, initial_direction
 from twoloop.kernels.control.singular_positions import EPS
 from twoloop.kernels.data import indices
@@ -257,7 +257,7 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
         at_singular_start = t == run.t0 and run.starts_singular  # positions and velocities at the start are given
-        if t >= end or at_singular_start or surely_above(run.near_threshold, system.rows(t, q), run.rank):
+        if t >= end or at_singular_start or certainly_exceed(run.near_threshold, system.rows(t, q), run.rank):
             continue
         error_ratio = _velocity_error_ratio(run, t, q, v)
         if error_ratio > MAX_LASTING_ERROR:
@@ -366,7 +366,7 @@ def _describe_contradiction(run: "Run") -> str:
             "or beyond."
         )
     row = int(run.work.notes[indices.CONTRADICTION])
-    words = in_words(run.system.rows(t, q), [row])
+    words = describe_dependence(run.system.rows(t, q), [row])
     return (
         f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
         f"not hold along the motion that these allow ({words} at the last state). Either it contradicts them, or "
@@ -380,7 +380,7 @@ def warn_of_singular_end(run: "Run") -> str:
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
     q, v = run.state[:n], run.state[n : 2 * n]
-    if surely_above(WEAK_RATIO, system.rows(t, q), run.rank):
+    if certainly_exceed(WEAK_RATIO, system.rows(t, q), run.rank):
         return ""
     ratios = [ratio(system, t, q, run.rank) for ratio in (singular_ratio, unit_free_ratio)]
     if max(ratios) <= MAX_RATIO_AT_END:

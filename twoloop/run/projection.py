@@ -303,7 +303,7 @@ def _project(
     change = _least_change(jacobian, free, -system.velocity_constraint(t, position, speeds))
     velocity = speeds + change
     scales = scales_of(system, t, position, jacobian)
-    violation = Violation.of_velocity(system, t, position, velocity, jacobian, scales) if len(jacobian) > 0 else None
+    violation = Violation.measure_v(system, t, position, velocity, jacobian, scales) if len(jacobian) > 0 else None
     if violation is not None and violation.excess > 1.0:
         why = f"max|C_q v + C_t| stays at {_format_largest(violation.values)}"
         raise ValueError(_describe_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
@@ -335,7 +335,7 @@ def _projected_position(
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
-    violation = Violation.of_position(system, t, guess, jacobian, scales)
+    violation = Violation.measure_q(system, t, guess, jacobian, scales)
     if violation.excess > CONVERGED_VIOLATION and _rank(scaled[:, free]) < _rank(scaled):
         why = f"max|C| stays at {_format_largest(violation.values)}"
         raise ValueError(_describe_no_freedom(system, t, scaled, free, kept, why))
@@ -432,7 +432,7 @@ def _gauss_newton(
             return None, np.inf, iteration
         step = _least_change(jacobian, free, -values, cutoff)
         scales = scales_of(system, t, q, jacobian)
-        excess = Violation.of_position(system, t, q, jacobian, scales).excess
+        excess = Violation.measure_q(system, t, q, jacobian, scales).excess
         if excess == 0.0 or (excess <= CONVERGED_VIOLATION and excess >= 0.5 * least_excess):
             return q, excess, iteration  # as close as rounding allows
         if excess < least_excess:
@@ -499,6 +499,7 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
 def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
+    """Return the message if the rank of the `free` columns is too small for a projection; `why`: what failed."""
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
     name = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:

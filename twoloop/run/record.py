@@ -202,6 +202,7 @@ class Recorder:
             self.interpolator.crossing_memories[float(self._t[-1])] = memory.copy()
 
     def _store_output(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
+        """Store the output states at the ends of steps, and the data of the dense solution if it is requested."""
         request, store = self.request, self.request.store
         if request.times is None:
             self._store_states(t, rows)

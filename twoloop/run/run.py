@@ -11,8 +11,8 @@ from twoloop.checks.sparse_rows import Rows, SparseRows, norms
 from twoloop.checks.structure import (
     SHOWN,
     dependent_rows,
-    equations_in_words,
-    in_words,
+    describe_dependence,
+    describe_equations,
     least_inertia,
     mass_and_rows,
     pattern_of,
@@ -35,7 +35,7 @@ from twoloop.run.singular_positions import (
     describe_singular_start,
     singular_threshold,
 )
-from twoloop.run.workspace import kit_for_plan, kit_of, static_form, with_newton, workspace
+from twoloop.run.workspace import add_newton_program, kit_for_plan, kit_of, static_form, workspace
 
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
@@ -139,7 +139,7 @@ class Run:
         new_run.work = copy_workspace(self.work)
         return new_run
 
-    def from_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
+    def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
         """Return a copy of this run at another start; None if ranks differ there, or accelerations cannot be computed.
 
         The run must not use the static form of linear algebra.
@@ -199,6 +199,7 @@ class Run:
         return code
 
     def _copy_without_workspace(self) -> "Run":
+        """Return a copy of this run, which must be at its start, that has no workspace yet."""
         new_run = object.__new__(Run)
         vars(new_run).update(
             vars(self),
@@ -264,7 +265,7 @@ class Run:
         t, q = float(self.clock[self.a.T]), self.state[:n].copy()
         static, self.static_form = self.static_form, None
         if static is not None and static.newton_program is None and self.matrices > 0:
-            self.static_form = with_newton(self.system, t, q, static)
+            self.static_form = add_newton_program(self.system, t, q, static)
         if self.static_form is not None and self.plan.first is not None:
             self.plan = with_matrix_cost(self.plan, self.static_form.matrix_cost())
         self.kit = kit_of(self.system, t, q, self.plan, self.static_form)
@@ -376,14 +377,14 @@ class Run:
     def _describe_rows(self, all_rows: Rows, rows: list[int]) -> str:
         """Describe in words how the rows of `all_rows` with the indices `rows` depend on the other rows."""
         if not isinstance(all_rows, SparseRows):
-            return in_words(all_rows, rows)
+            return describe_dependence(all_rows, rows)
         q, independent_rows = self.state[: self.system.n_q], self.work.rows_v.tolist()
         if self.static_form is None or set(rows) & set(independent_rows):
-            return in_words(self.system.rows(self.t0, q), rows)
+            return describe_dependence(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
         for row, factor in zip(rows, factors, strict=False):  # row = factor @ independent rows
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
-        return equations_in_words(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
+        return describe_equations(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
 
     def set_step_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first step size and the limits of step sizes, s; `first_step` None: take an estimate."""

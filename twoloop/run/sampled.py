@@ -95,7 +95,7 @@ class SampledRun:
         self._plan = method.plan(system.n_q, rtol, float(atol.min()), False)
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
         self._tolerances = rtol, atol
-        self.run = self._run_from(t0, q0, v0)
+        self.run = self._create_run(t0, q0, v0)
         if self.run.start_warning:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
@@ -111,7 +111,7 @@ class SampledRun:
         self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time, s; longest allowed time between evaluations, s
         self._store_sample(t0)
 
-    def _run_from(self, t: float, q: Array, v: Array) -> Run:
+    def _create_run(self, t: float, q: Array, v: Array) -> Run:
         run = Run(self._derived_system, self._plan.fresh(), t, q, v, *self._tolerances, None)
         allowed = self._tolerances[1] + self._tolerances[0] * np.abs(v).max()
         if run.static_form is None and branch_at(self._derived_system, t, run.state, run.rank, allowed) is not None:
@@ -246,7 +246,7 @@ class SampledRun:
         """Replace the run, which failed or has to be repeated, by a new run from the state at the last sample."""
         old_run, n = self.run, self.system.n_q
         try:
-            self.run = self._run_from(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
+            self.run = self._create_run(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
         except ValueError as error:
             raise RuntimeError(f"step goes on from the last sample, where it cannot begin: {error}") from None
         self.run.work.counters[:] = old_run.work.counters

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.scales import signs
-from twoloop.checks.structure import surely_above
+from twoloop.checks.structure import certainly_exceed
 from twoloop.kernels.data.indices import REPORTED_ERROR
 from twoloop.problem.system import ConstrainedSystem
 
@@ -234,7 +234,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
     """Return a warning for a start that the tolerances do not distinguish from a singular position, else ""."""
-    if rank == 0 or surely_above(WEAK_RATIO, system.rows(t, q), rank):
+    if rank == 0 or certainly_exceed(WEAK_RATIO, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)
     if max(ratio, unit_free_ratio(system, t, q, rank)) > WEAK_RATIO:

@@ -65,6 +65,7 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
 
 
 def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
+    """Return the result of `branch_at`; callbacks may raise exceptions."""
     q, v, a = np.split(state[: 3 * system.n_q], 3)
     direction = v if v.any() else a
     if not direction.any():

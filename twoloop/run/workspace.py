@@ -156,11 +156,11 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
         return None
     form: StaticForm | None = system.remembered("static form", lambda: _create_static_form(system, t0, q0))
     if form is not None and any(plan.matrices and plan.first is None for plan in plans):
-        return with_newton(system, t0, q0, form)
+        return add_newton_program(system, t0, q0, form)
     return form
 
 
-def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
+def add_newton_program(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
     """Return a copy of `form` with the program of Newton's matrix; None if sparse factors of this matrix do not pay."""
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None

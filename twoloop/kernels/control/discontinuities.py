@@ -217,35 +217,36 @@ def _is_smooth_bend(values, k, n):
 
 
 @compiled
-def _find_sudden_bend(values, n, slope, least, within):
+def _find_sudden_bend(values, n, slope, min_range, strict):
     """Return the index of the first sudden bend of n + 1 values (0: none), and the limit of second differences.
 
     The limit is SUDDEN_RATIO times the range of the values minus a line of slope `slope` (per sample). The index is 0
-    if this range is at most `least`. With `within` = True, bends of a smooth curve are excluded, see `_is_smooth_bend`.
+    if this range is at most `min_range`. If `strict`, bends of a smooth curve are excluded, see `_is_smooth_bend`.
     """
     low = high = 0.0
     for k in range(1, n + 1):
         deviation = values[k] - values[0] - k * slope
         low, high = min(low, deviation), max(high, deviation)
     limit = SUDDEN_RATIO * (high - low)
-    if high - low > least:
+    if high - low > min_range:
         for k in range(1, n):
             second_difference = values[k + 1] - 2.0 * values[k] + values[k - 1]
-            if abs(second_difference) > limit and not (within and _is_smooth_bend(values, k, n)):
+            if abs(second_difference) > limit and not (strict and _is_smooth_bend(values, k, n)):
                 return k, limit
     return 0, limit
 
 
 @compiled
-def _first_sudden_bend(values, n, along, least):
+def _first_sudden_bend(values, n, detrends, min_range):
     """Return the index of the first sudden bend of n + 1 samples (0: none), and the limit of its second difference.
 
-    If `along` is 1, the straight line from the first to the last value is subtracted before the search. The search is
-    repeated among the values before the bend, until it finds no earlier bend. `least`: see `_find_sudden_bend`.
+    If `detrends` is 1, the straight line from the first to the last value is subtracted before the search, which is
+    repeated among the values before the bend, until it finds no earlier bend. `min_range`: see `_find_sudden_bend`.
     """
-    index, limit = _find_sudden_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
-    while index > 1:  # few samples of a smooth curve may bend as much: the argument `within` = True excludes such bends
-        earlier, bound = _find_sudden_bend(values, index, along * (values[index] - values[0]) / index, least, True)
+    index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
+    while index > 1:  # few samples of a smooth curve may bend as much, hence `strict`
+        slope = detrends * (values[index] - values[0]) / index
+        earlier, bound = _find_sudden_bend(values, index, slope, min_range, True)
         if earlier == 0:
             break
         index, limit = earlier, bound
@@ -321,15 +322,16 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
         if t_first < np.inf:
             break
         n = k
-    least = LEAST_RANGE * tolerances[RTOL]
-    min_force_range = max(LEAST_VALUE, least * _largest_value(changes[LARGEST_ROW, : q.size]))
-    min_rate_range = max(LEAST_VALUE, least * _largest_value(changes[LARGEST_ROW, q.size :]))
+    relative_range = LEAST_RANGE * tolerances[RTOL]
+    min_force_range = max(LEAST_VALUE, relative_range * _largest_value(changes[LARGEST_ROW, : q.size]))
+    min_rate_range = max(LEAST_VALUE, relative_range * _largest_value(changes[LARGEST_ROW, q.size :]))
     bend, column, limit = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]
-        index, least = _first_sudden_bend(values, n, follows_motion, min_force_range if j < q.size else min_rate_range)
+        min_range = min_force_range if j < q.size else min_rate_range
+        index, bound = _first_sudden_bend(values, n, follows_motion, min_range)
         if 0 < index < bend:
-            bend, column, limit = index, j, least
+            bend, column, limit = index, j, bound
     if column >= 0:
         t_first = min(t_first, begin + bend * spacing)
         if follows_motion == 0.0:
@@ -346,9 +348,9 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
         return
     for k, time in enumerate((t - 2.0 * spacing, t - spacing, end + spacing, end + 2.0 * spacing)):
         _sample_forces(f, w, min(max(time, begin), last), 0.0, q, v, a, changes[k + (k > 1)])
-    least = LEAST_RANGE * tolerances[RTOL]
-    min_force_range = max(LEAST_VALUE, least * _largest_value(changes[LARGEST_ROW, : q.size]))
-    min_rate_range = max(LEAST_VALUE, least * _largest_value(changes[LARGEST_ROW, q.size :]))
+    relative_range = LEAST_RANGE * tolerances[RTOL]
+    min_force_range = max(LEAST_VALUE, relative_range * _largest_value(changes[LARGEST_ROW, : q.size]))
+    min_rate_range = max(LEAST_VALUE, relative_range * _largest_value(changes[LARGEST_ROW, q.size :]))
     for k in range(N_SAMPLES_IN_SHORT_STEP):
         time = t + k * size / N_SAMPLES_IN_SHORT_STEP
         _sample_forces(f, w, time, 0.0, q, v, a, changes[2])

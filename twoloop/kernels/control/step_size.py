@@ -30,7 +30,7 @@ from twoloop.kernels.control.loop_state import (
     LEAST_ERROR,
     SAFETY,
 )
-from twoloop.kernels.data.common import SETTLE, allowed_error, compiled, is_beyond_gap, kernel, merged
+from twoloop.kernels.data.common import COMMIT, allowed_error, compiled, is_beyond_gap, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import representable_step
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
@@ -73,7 +73,7 @@ def project_and_evaluate(f, w, t, Q, V, A):
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
 
 
-@kernel(SETTLE)
+@kernel(COMMIT)
 def commit_nothing(f, w, options, memory, tolerances, accepted):
     """Do nothing: the method of the step has no memory."""
 

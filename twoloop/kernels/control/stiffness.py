@@ -37,7 +37,7 @@ from twoloop.kernels.control.loop_state import (
 from twoloop.kernels.control.step_size import project_and_evaluate, step_size_ratio
 from twoloop.kernels.data.common import (
     ATTEMPT,
-    SETTLE,
+    COMMIT,
     Attempt,
     Step,
     allowed_error,
@@ -352,16 +352,16 @@ def _clear_memory(memory):
         memory[i] = 0.0
 
 
-@kernel(SETTLE)
-def settle_switching(f, w, options, memory, tolerances, accepted):
+@kernel(COMMIT)
+def commit_switching(f, w, options, memory, tolerances, accepted):
     """Commit or discard the attempted step in the memory of the active method, and count it if it is accepted."""
     first, second = _memory_views(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
     memory[MAY_ESTIMATE] = 0.0
     if _is_explicit(memory):
-        f.settle_first(f, w, options[N_OPTIONS:begin], first, tolerances, accepted)
+        f.commit_first(f, w, options[N_OPTIONS:begin], first, tolerances, accepted)
     else:
-        f.settle_second(f, w, options[begin:], second, tolerances, accepted)
+        f.commit_second(f, w, options[begin:], second, tolerances, accepted)
     if accepted:
         memory[STEPS] += 1.0
         memory[MAY_ESTIMATE] = 1.0
@@ -425,4 +425,4 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(DONE, error, factor)
 
 
-SWITCHING = Step(switching_step, settle_switching)
+SWITCHING = Step(switching_step, commit_switching)

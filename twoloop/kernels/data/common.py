@@ -142,13 +142,13 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Compiled functions of a method: `attempt` computes a step, `settle` accepts or discards the step in `memory`.
+    """Compiled functions of a method: `attempt` computes a step, `commit` accepts or discards the step in `memory`.
 
     `many` computes several steps in one call, and is None if the method has no such function.
     """
 
     attempt: Any = None
-    settle: Any = None
+    commit: Any = None
     many: Any = None
 
 
@@ -170,10 +170,10 @@ for _name in ("inner", "general"):
 ATTEMPT = types.NamedTuple((i8, f8, f8), Attempt)(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
 for _name in ("attempt", "attempt_first", "attempt_second"):
     KIT.add_function(_name, ATTEMPT)
-# signature of `Step.settle`: (kit, work, options, memory, tolerances, accepted) -> None
-SETTLE = types.void(KIT, WORK, VECTOR, VECTOR, VECTOR, types.boolean)
-for _name in ("settle", "settle_first", "settle_second"):
-    KIT.add_function(_name, SETTLE)
+# signature of `Step.commit`: (kit, work, options, memory, tolerances, accepted) -> None
+COMMIT = types.void(KIT, WORK, VECTOR, VECTOR, VECTOR, types.boolean)
+for _name in ("commit", "commit_first", "commit_second"):
+    KIT.add_function(_name, COMMIT)
 # signature of `Step.many`: (kit, work, options, memory, tolerances, control, clock, goal, state, new_state, times,
 # states, steps) -> number of steps
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
@@ -328,9 +328,9 @@ class Kit:
         self.functions, self.inner, self.general, self.own = functions, inner, general, own
         self.numbers = NO_NUMBERS if numbers is None else numbers
         self.own_numbers = NO_NUMBERS if own_numbers is None else own_numbers
-        self.attempt, self.settle, self.attempt_many = step or Step()
-        self.attempt_first, self.settle_first, _ = first or Step()
-        self.attempt_second, self.settle_second, _ = second or Step()
+        self.attempt, self.commit, self.attempt_many = step or Step()
+        self.attempt_first, self.commit_first, _ = first or Step()
+        self.attempt_second, self.commit_second, _ = second or Step()
         self.__dict__.update(dict.fromkeys(OWN_FUNCTIONS, 0))
         for each in own:
             self.__dict__.update(each.addresses)

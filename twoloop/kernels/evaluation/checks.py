@@ -247,10 +247,7 @@ def _record_entries(rows, pattern):
 
 @exact
 def _record_entries_at_displacements(f, t, q, shifts, position, rows, n_c, pattern):
-    """Set `pattern` to 1 where C_q or A is nonzero at one of the positions q + max|q| shifts[k]; keep other entries.
-
-    `position` and `rows` are scratch.
-    """
+    """Set `pattern` to 1 where C_q or A is nonzero at a position q + max|q| shifts[k]; `position`, `rows`: scratch."""
     largest = largest_of(q)
     for k in range(len(shifts)):
         for j in range(q.size):

@@ -253,6 +253,7 @@ def _verify_pattern(w):
 
 @compiled
 def _do_other_task(f, w, task, t, q, v):
+    """Do one of the tasks that choose, check or factor something between evaluations; return a code."""
     if task == tasks.FIND_NULL_SPACE:
         code = evaluate_and_factor_columns(f, w, t, q)
         if code == DONE:

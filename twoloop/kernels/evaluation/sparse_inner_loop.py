@@ -500,6 +500,7 @@ def _solve_system(f, w, r, c, a, lam):
 
 @compiled
 def _do_other_task(f, w, task, t, q, v, a, lam):
+    """Do a task other than evaluations and projections; return a code."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:

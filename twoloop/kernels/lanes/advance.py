@@ -83,10 +83,7 @@ def _write_states_in_steps(code, settings, control, options, work, n, new, times
 
 @compiled
 def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
-    """End the runs whose accepted step ends at t1, and copy their final states to out_q, out_v and out_a.
-
-    `last` is the index of t1 among the output times.
-    """
+    """End the runs whose accepted step ends at t1, output time `last`; copy their states to out_q, out_v and out_a."""
     for k in range(LANES):
         if work[at.ACCEPTED * LANES + k] == 0.0 or work[at.H * LANES + k] != control[at.T1] - work[at.T * LANES + k]:
             continue

@@ -169,10 +169,7 @@ def _scratch_view(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the bordered system in `numbers`; return a code.
-
-    `factorize` and `substitute` are the indices of the LAPACK routines, such as DGBTRF and DGBTRS.
-    """
+    """Factor the bordered system in `numbers` by LAPACK routines, such as DGBTRF and DGBTRS; return a code."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     exchanges = pivots[: n - n_c].view(np.int32)

@@ -133,10 +133,7 @@ def ldl_factor(A):
 
 @merged
 def invert_definite(A):
-    """Replace a symmetric positive definite A by its inverse, by Gauss-Jordan elimination.
-
-    Returns False if A is not positive definite or has values that are not finite.
-    """
+    """Replace a symmetric A by its inverse, by Gauss-Jordan elimination; return False if A is not positive definite."""
     n = A.shape[0]
     for k in range(n):
         if not A[k, k] > 0.0:

@@ -158,10 +158,7 @@ def multipliers_by_elimination(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Store in w.L the factors of w.M; if M is constant and dense, store its inverse, which is faster to apply.
-
-    Returns DONE, MASS_NOT_DEFINITE or NOT_FINITE.
-    """
+    """Store in w.L the factors of w.M or, if M is constant and dense, its inverse, which is faster; return a code."""
     if has_banded_mass(f):
         is_definite = factor_banded_mass(f, w) == DONE
     else:

@@ -36,12 +36,14 @@ class _DisjointSets:
         self.parent = list(range(n))
 
     def find(self, i: int) -> int:
+        """Return the smallest member of the set that contains i."""
         while self.parent[i] != i:
             self.parent[i] = self.parent[self.parent[i]]
             i = self.parent[i]
         return i
 
     def join(self, i: int, j: int) -> int:
+        """Merge the sets that contain i and j; return the smallest member."""
         i, j = self.find(i), self.find(j)
         self.parent[max(i, j)] = min(i, j)
         return min(i, j)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels.control.step_size import departure
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
+from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
@@ -81,8 +81,8 @@ def _history_views(memory, n):
     return differences, trial, prediction, rate, memory[begin + 4 * n :]
 
 
-@kernel(SETTLE)
-def settle_bdf(f, w, options, memory, tolerances, accepted):
+@kernel(COMMIT)
+def commit_bdf(f, w, options, memory, tolerances, accepted):
     """Set ORDER to NEXT_ORDER; if the attempt was accepted, also replace the history by the trial differences."""
     differences, trial, _, _, _ = _history_views(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
@@ -205,10 +205,7 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error, in units of the tolerances, and the ratio of the next to this step size.
-
-    d is y1 - prediction.
-    """
+    """Store NEXT_ORDER; return the error, in tolerances, and the ratio of the next step size; d: y1 - prediction."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
@@ -318,4 +315,4 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(DONE, error, factor)
 
 
-BDF = Step(bdf_step, settle_bdf)
+BDF = Step(bdf_step, commit_bdf)

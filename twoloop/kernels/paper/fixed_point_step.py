@@ -3,7 +3,7 @@
 import numpy as np
 
 from twoloop.kernels.control.step_size import commit_nothing
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, kernel
+from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, kernel
 from twoloop.kernels.data.indices import DONE, ESTIMATE
 from twoloop.kernels.evaluation.inner_loop import accelerations
 from twoloop.kernels.linalg.dense import copy
@@ -30,8 +30,8 @@ from twoloop.kernels.steps.stages import (
 )
 
 
-@kernel(SETTLE)
-def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
+@kernel(COMMIT)
+def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
     """Store the stage accelerations and the rounding errors of an accepted step; nothing if `accepted` is false."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
@@ -105,7 +105,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(code, max(error, departure), 0.0)
 
 
-RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
+RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
 # largest END_ERROR_WEIGHT * estimate_end_error with which paper_step accepts a step; the paper has no such limit

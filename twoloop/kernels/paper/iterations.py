@@ -33,16 +33,16 @@ def memory_size(s: int, n_q: int) -> int:
 
 
 @inlined
-def memory_block(memory, s, n, which):
-    """Return a view (s, n) of the block with the index `which`, such as A_PREVIOUS, in `memory`."""
-    start = N_MEMORY_SCALARS + which * s * n
+def memory_block(memory, s, n, index):
+    """Return a view (s, n) of the block number `index`, such as A_PREVIOUS, in `memory`."""
+    start = N_MEMORY_SCALARS + index * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
-def memory_vector(memory, s, n, which):
-    """Return a view (n) of the vector with the index `which`, such as Q_FULL, in `memory`."""
-    start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
+def memory_vector(memory, s, n, index):
+    """Return a view (n) of the vector number `index`, such as Q_FULL, in `memory`."""
+    start = N_MEMORY_SCALARS + N_BLOCKS * s * n + index * n
     return memory[start : start + n]
 
 

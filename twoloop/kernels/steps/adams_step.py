@@ -16,7 +16,7 @@ integrals are positive.
 import numpy as np
 
 from twoloop.kernels.control.step_size import departure, store_prediction
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined, kernel, merged
+from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, inlined, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 
@@ -78,20 +78,20 @@ def _padded_size(n_q: int) -> int:
 
 
 @inlined
-def _row(memory, which):
-    """Return a view (N_TERMS + 2) of row `which`, such as PSI, of the coefficients in `memory`."""
-    start = N_SCALARS + which * (N_TERMS + 2)
+def _row(memory, index):
+    """Return a view (N_TERMS + 2) of row `index`, such as PSI, of the coefficients in `memory`."""
+    start = N_SCALARS + index * (N_TERMS + 2)
     return memory[start : start + N_TERMS + 2]
 
 
 @inlined
-def _difference_table(memory, n, which):
-    """Return a view of table number `which` of differences, N_TERMS + 1 rows of n entries, padded.
+def _difference_table(memory, n, index):
+    """Return a view of table number `index` of differences, N_TERMS + 1 rows of n entries, padded.
 
     The difference phi_i is row i - 1 plus the last row.
     """
     width = (n + 3) // 4 * 4
-    start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
+    start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(index) * (N_TERMS + 1) * width
     return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))
 
 
@@ -103,8 +103,8 @@ def _scratch_rows(memory, n):
     return memory[start : start + width], memory[start + width : start + 2 * width]
 
 
-@kernel(SETTLE)
-def settle_adams(f, w, options, memory, tolerances, accepted):
+@kernel(COMMIT)
+def commit_adams(f, w, options, memory, tolerances, accepted):
     """Add an accepted attempt to the history in `memory`, or count a rejected attempt."""
     if not accepted:
         memory[FAILED] += 1.0
@@ -325,4 +325,4 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(DONE, max(error, distance), factor)
 
 
-ADAMS = Step(adams_step, settle_adams)
+ADAMS = Step(adams_step, commit_adams)

@@ -23,7 +23,7 @@ to the tolerance times the number of steps.
 import numpy as np
 
 from twoloop.kernels.control.step_size import departure, store_prediction
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
+from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import DONE, ESTIMATE, OUTER_DIVERGED, SINGULAR, STATIC
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
 from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
@@ -485,8 +485,8 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
     return error
 
 
-@kernel(SETTLE)
-def settle_diagonal(f, w, options, memory, tolerances, accepted):
+@kernel(COMMIT)
+def commit_diagonal(f, w, options, memory, tolerances, accepted):
     """Store the accelerations of the last stage of an accepted step, which is the first stage of the next step."""
     if accepted:
         s = int(options[at.DIAGONAL_OFFSET])
@@ -564,4 +564,4 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(code, error, 0.0)
 
 
-DIAGONAL = Step(diagonal_step, settle_diagonal)
+DIAGONAL = Step(diagonal_step, commit_diagonal)

@@ -73,9 +73,9 @@ def tableau_of(options):
 
 
 @inlined
-def _vector_view(memory, n, which):
-    """Return a view (2 n, padded) of the vector with index `which`, such as STAGE_STATE, in `memory`."""
-    return memory[which * _padded_width(n) : (which + 1) * _padded_width(n)]
+def _vector_view(memory, n, index):
+    """Return a view (2 n, padded) of the vector number `index`, such as STAGE_STATE, in `memory`."""
+    return memory[index * _padded_width(n) : (index + 1) * _padded_width(n)]
 
 
 @inlined

@@ -23,9 +23,9 @@ from twoloop.kernels.data import collocation as field
 from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REJECTED, array_offsets
 from twoloop.kernels.data.common import (
     ATTEMPT,
+    COMMIT,
     GAP_SLACK,
     MANY,
-    SETTLE,
     Attempt,
     Step,
     allowed_error,
@@ -186,8 +186,8 @@ def _passes_singular_position(f, w, t, h, state, new_state):
     return False
 
 
-@kernel(SETTLE)
-def settle_lobatto(f, w, options, memory, tolerances, accepted):
+@kernel(COMMIT)
+def commit_lobatto(f, w, options, memory, tolerances, accepted):
     """Keep the polynomial of an accepted attempt to predict the next step; discard that of a rejected attempt."""
     data = _aligned_view(memory)
     if accepted and data[field.TRIED] == 1.0:
@@ -360,4 +360,4 @@ def lobatto_steps(
     return n_ends
 
 
-LOBATTO = Step(lobatto_step, settle_lobatto, lobatto_steps)
+LOBATTO = Step(lobatto_step, commit_lobatto, lobatto_steps)

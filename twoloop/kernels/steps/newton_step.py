@@ -14,7 +14,7 @@ Solving ODEs II, IV.8, for Radau IIA). In stiff problems, a fixed-point iteratio
 import numpy as np
 
 from twoloop.kernels.control.step_size import project_prediction
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed_error, compiled, kernel
+from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, kernel
 from twoloop.kernels.data.indices import DONE, ESTIMATE, LEAST, OUTER_DIVERGED, STATIC
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
@@ -206,8 +206,8 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     return error
 
 
-@kernel(SETTLE)
-def settle_newton(f, w, options, memory, tolerances, accepted):
+@kernel(COMMIT)
+def commit_newton(f, w, options, memory, tolerances, accepted):
     """Store the stage accelerations of an accepted step; the next step predicts its stage accelerations from them."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted:
@@ -296,4 +296,4 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(code, error, 0.0)
 
 
-NEWTON = Step(newton_step, settle_newton)
+NEWTON = Step(newton_step, commit_newton)

@@ -284,11 +284,8 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
 
 
 @compiled
-def _factor_dense_matrix(w, memory, s, which, z, matrix):
-    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, and their pivots in `memory`; return a code.
-
-    `which`: index of the pivots, see `pivots_of`.
-    """
+def _factor_dense_matrix(w, memory, s, index, z, matrix):
+    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, with pivots `index` in `memory`; return a code."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
     damped = memory[at.HAS_DAMPING] == 1.0
@@ -298,7 +295,7 @@ def _factor_dense_matrix(w, memory, s, which, z, matrix):
             if damped:
                 matrix[i, j] -= z * Jv[i, j]
         matrix[i, i] += 1.0
-    return DONE if lu_factor(matrix, pivots_of(memory, s, n, which)) > 0.0 else SINGULAR
+    return DONE if lu_factor(matrix, pivots_of(memory, s, n, index)) > 0.0 else SINGULAR
 
 
 @compiled
@@ -440,10 +437,10 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
 
 
 @compiled
-def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
+def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
     """Store the factors of M - z^2 K - z D with the border C_q in `numbers`, and pivots in `memory`; return a code.
 
-    `which`: index of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
+    `index`: index of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
     """
     n = w.Q.size
     K = _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b)
@@ -457,7 +454,7 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
                 value -= z * D[i, b + j - i]
             band[j, 2 * b + i - j] = value
     Cq, _, _ = _border_views(w, n, w.rows.size, b)
-    return factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, which), factorize, substitute)
+    return factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, index), factorize, substitute)
 
 
 @compiled
@@ -475,10 +472,7 @@ def _multiply_by_T(w, b, x, X):
 
 @compiled
 def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system with the right-hand side x (n_q); store the solution's independent part in x[:n_dof].
-
-    The other entries of x are scratch.
-    """
+    """Solve the bordered system for x (n_q); store the independent part in x[:n_dof]; the other entries are scratch."""
     Cq, _, _ = _border_views(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # in ascending order, no entry is overwritten before it is read
@@ -499,10 +493,7 @@ def _solve_banded_system(f, w, b, numbers, pivots, substitute, X, x):
 
 @compiled
 def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
-    """Replace e_v[:n_dof] by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)[:n_dof], with z = h gamma0.
-
-    The other entries of e_v (n_q) are scratch.
-    """
+    """Replace e_v[:n_dof] as `filter_error` does; the other entries of e_v (n_q) are scratch."""
     n = w.Q.size
     b = f.bandwidth
     z = h * options[newton_options_index(s) + at.GAMMA0]
@@ -736,10 +727,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v (dense storage) or K and D (else) in w.matrices; return a code.
-
-    (t, q, v) is the last evaluated state, and a its accelerations.
-    """
+    """Store J_q and J_v (dense storage) or K and D (else) at the last evaluated state in w.matrices; return a code."""
     if f.form == STATIC:
         return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.bandwidth >= 0:
@@ -748,12 +736,12 @@ def fill_derivatives(f, w, options, memory, s, t, q, v, a):
 
 
 @compiled
-def _factor_system(f, w, memory, s, which, z, numbers, factorize, substitute):
+def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
     """Store the factors of I - z^2 J_q - z J_v, real or complex as z is, in `numbers`; see `_factor_banded`."""
     w.n_factorizations += 1
     if f.bandwidth >= 0:
-        return _factor_banded(w, memory, s, f.bandwidth, which, z, numbers, factorize, substitute)
-    return _factor_dense_matrix(w, memory, s, which, z, as_matrix(numbers, w.independent.size))
+        return _factor_banded(w, memory, s, f.bandwidth, index, z, numbers, factorize, substitute)
+    return _factor_dense_matrix(w, memory, s, index, z, as_matrix(numbers, w.independent.size))
 
 
 @compiled
@@ -786,9 +774,9 @@ def factor_systems(f, w, options, memory, s, h):
 
 
 @compiled
-def _solve_system(f, w, memory, s, which, numbers, substitute, X, x):
+def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
     """Replace x[:n_dof] by the solution, with the factors of `_factor_system` in `numbers`; X (n_q) is scratch."""
-    m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, which)
+    m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, index)
     if f.bandwidth >= 0:
         _solve_banded_system(f, w, f.bandwidth, numbers, pivots, substitute, X, x)
     else:

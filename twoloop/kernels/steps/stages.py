@@ -260,23 +260,23 @@ def count_systems(options, s):
 
 
 @inlined
-def block(memory, s, n, which):
-    """Return a view (s, n) of block `which`, such as PREVIOUS, of `memory`."""
-    start = N_MEMORY_SCALARS + which * s * n
+def block(memory, s, n, index):
+    """Return a view (s, n) of block `index`, such as PREVIOUS, of `memory`."""
+    start = N_MEMORY_SCALARS + index * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
-def vector(memory, s, n, which):
-    """Return a view (n) of vector `which`, such as A_NEW, of `memory`."""
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + which) * n
+def vector(memory, s, n, index):
+    """Return a view (n) of vector `index`, such as A_NEW, of `memory`."""
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + index) * n
     return memory[start : start + n]
 
 
 @inlined
-def matrix_storage(w, n, which):
-    """Return a view (n^2) of part `which`, such as DERIVATIVE_Q, of w.matrices."""
-    return w.matrices[which * n * n : (which + 1) * n * n]
+def matrix_storage(w, n, index):
+    """Return a view (n^2) of part `index`, such as DERIVATIVE_Q, of w.matrices."""
+    return w.matrices[index * n * n : (index + 1) * n * n]
 
 
 @inlined
@@ -306,9 +306,9 @@ def pivots_of(memory, s, n, k):
 
 
 @inlined
-def complex_vector(memory, s, n, n_systems, which):
-    """Return a view of complex scratch vector `which` (n), 0 or 1, of `memory`."""
-    return _storage_after_vectors(memory, s, n, 1 + n_systems + 2 * which).view(np.complex128)
+def complex_vector(memory, s, n, n_systems, index):
+    """Return a view of complex scratch vector `index` (n), 0 or 1, of `memory`."""
+    return _storage_after_vectors(memory, s, n, 1 + n_systems + 2 * index).view(np.complex128)
 
 
 @kernel(ATTEMPT)

@@ -22,8 +22,8 @@ import numpy as np
 from twoloop.kernels.control.step_size import defect_ratio, departure, store_prediction
 from twoloop.kernels.data.common import (
     ATTEMPT,
+    COMMIT,
     GAP_SLACK,
-    SETTLE,
     Attempt,
     Step,
     compiled,
@@ -88,20 +88,20 @@ def series_accelerations(memory, n):
 
 
 @inlined
-def _integer_array(options, which):
-    begin, end = int(options[N_SCALARS + which]), int(options[N_SCALARS + which + 1])
+def _integer_array(options, index):
+    begin, end = int(options[N_SCALARS + index]), int(options[N_SCALARS + index + 1])
     return options[begin:end].view(np.int64)
 
 
 @inlined
-def _floats(options, which):
-    return options[int(options[N_SCALARS + which]) : int(options[N_SCALARS + which + 1])]
+def _floats(options, index):
+    return options[int(options[N_SCALARS + index]) : int(options[N_SCALARS + index + 1])]
 
 
 @inlined
-def series_view(memory, order, n, which):
-    """Return a flat view of series number `which` (0 or 1) of q, row by row: a matrix would cost a function call."""
-    begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
+def series_view(memory, order, n, index):
+    """Return a flat view of series number `index` (0 or 1) of q, row by row: a matrix would cost a function call."""
+    begin = N_MEMORY_SCALARS + int(index) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
 
@@ -368,10 +368,10 @@ TOO_SHORT = 2.0  # error returned to reject a first step because the series allo
 
 
 @merged
-def _compute_series(f, w, options, memory, t, state, unit, which):
-    """Store series `which` about `state`, the result of the last projection, at t in `memory`; return a code."""
+def _compute_series(f, w, options, memory, t, state, unit, index):
+    """Store series `index` about `state`, the result of the last projection, at t in `memory`; return a code."""
     n = w.Q.size
-    memory[TARGET] = which
+    memory[TARGET] = index
     if f.is_generated == 1 and w.used_general == 0.0:  # generated code leaves no factors in w
         q, v, a = state[:n], state[n : 2 * n], series_accelerations(memory, n)
         code = f.general(f, w, EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
@@ -485,8 +485,8 @@ def _factor_after_large_defect(defect, order):
     return max(MIN_FACTOR, 0.9 * defect ** (-1.0 / order))
 
 
-@kernel(SETTLE)
-def settle_taylor(f, w, options, memory, tolerances, accepted):
+@kernel(COMMIT)
+def commit_taylor(f, w, options, memory, tolerances, accepted):
     """Make the series about the end of an accepted step the current one, from which the next step is computed."""
     if accepted and memory[TRIED] == 1.0:
         memory[CURRENT] = 1.0 - memory[CURRENT]
@@ -576,4 +576,4 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(DONE, max(error, distance), factor)
 
 
-TAYLOR = Step(taylor_step, settle_taylor)
+TAYLOR = Step(taylor_step, commit_taylor)

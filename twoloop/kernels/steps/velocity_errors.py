@@ -73,10 +73,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the ratio (s) of the largest velocity in `state` to the largest of the accelerations a (n_q).
-
-    The result is at most LONGEST_GAPS times tolerances[GAP].
-    """
+    """Return max|v| of `state` over max|a| of accelerations a (n_q), s, at most LONGEST_GAPS * tolerances[GAP]."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
