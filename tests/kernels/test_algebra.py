@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.problems import called, entry
-from twoloop.generate.elimination import MIN_PIVOTS, RANK_TOL, SINGULAR_MASS, START_LIMITS
+from twoloop.generate.elimination import RANK_TOL, SINGULAR_MASS, START_LIMITS
 from twoloop.kernels.lanes import layout
 from twoloop.kernels.lanes.layout import ACTIVE, LANES, N_FIELDS
 from twoloop.kernels.linalg import dense as linalg
@@ -129,18 +129,17 @@ def chosen(mass, G):
     return place, places[:n_kept], places[len(G) : len(G) + n_added], room[0]
 
 
-def least_pivot(mass, G):
-    return MIN_PIVOTS[chosen(mass, G)[0]]
-
-
-@pytest.mark.parametrize("near", [1.0, 1e-1, 1e-6])
-def test_the_least_pivot_is_the_power_of_ten_below_the_least_eigenvalue(near):
-    G = np.vstack([ROWS[:3], ROWS[0] + near * ROWS[3]])
+@pytest.mark.parametrize("near", [1.0, 1e-1, 1e-6])  # with the last, the rows are orthogonalised one by one
+@pytest.mark.parametrize("position", [3, 5])
+def test_the_bound_is_below_the_least_eigenvalue_of_rows_that_do_not_depend_on_earlier_ones(near, position):
+    G = np.vstack([ROWS[:3], ROWS[0] + near * ROWS[3], ROWS[4]])
     mass = np.diag(10.0 ** np.linspace(-1.0, 1.0, 8)) + 0.01 * np.ones((8, 8))
     S = G @ np.linalg.solve(mass, G.T)
     size = np.sqrt(np.diag(S))
-    expected = MIN_PIVOTS[int((np.linalg.eigvalsh(S / np.outer(size, size))[0] < START_LIMITS).sum())]
-    assert least_pivot(mass, G) == expected and (near == 1.0 or expected < least_pivot(mass, ROWS[:4]))
+    expected = int((np.linalg.eigvalsh(S / np.outer(size, size))[0] < START_LIMITS).sum())
+    place, kept, *_ = chosen(mass, np.insert(G, position, 0.5 * (ROWS[1] - ROWS[2]), axis=0))
+    assert place == expected and kept == [k for k in range(6) if k != position]
+    assert near == 1.0 or expected > chosen(mass, ROWS[:4])[0]
 
 
 @pytest.mark.parametrize("n_weak", [0, 1, 3])

@@ -453,9 +453,16 @@ class GeneratedCode(NamedTuple):
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
         """Return whether a run from (t0, q0) may use this code: whether it was generated for the PivotChoice there."""
         try:
-            return PivotChoice.choose(system, t0, q0) == self.shared.equations.choice
+            return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
             return False
+
+
+def _choice_at(system: ConstrainedSystem, t: float, q: Array) -> PivotChoice:
+    """Return the PivotChoice at a position, cached for the last one."""
+    choice: PivotChoice
+    choice = system.remembered_at("choice", (t, q.tobytes()), lambda: PivotChoice.choose(system, t, q))
+    return choice
 
 
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = accept_traces) -> GeneratedCode:
@@ -464,7 +471,7 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
     Raises ValueError if code for the equations cannot be generated.
     """
     try:
-        choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: PivotChoice.choose(system, t0, q0))
+        choice = _choice_at(system, t0, q0)
 
         def make(cache: TraceCache) -> SharedCode:
             return SharedCode(Elimination(system, choice, cache.equations(system)), cache)

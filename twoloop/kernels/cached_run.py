@@ -146,8 +146,10 @@ def split_steps(steps, counts, h, changes, used_newton):
 
 # codes that `start_and_advance` returns instead of a number of steps. REFUSED: rows or coordinates chosen in the
 # previous run do not suit this start. IN_DOUBT: the start may violate the constraints and needs a closer check.
-# UNUSUAL: Python must read the report, and may have to continue the run
-REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
+# UNUSUAL: Python must read the report, and may have to continue the run. UNCHOSEN: Python must choose rows
+REFUSED, IN_DOUBT, UNUSUAL, UNCHOSEN = -1, -2, -3, -4
+# checks of a start that Python has made, in this order: that it is consistent, and that the choices are the same there
+NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
 # arrays of runs from different starts: for checks of a start, the choice of rows, and the steps. Among them are
 # - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
@@ -178,7 +180,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 # indices in `constants`
 # - ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w; EQUATION_FORM: value of FORM
 # - RANK, WEAK: thresholds for `choose`; SCALE: factor s in M + s G^T G; MASS_FLAG: DEFINITE, INDEFINITE or 0
-# - HAS_ALL_ENTRIES: 1 if `rows` is nonzero wherever `kinds` is not 0; CONTRADICTS: relative tolerance of redundant rows
+# - HAS_ALL_ENTRIES: 1 if `kinds` shows all entries of `rows`; CONTRADICTS: relative tolerance of redundant rows
 # - LEAST_PIVOT: smallest pivot of an accepted start; NEAR: pivot below which Python checks the run
 # - FIRST: first step size, s, that the user has chosen, or 0; LEAST: argument `smallest` of _first_step_size
 # - LONGEST, EVALUATES_WITHIN: arguments of _set_step_limits
@@ -187,8 +189,10 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
 EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
 # indices in `expected`, the choices for which code was generated (empty without generated code). BOUND: result of
-# choose_rows. N_ROWS, N_ADDED: numbers of independent rows and of rows added to M. FIRST_ROW: index of the first row
+# choose_rows, or OF_PYTHON if no kernel makes these choices. N_ROWS, N_ADDED: numbers of independent rows and of rows
+# added to M. FIRST_ROW: index of the first row
 BOUND, N_ROWS, N_ADDED, FIRST_ROW = range(4)
+OF_PYTHON = 100
 
 
 @merged
@@ -245,34 +249,35 @@ def _evaluate_start(checked_kit, b, t, q, v, sizes, shifts):
 
 
 @merged
-def _has_all_entries(b):
-    """Return whether b.rows is nonzero exactly where b.kinds is, so that one position shows all nonzero entries."""
-    n, is_same = b.rows.shape[1], True
+def _add_known_entries(b):
+    """Set b.pattern to 1 where b.kinds shows entries of the rows."""
+    pattern = b.pattern.reshape(b.pattern.size)
     for k in range(b.kinds.size):
-        is_same = is_same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
-    return is_same
+        pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
 
 
 @merged
-def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
-    """Prepare a run from t to t1, with rows and coordinates chosen as before; return 0, REFUSED or IN_DOUBT.
+def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, checks):
+    """Prepare a run from t to t1, with rows and coordinates chosen as before; return 0, REFUSED, IN_DOUBT or UNCHOSEN.
 
-    `checked_kit` contains the callbacks that the check of the start calls. If `is_consistent`, an earlier check has
-    shown that (q, v) satisfies the constraints.
+    `checked_kit` contains the callbacks that the check of the start calls; `checks`: the last check that Python made.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
     has_all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
     flags = _evaluate_start(checked_kit, b, t, q, v, sizes, b.shifts[: 0 if has_all_entries else len(b.shifts)])
-    if has_all_entries and not _has_all_entries(b):
-        flags = _evaluate_start(checked_kit, b, t, q, v, sizes, b.shifts)
+    if has_all_entries:
+        _add_known_entries(b)
     if flags & WELL_FORMED == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
-    if flags & CONSISTENT == 0 and not is_consistent:
+    if flags & CONSISTENT == 0 and checks < STATE_CHECKED:
         return IN_DOUBT
-    if b.expected.size > 0 and not _has_same_choices(b):
-        return REFUSED
+    if b.expected.size > 0 and checks < CHOICES_CHECKED:
+        if b.expected[BOUND] == OF_PYTHON:
+            return UNCHOSEN
+        if not _has_same_choices(b):
+            return REFUSED
     _copy_vector(b.start_numbers, b.numbers)
     for j in range(b.state.size):
         b.state[j] = q[j] if j < n else v[j - n] if j < 2 * n else 0.0
@@ -376,9 +381,9 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     return n_steps if is_usual else UNUSUAL
 
 
-@kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, types.boolean), vectorized=True)
-def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consistent):
-    """Start a run from t to t1, and take the first steps; return the number of steps, REFUSED, IN_DOUBT or UNUSUAL.
+@kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, i8), vectorized=True)
+def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, checks):
+    """Start a run from t to t1, and take the first steps; return the number of steps, or one of the codes above.
 
     If a start is repeated bit for bit, the second run checks it again, and saves the data of the started run. The third
     and later runs restore these data without a check. For the arguments see _start_run and _write_report.
@@ -389,7 +394,8 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consi
         _restore_start(b)
     else:
         b.last_start[N_EQUAL] = NEVER
-        start_code = _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent or is_repeated)
+        checks = CHOICES_CHECKED if is_repeated else checks
+        start_code = _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, checks)
         if start_code != 0:
             return start_code
         if is_repeated:

@@ -120,7 +120,7 @@ class CachedIntegrator:
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, n_attempts
         checked = system if self.parametric is None else self.parametric.system
         # skips: number of coming calls that do not use the integrator, because a callback raised an exception
-        self.evaluation, self.loops, self.skips = StartEvaluation(checked), cached_run(), 0
+        self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
         # indices in `arrays.block` at which the states begin, and at which the report of a run with one state begins
@@ -178,9 +178,11 @@ class CachedIntegrator:
         clock = time.perf_counter if self.cpu_time < SHORT_RUN else time.process_time
         began = clock()
         try:
-            n = self._start_and_advance(*start, False)
+            n = self._start_and_advance(*start, loops.NOTHING_CHECKED)
             if n == loops.IN_DOUBT and is_consistent(self.evaluation.system, t0, q0, v0):
-                n = self._start_and_advance(*start, True)
+                n = self._start_and_advance(*start, loops.STATE_CHECKED)
+            if n == loops.UNCHOSEN and self._has_same_choice(t0, q0):
+                n = self._start_and_advance(*start, loops.CHOICES_CHECKED)
         except Exception as error:  # raised by a callback: `IntegrationLoop` will handle it
             if raised_by_handler(error):
                 raise
@@ -189,10 +191,13 @@ class CachedIntegrator:
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
         n_rows, timed_states = n, None  # one row for each step, unless `_finish_run` is called
-        rows_differ = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent_rows
+        rows_differ = run.rows_warning != "" and (rows := arrays.start_rows.tobytes()) != self.independent_rows
+        if rows_differ and n >= 0 and rows in self.redundancy:
+            self._use_independent_rows(rows)
+            rows_differ = False
         all_steps = output.times is None and not output.dense
         if n < 0 or rows_differ or is_due or not all_steps or parametric is not None:
-            if n in (loops.IN_DOUBT, loops.REFUSED):
+            if n in (loops.IN_DOUBT, loops.REFUSED, loops.UNCHOSEN):
                 return None
             interrupts.install_handlers()
             n_rows, n = arrays.filled.tolist()
@@ -207,6 +212,12 @@ class CachedIntegrator:
         )
         region.count_run()  # runs that `IntegrationLoop` has continued are counted by `compare_callbacks`
         return fields
+
+    def _has_same_choice(self, t0: float, q0: Array) -> bool:
+        """Return whether the choice of pivots at a start, whose M and G are in the arrays, is that of the code."""
+        system, arrays = self.evaluation.system, self.arrays
+        system.remember_at("mass and rows", (t0, q0.tobytes()), (arrays.mass.copy(), arrays.rows.copy()))
+        return self.code is not None and self.code.is_valid_from(system, t0, q0)
 
     def _finish_run(
         self,
@@ -275,10 +286,15 @@ class CachedIntegrator:
                 if new_run is None:
                     return False
                 self.redundancy[independent] = new_run.redundant, new_run.rows_warning
-            run.redundant, run.rows_warning = self.redundancy[independent]
-            self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), independent
+            self._use_independent_rows(independent)
         mass, derivatives = self.evaluation.mass, self.check_derivatives
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
+
+    def _use_independent_rows(self, rows: bytes) -> None:
+        """Describe the rows that are redundant beside these independent rows."""
+        run = self.run
+        run.redundant, run.rows_warning = self.redundancy[rows]
+        self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows
 
     def _return_to_start(self) -> None:
         """Restore the attributes of the run, other than arrays, that `IntegrationLoop` may have changed."""
@@ -415,9 +431,9 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # kernels do not measure the loss of digits: a choice that depends on it gets an index that no kernel returns
+    # kernels do not measure the loss of digits: Python makes a choice that depends on it
     of_kernels = choice.is_refined is None and len(set(choice.scales)) < 2
-    index = int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot)) if of_kernels else len(MIN_PIVOTS)
+    index = int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot)) if of_kernels else cached_run().OF_PYTHON
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
 

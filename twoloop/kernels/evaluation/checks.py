@@ -178,7 +178,8 @@ def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):
-        sum_of_terms += abs(row[j]) * max(abs(state[j]), sizes[j], min_size)
+        if row[j] != 0.0:  # most entries are zero
+            sum_of_terms += abs(row[j]) * max(abs(state[j]), sizes[j], min_size)
     return abs(value) <= tolerance * sum_of_terms
 
 
@@ -229,7 +230,8 @@ def _is_consistent(C, rate, rows, q, v, records, tolerance):
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
-            speed += rows[i, j] * v[j]
+            if rows[i, j] != 0.0:
+                speed += rows[i, j] * v[j]
         if not _is_rounding_error(speed + rate[i], rows[i], v, v, fastest, rate[i], tolerance):
             return False
         if i < C.size and not _is_rounding_error(C[i], rows[i], q, stored_sizes, rounding, 0.0, tolerance):

@@ -4,7 +4,7 @@ Constant pivots are chosen first: they need no division and do not change. Among
 those that cause the least fill-in are chosen, not the largest ones, so that nearby positions mostly have equal pivots.
 """
 
-from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel
+from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel, merged
 
 NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries of G: always zero, constant, varying
 ROWS_SEARCHED = 4  # pivot blocks are sought only in this number of rows, those with the fewest entries, to save time
@@ -21,24 +21,24 @@ CANCELLATION = 1e-12  # largest |a - b| of two constants that counts as zero, re
 
 def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
     """Return the lengths of `numbers` and `integers`, the scratch arrays of `choose_dependent_columns`."""
-    return n_rows * n + n, n_rows * n + 3 * n_rows + 2 * n
+    return n_rows * n + n, 2 * n_rows * n + 3 * n_rows + 2 * n
 
 
 @compiled
-def _find_constant_pivot(R, K, row_active, row_sizes, column_sizes):
+def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
     """Return n * row + column of the constant entry that causes the least fill-in as a pivot; -1 if there is none."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_active[i]:
             continue
         largest, size = -1.0, row_sizes[i]
-        for j in range(n):
+        for j in columns[i, :size]:
             if K[i, j] == NUMBER:
                 fill = (size - 1) * (column_sizes[j] - 1)
                 if best < 0 or fill < best_fill or (fill == best_fill and size < best_size):
                     if largest < 0.0:
                         largest = 0.0
-                        for k in range(n):
+                        for k in columns[i, :size]:
                             largest = max(largest, abs(R[i, k]))
                     if abs(R[i, j]) > MIN_CONSTANT_PIVOT * largest:
                         best, best_fill, best_size = i * n + j, fill, size
@@ -46,21 +46,24 @@ def _find_constant_pivot(R, K, row_active, row_sizes, column_sizes):
 
 
 @compiled
-def _is_pivot_block(R, column_active, squared_norms, i, k, j, l, max_squares, min_sine_square):
-    """Return whether rows i, k and columns j, l may be a pivot block; a single pivot has i == k and j == l."""
-    n, total = R.shape[1], 0.0
+def _is_pivot_block(R, block_columns, squared_norms, i, k, j, l, max_squares, min_sine_square):
+    """Return whether rows i, k and columns j, l may be a pivot block; a single pivot has i == k and j == l.
+
+    `block_columns`: columns in which rows i and k have entries.
+    """
+    total = 0.0
     if i == k:
         square = R[i, j] * R[i, j]
-        for c in range(n):
-            if column_active[c] and c != j:
+        for c in block_columns:
+            if c != j:
                 total += R[i, c] * R[i, c]
         return square > min_sine_square * squared_norms[j] and total < max_squares * square
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
     determinant = a * d - b * c
     if not determinant * determinant > min_sine_square * (a * a + c * c) * (b * b + d * d):
         return False
-    for column in range(n):
-        if column_active[column] and column != j and column != l:
+    for column in block_columns:
+        if column != j and column != l:
             x, y = R[i, column], R[k, column]
             first, second = d * x - b * y, a * y - c * x
             total += first * first + second * second
@@ -68,26 +71,31 @@ def _is_pivot_block(R, column_active, squared_norms, i, k, j, l, max_squares, mi
 
 
 @compiled
-def _find_varying_pivots(R, K, row_active, column_active, squared_norms, rows, column_sizes, block):
+def _merge_columns(columns, row_sizes, i, k, union):
+    """Store the columns in which rows i and k have entries in `union`, in ascending order; return their number."""
+    n, x, y = 0, 0, 0
+    while x < row_sizes[i] or y < row_sizes[k]:
+        j = columns[i, x] if x < row_sizes[i] else union.size
+        l = columns[k, y] if y < row_sizes[k] else union.size
+        union[n] = min(j, l)
+        n, x, y = n + 1, x + (j <= l), y + (l <= j)
+    return n
+
+
+@compiled
+def _find_varying_pivots(R, K, columns, row_active, row_sizes, column_sizes, squared_norms, rows, union, block):
     """Store the two rows and two columns of a pivot block of varying entries in `block`; return False if none is found.
 
-    A single pivot has its row and its column twice. `rows` and `column_sizes` are scratch.
+    A single pivot has its row and its column twice. `rows` and `union` are scratch.
     """
-    m, n = R.shape
     n_rows = 0
-    column_sizes[:] = 0
-    for i in range(m):  # sort the rows by their numbers of entries
+    for i in range(len(R)):  # sort the rows by their numbers of entries
         if row_active[i]:
-            row_size = 0
-            for j in range(n):
-                if column_active[j] and K[i, j] != NONE:
-                    row_size += 1
-                    column_sizes[j] += 1
             position = n_rows
-            while position > 0 and rows[m + position - 1] > row_size:
-                rows[position], rows[m + position] = rows[position - 1], rows[m + position - 1]
+            while position > 0 and row_sizes[rows[position - 1]] > row_sizes[i]:
+                rows[position] = rows[position - 1]
                 position -= 1
-            rows[position], rows[m + position] = i, row_size
+            rows[position] = i
             n_rows += 1
     n_searched = min(n_rows, ROWS_SEARCHED)
     for tier in range(len(MAX_SQUARES)):
@@ -96,84 +104,79 @@ def _find_varying_pivots(R, K, row_active, column_active, squared_norms, rows, c
             for x in range(n_searched):
                 for y in range(x + 1 if block_size == 2 else x, n_searched if block_size == 2 else x + 1):
                     i, k = rows[x], rows[y]
-                    n_columns = 0
-                    for j in range(n):
-                        if column_active[j] and (K[i, j] != NONE or K[k, j] != NONE):
-                            n_columns += 1
-                    for j in range(n):
-                        if not column_active[j] or (K[i, j] == NONE and K[k, j] == NONE):
-                            continue
-                        for l in range(j + 1 if block_size == 2 else j, n if block_size == 2 else j + 1):
-                            if not column_active[l] or (K[i, l] == NONE and K[k, l] == NONE):
-                                continue
+                    n_columns = _merge_columns(columns, row_sizes, i, k, union)
+                    for first in range(n_columns):
+                        for second in range(*((first + 1, n_columns) if block_size == 2 else (first, first + 1))):
+                            j, l = union[first], union[second]
                             fill = column_sizes[j] - (K[i, j] != NONE)
                             if block_size == 2:
                                 fill += column_sizes[l] - (K[i, l] != NONE) - (K[k, j] != NONE) - (K[k, l] != NONE)
                             fill *= n_columns - block_size
-                            if best_fill >= 0 and fill >= best_fill:
-                                continue
-                            if _is_pivot_block(
-                                R, column_active, squared_norms, i, k, j, l, MAX_SQUARES[tier], MIN_SINE_SQUARES[tier]
-                            ):
-                                best_fill = fill
-                                block[0], block[1], block[2], block[3] = i, k, j, l
+                            if best_fill < 0 or fill < best_fill:
+                                limits = MAX_SQUARES[tier], MIN_SINE_SQUARES[tier]
+                                if _is_pivot_block(R, union[:n_columns], squared_norms, i, k, j, l, *limits):
+                                    best_fill = fill
+                                    block[0], block[1], block[2], block[3] = i, k, j, l
             if best_fill >= 0:
                 return True
     return False
 
 
+@merged
+def _append_entry(K, columns, row_sizes, i, j):
+    """Append column j to the list of the columns in which row i has entries, if (i, j) is one."""
+    if K[i, j] != NONE:
+        columns[i, row_sizes[i]] = j
+        row_sizes[i] += 1
+
+
 @compiled
-def _subtract_multiple(R, K, column_active, row_sizes, column_sizes, r, j, i):
-    """Subtract from row r the multiple of row i that removes entry (r, j); entry (i, j) is 1."""
+def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
+    """Subtract from row r the multiple of row i that removes its entry in column j; entry (i, j) is 1."""
     factor, kind = R[r, j], K[r, j]
     R[r, j], K[r, j] = 0.0, NONE
-    if kind == NONE:
-        return
-    row_sizes[r] -= 1
-    for c in range(R.shape[1]):
-        if column_active[c] and K[i, c] != NONE:
-            change = factor * R[i, c]
-            remainder, had_entry = R[r, c] - change, K[r, c] != NONE
-            K[r, c] = max(K[r, c], kind, K[i, c])
-            if K[r, c] == NUMBER and abs(remainder) <= CANCELLATION * abs(change):
-                remainder, K[r, c] = 0.0, NONE
-            R[r, c] = remainder
-            n_new = (K[r, c] != NONE) - had_entry
-            row_sizes[r], column_sizes[c] = row_sizes[r] + n_new, column_sizes[c] + n_new
+    n = _merge_columns(columns, row_sizes, r, i, union)
+    for c in columns[i, : row_sizes[i]]:
+        change = factor * R[i, c]
+        remainder, had_entry = R[r, c] - change, K[r, c] != NONE
+        K[r, c] = max(K[r, c], kind, K[i, c])
+        if K[r, c] == NUMBER and abs(remainder) <= CANCELLATION * abs(change):
+            remainder, K[r, c] = 0.0, NONE
+        R[r, c] = remainder
+        column_sizes[c] += (K[r, c] != NONE) - had_entry
+    row_sizes[r] = 0
+    for c in union[:n]:
+        _append_entry(K, columns, row_sizes, r, c)
 
 
 @compiled
-def _eliminate(R, K, row_active, column_active, row_sizes, column_sizes, i, k, j, l):
-    """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate these columns.
-
-    `row_sizes` and `column_sizes`, the numbers of entries left in each row and column, are updated correctly only if
-    i == k.
-    """
-    m, n = R.shape
-    row_active[i] = row_active[k] = column_active[j] = column_active[l] = 0
-    if i == k:
-        pivot, kind = R[i, j], K[i, j]
-        for c in range(n):
-            if column_active[c] and K[i, c] != NONE:
-                R[i, c] /= pivot
-                K[i, c] = max(kind, K[i, c])
-                column_sizes[c] -= 1
-    else:
-        a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
-        has_a, has_b, has_c, has_d = K[i, j] != NONE, K[i, l] != NONE, K[k, j] != NONE, K[k, l] != NONE
-        determinant = a * d - b * c
-        for column in range(n):
-            if column_active[column]:
-                x, y = R[i, column], R[k, column]
-                has_x, has_y = K[i, column] != NONE, K[k, column] != NONE
-                R[i, column], R[k, column] = (d * x - b * y) / determinant, (a * y - c * x) / determinant
-                K[i, column] = VARIES if (has_d and has_x) or (has_b and has_y) else NONE
-                K[k, column] = VARIES if (has_a and has_y) or (has_c and has_x) else NONE
-    for r in range(m):
-        if row_active[r]:
-            _subtract_multiple(R, K, column_active, row_sizes, column_sizes, r, j, i)
-            if i != k:
-                _subtract_multiple(R, K, column_active, row_sizes, column_sizes, r, l, k)
+def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
+    """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate these columns."""
+    row_active[i] = row_active[k] = 0
+    n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
+    a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
+    has_a, has_b, has_c, has_d = K[i, j] != NONE, K[i, l] != NONE, K[k, j] != NONE, K[k, l] != NONE
+    kind, determinant = K[i, j], a * d - b * c
+    row_sizes[i] = row_sizes[k] = 0
+    for column in union[:n]:
+        x, y = R[i, column], R[k, column]
+        has_x, has_y = K[i, column] != NONE, K[k, column] != NONE
+        column_sizes[column] -= 1 if is_single else has_x + has_y
+        if column in (j, l):
+            continue
+        if is_single:
+            R[i, column], K[i, column] = x / a, max(kind, K[i, column])
+        else:
+            R[i, column], R[k, column] = (d * x - b * y) / determinant, (a * y - c * x) / determinant
+            K[i, column] = VARIES if (has_d and has_x) or (has_b and has_y) else NONE
+            K[k, column] = VARIES if (has_a and has_y) or (has_c and has_x) else NONE
+            _append_entry(K, columns, row_sizes, k, column)
+        _append_entry(K, columns, row_sizes, i, column)
+    for r in range(len(R)):
+        if row_active[r] and K[r, j] != NONE:
+            _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i)
+        if row_active[r] and K[r, l] != NONE:
+            _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, l, k)
 
 
 @kernel(i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
@@ -187,36 +190,33 @@ def choose_dependent_columns(G, kinds, rows, n_kept, numbers, integers, out):
     n = G.shape[1]
     if n_kept > n:
         return 0
-    R, K = numbers[: n_kept * n].reshape((n_kept, n)), integers[: n_kept * n].reshape((n_kept, n))
     end = n_kept * n
-    squared_norms = numbers[end : end + n]
+    R, squared_norms = numbers[:end].reshape((n_kept, n)), numbers[end : end + n]
+    K, columns = integers[:end].reshape((n_kept, n)), integers[end : 2 * end].reshape((n_kept, n))
+    end *= 2
+    row_active, row_sizes = integers[end : end + n_kept], integers[end + n_kept : end + 2 * n_kept]
+    row_scratch, end = integers[end + 2 * n_kept : end + 3 * n_kept], end + 3 * n_kept
+    column_sizes, union = integers[end : end + n], integers[end + n : end + 2 * n]
     squared_norms[:] = 0.0
-    row_active, row_scratch = integers[end : end + n_kept], integers[end + n_kept : end + 3 * n_kept]
-    row_sizes, end = row_scratch[:n_kept], end + 3 * n_kept
-    column_active, column_sizes = integers[end : end + n], integers[end + n : end + 2 * n]
-    column_active[:] = 1
     column_sizes[:] = 0
     for i in range(n_kept):
         row_active[i], row_sizes[i] = 1, 0
         for j in range(n):
             R[i, j], K[i, j] = G[rows[i], j], kinds[rows[i] * n + j]
             squared_norms[j] += R[i, j] * R[i, j]
-            is_entry = K[i, j] != NONE
-            row_sizes[i], column_sizes[j] = row_sizes[i] + is_entry, column_sizes[j] + is_entry
-    n_active, n_blocks = n_kept, 0
+            column_sizes[j] += K[i, j] != NONE
+            _append_entry(K, columns, row_sizes, i, j)
+    n_active, n_blocks, index = n_kept, 0, 0
     while n_active > 0:
         block = out[4 * n_blocks : 4 * n_blocks + 4]
-        index = _find_constant_pivot(R, K, row_active, row_sizes, column_sizes)
-        if index < 0:
-            break
-        block[0] = block[1] = index // n
-        block[2] = block[3] = index % n
-        _eliminate(R, K, row_active, column_active, row_sizes, column_sizes, block[0], block[1], block[2], block[3])
-        n_active, n_blocks = n_active - 1, n_blocks + 1
-    while n_active > 0:
-        block = out[4 * n_blocks : 4 * n_blocks + 4]
-        if not _find_varying_pivots(R, K, row_active, column_active, squared_norms, row_scratch, column_sizes, block):
+        index = -1 if index < 0 else _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes)
+        if index >= 0:
+            block[0] = block[1] = index // n
+            block[2] = block[3] = index % n
+        elif not _find_varying_pivots(
+            R, K, columns, row_active, row_sizes, column_sizes, squared_norms, row_scratch, union, block
+        ):
             return 0
-        _eliminate(R, K, row_active, column_active, row_sizes, column_sizes, block[0], block[1], block[2], block[3])
+        _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, block[0], block[1], block[2], block[3])
         n_active, n_blocks = n_active - (1 if block[0] == block[1] else 2), n_blocks + 1
     return n_blocks

@@ -5,7 +5,7 @@ import math
 from numba import types
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
-from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl_solve_rows
+from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ldl_solve, ldl_solve_rows
 
 # rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
@@ -147,10 +147,10 @@ def singular_values_exceed(rows, ratio, gram):
 BOUND_ROUNDING = 1e-12  # largest amount, relative to a bound of pivots, by which rounding may put a pivot below it
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
-# smallest ratio of the smallest to the largest eigenvalue of M at which pivots above a bound show that all rows are
-# independent and that no row must be added to M. Bounds are at least 1e-5, so that the part of a row that is orthogonal
-# to the other rows is then at least 1e-6 of the row; 1e-9 is enough
-SIMILAR_EIGENVALUES = 1e-7
+# smallest ratio of the smallest to the largest eigenvalue of M at which the pivots of S = G M^-1 G^T decide which rows
+# are independent, and no row must be added to M. A pivot above INDEPENDENT shows that the part of the row that is
+# orthogonal to the rows before it is at least 3e-9 of the row; for a dependent row, this part must be at most DEPENDENT
+SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # largest coefficient of an independent row in a redundant one, both scaled to norm 1: above it the two rows are
 # exchanged. If the coefficient passes through zero during the motion, the independent rows become dependent, as at each
 # dead centre of the slider-crank with two rods; hence redundant rows with large coefficients become independent ones.
@@ -164,7 +164,7 @@ TIE_RATIO = 1.01
 def workspace_size(n_rows: int, n: int) -> int:
     """Return the number of floats that the argument `workspace` of `choose_rows` must have."""
     n_max = min(n_rows, n) + 1
-    return n_max * (n + n_max) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
+    return n_max * (n + n_max) + 2 * n * n + n_rows * (n + 3 * n_rows + 1) + n
 
 
 @merged
@@ -218,13 +218,7 @@ def _has_similar_eigenvalues(mass):
 @merged
 def _scale_of_added_rows(mass, G):
     """Return the power of two s for which the largest entries of s G^T G and M are about equal."""
-    largest, largest_of_rows = 0.0, 0.0
-    for i in range(len(mass)):
-        for j in range(len(mass)):
-            largest = max(largest, abs(mass[i, j]))
-    for i in range(len(G)):
-        for j in range(len(mass)):
-            largest_of_rows = max(largest_of_rows, abs(G[i, j]))
+    largest, largest_of_rows = largest_of(mass.reshape(mass.size)), largest_of(G.reshape(G.size))
     return 2.0 ** math.floor(math.log2(largest / (largest_of_rows * largest_of_rows)) + 0.5)
 
 
@@ -283,79 +277,171 @@ def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
     return n_added
 
 
+@merged
+def _list_rows(is_kept, kept):
+    n_kept = 0
+    for k in range(len(is_kept)):
+        if is_kept[k] == 1:
+            kept[n_kept] = k
+            n_kept += 1
+    return n_kept
+
+
 @compiled
-def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_kept):
+def _exchange_rows(C, is_kept, kept):
     """Exchange independent rows with redundant rows in which their coefficients exceed MAX_COEFFICIENT.
 
-    Each exchange multiplies the volume that the independent rows span by the coefficient. Updates `basis`, `factors`
-    and `kept`, results of `select_rows`; `order`, `coefficients` (n_rows) and `rows_kept` (n, n) are scratch.
+    C[i, k] is the coefficient of the independent row k in the redundant row i, all rows scaled to norm 1; `is_kept` is
+    1 for independent rows. Each exchange multiplies the volume that the independent rows span by the coefficient.
+    Stores the indices of the independent rows in `kept`, and returns their number.
     """
-    for _ in range(2 * (len(G) - n_kept)):
-        largest, leaving, entering, position = MAX_COEFFICIENT, -1, -1, 0
-        for i in range(len(G)):
-            if position < n_kept and kept[position] == i:
-                position += 1
+    n = len(C)
+    n_kept = _list_rows(is_kept, kept)
+    for _ in range(2 * (n - n_kept)):
+        largest, leaving, entering = MAX_COEFFICIENT, -1, -1
+        for i in range(n):
+            if is_kept[i] == 1:
                 continue
-            _fill_coefficients(n_kept, basis, factors, G[i], coefficients)
-            row_square = _dot(G[i], G[i])
-            for k in range(n_kept):
-                kept_square = _dot(G[kept[k]], G[kept[k]])
-                coefficient = abs(coefficients[k]) * math.sqrt(kept_square / max(row_square, TINY))
+            for k in range(n):
+                coefficient = abs(C[i, k]) if is_kept[k] == 1 else 0.0
                 if coefficient > largest and (leaving < 0 or coefficient > TIE_RATIO * largest):
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
-            return
-        k = leaving  # shift the indices between `leaving` and `entering`, so that `kept` stays sorted
-        while k + 1 < n_kept and kept[k + 1] < entering:
-            kept[k] = kept[k + 1]
-            k += 1
-        while k > 0 and kept[k - 1] > entering:
-            kept[k] = kept[k - 1]
-            k -= 1
-        kept[k] = entering
-        for i in range(n_kept):
-            for j in range(G.shape[1]):
-                rows_kept[i, j] = G[kept[i], j]
-        select_rows(rows_kept[:n_kept], 0.0, basis, factors, order)
+            break
+        # solve the equation of the entering row for the leaving row, and insert it into the other redundant rows
+        inverse = 1.0 / C[entering, leaving]
+        is_kept[leaving], is_kept[entering] = 0, 1
+        for k in range(n):
+            C[leaving, k] = -inverse * C[entering, k]
+        C[leaving, entering] = inverse
+        for i in range(n):
+            if is_kept[i] == 0 and i != leaving:
+                factor = C[i, leaving]
+                C[i, entering] = 0.0
+                for k in range(n):
+                    C[i, k] += factor * C[leaving, k]
+    return _list_rows(is_kept, kept)
 
 
-@merged
-def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scratch, S_scratch, sizes):
-    """Return the index of the first entry of `bounds` below all pivots of the rows `kept`; bounds.size if none is.
+@compiled
+def _fill_scaled_products(mass, G, factors, solved, S, sizes):
+    """Store the upper triangle of S = G M^-1 G^T, scaled to a diagonal of 1, in S; return whether M is definite.
 
-    Pivots are relative to the diagonal entries of S = G M^-1 G^T. No pivot is below the smallest eigenvalue of S scaled
-    to a diagonal of 1, and this eigenvalue exceeds a bound b if the scaled S - b I is positive definite. Returns
-    NOT_DEFINITE if M is not positive definite.
+    `sizes` receives the factors that scale the rows; 0 for a row of zeros. `factors` and `solved` are scratch.
     """
+    n_rows, n = G.shape
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
-        return NOT_DEFINITE
-    solved = solved_scratch[: len(mass) * n_rows].reshape((len(mass), n_rows))
-    S = S_scratch[: 2 * n_rows * n_rows].reshape((2 * n_rows, n_rows))
-    for k in range(n_rows):
-        for i in range(len(mass)):
-            solved[i, k] = G[kept[k], i]
+        return False
+    for i in range(n):
+        for k in range(n_rows):
+            solved[i, k] = G[k, i]
     ldl_solve_rows(factors, solved)
     for i in range(n_rows):
-        for k in range(n_rows):
+        for k in range(i, n_rows):
             S[i, k] = 0.0
-        for j in range(len(mass)):
-            if G[kept[i], j] != 0.0:
-                for k in range(n_rows):
-                    S[i, k] += G[kept[i], j] * solved[j, k]
-        sizes[i] = 1.0 / math.sqrt(S[i, i])
+        for j in range(n):
+            if G[i, j] != 0.0:
+                for k in range(i, n_rows):
+                    S[i, k] += G[i, j] * solved[j, k]
+        sizes[i] = 1.0 / math.sqrt(S[i, i]) if S[i, i] > 0.0 else 0.0
     for i in range(n_rows):
         for k in range(i, n_rows):
             S[i, k] *= sizes[i] * sizes[k]
-    shifted = S[n_rows:]
-    for index in range(bounds.size):
+    return True
+
+
+@compiled
+def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
+    """Set `is_kept` to 0 for each row that depends on the rows before it, else to 1; return whether there is no doubt.
+
+    For S and `sizes` see `_fill_scaled_products`. C[i, k] receives the coefficient of row k in a dependent row i, both
+    scaled to norm 1. U and `remainder` are scratch.
+    """
+    n_rows = len(S)
+    for i in range(n_rows):
+        for k in range(i, n_rows):
+            U[i, k] = S[i, k]
+    for k in range(n_rows):
+        is_kept[k] = 1 if U[k, k] > INDEPENDENT else 0
+        if is_kept[k] == 1:
+            U[k, k] = 1.0 / U[k, k]
+            for i in range(k + 1, n_rows):
+                if U[k, i] != 0.0:
+                    factor = U[k, i] * U[k, k]
+                    for j in range(i, n_rows):
+                        U[i, j] -= factor * U[k, j]
+            continue
+        for j in range(remainder.size):
+            remainder[j] = G[k, j] * sizes[k]
+        norm = math.sqrt(_dot(remainder, remainder))
         for i in range(n_rows):
-            for k in range(i, n_rows):  # only the upper triangle of `shifted` is used
-                shifted[i, k] = S[i, k]
-            shifted[i, i] -= bounds[index] * (1.0 - BOUND_ROUNDING)
-        if ldl_factor(shifted):
-            return index
+            C[k, i] = 0.0
+        for i in range(k - 1, -1, -1):
+            if is_kept[i] == 1:
+                coefficient = U[i, k]
+                for j in range(i + 1, k):
+                    coefficient -= U[i, j] * C[k, j]
+                C[k, i] = coefficient = coefficient * U[i, i]
+                if coefficient != 0.0:
+                    for j in range(remainder.size):
+                        remainder[j] -= coefficient * sizes[i] * G[i, j]
+        if not math.sqrt(_dot(remainder, remainder)) <= DEPENDENT * norm:
+            return False
+        for i in range(k):
+            if C[k, i] != 0.0:
+                C[k, i] *= sizes[i] * math.sqrt(_dot(G[i], G[i])) / norm
+    return True
+
+
+@merged
+def _fill_shifted(S, kept, shift, shifted):
+    for i in range(len(shifted)):
+        for k in range(i, len(shifted)):  # only the upper triangle of `shifted` is used
+            shifted[i, k] = S[kept[i], kept[k]]
+        shifted[i, i] -= shift
+
+
+@compiled
+def _first_bound_below_pivots(S, kept, n_kept, bounds, scratch):
+    """Return the index of the first entry of `bounds` below all pivots of the rows `kept`; bounds.size if none is.
+
+    Pivots are relative to the diagonal entries of G M^-1 G^T. No pivot is below the smallest eigenvalue of S, which is
+    scaled to a diagonal of 1, and this eigenvalue exceeds a bound b if S - b I is positive definite. It is at most the
+    smallest pivot of S: larger bounds need no test.
+    """
+    shifted, largest_inverse = scratch[: n_kept * n_kept].reshape((n_kept, n_kept)), 0.0
+    _fill_shifted(S, kept, 0.0, shifted)
+    if not ldl_factor(shifted):
+        return bounds.size
+    for k in range(n_kept):
+        largest_inverse = max(largest_inverse, shifted[k, k])
+    for index in range(bounds.size):
+        shift = bounds[index] * (1.0 - BOUND_ROUNDING)
+        if shift * largest_inverse < 1.0:
+            _fill_shifted(S, kept, shift, shifted)
+            if ldl_factor(shifted):
+                return index
     return bounds.size
+
+
+@merged
+def _select_dependent_rows(G, min_sine, basis, factors, coefficients, C, kept, is_kept):
+    """Set `is_kept` to 1 for the rows of G that `select_rows` selects, else to 0; store C as in `_find_dependent_rows`.
+
+    The other arguments are scratch.
+    """
+    n_kept = select_rows(G, min_sine, basis, factors, kept)
+    for k in range(len(G)):
+        is_kept[k] = 0
+    for k in range(n_kept):
+        is_kept[kept[k]] = 1
+    for i in range(len(G)):
+        if is_kept[i] == 0:
+            _fill_coefficients(n_kept, basis, factors, G[i], coefficients)
+            row_square = max(_dot(G[i], G[i]), TINY)
+            for k in range(n_kept):
+                C[i, kept[k]] = coefficients[k] * math.sqrt(_dot(G[kept[k]], G[kept[k]]) / row_square)
 
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
@@ -373,29 +459,34 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
     kept, added, order = chosen[2 : 2 + n_rows], chosen[2 + n_rows : 2 + 2 * n_rows], chosen[2 + 2 * n_rows :]
     end = n_max * n
     basis, factors = workspace[:end].reshape((n_max, n)), workspace[end : end + n_max * n_max].reshape((n_max, n_max))
-    mass, end = workspace[end : end + n * n].reshape((n, n)), end + n * n
-    A, end = workspace[end : end + n * n].reshape((n, n)), end + n * n
-    x, end = workspace[end : end + n], end + n
-    sizes, end = workspace[end : end + n_rows], end + n_rows
-    solved, S = workspace[end : end + n * n_rows], workspace[end + n * n_rows :]
-    if n_rows <= n and _has_similar_eigenvalues(original_mass):
-        for k in range(n_rows):
-            kept[k] = k
-        first_bound = _first_bound_below_pivots(original_mass, G, kept, n_rows, bounds, A, solved, S, sizes)
-        if 0 <= first_bound < bounds.size:  # all rows are independent, and M is invertible
-            chosen[0], chosen[1], workspace[0] = n_rows, 0, 1.0
+    end += n_max * n_max
+    mass, A = workspace[end : end + n * n].reshape((n, n)), workspace[end + n * n : end + 2 * n * n].reshape((n, n))
+    end += 2 * n * n
+    x, sizes, end = workspace[end : end + n], workspace[end + n : end + n + n_rows], end + n + n_rows
+    solved, end = workspace[end : end + n * n_rows].reshape((n, n_rows)), end + n * n_rows
+    scratch = workspace[end : end + n_rows * n_rows]
+    matrices = workspace[end : end + 3 * n_rows * n_rows].reshape((3 * n_rows, n_rows))
+    U, S, C = matrices[:n_rows], matrices[n_rows : 2 * n_rows], matrices[2 * n_rows :]
+    chosen[1], workspace[0] = 0, 1.0
+    is_definite = _has_similar_eigenvalues(original_mass) and _fill_scaled_products(
+        original_mass, G, A, solved, S, sizes
+    )
+    if is_definite and _find_dependent_rows(S, G, sizes, U, C, x, order):
+        chosen[0] = n_kept = _exchange_rows(C, order, kept)
+        first_bound = _first_bound_below_pivots(S, kept, n_kept, bounds, scratch)
+        if first_bound < bounds.size:  # the chosen rows are independent beyond doubt
             return first_bound
-    n_kept = select_rows(G, min_sine, basis, factors, kept)
-    if n_kept < n_rows:
-        _exchange_rows(G, n_kept, basis, factors, kept, order, sizes, A)
+    _select_dependent_rows(G, min_sine, basis, factors, sizes, C, kept, order)
+    chosen[0] = n_kept = _exchange_rows(C, order, kept)
     copy_matrix(original_mass, mass)
     n_added, scale = 0, 1.0
     if n_kept > 0 and weak_ratio > 0.0 and _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
         scale = _scale_of_added_rows(mass, G)
         _sort_rows_by_entries(G, order, sizes)
         n_added = _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added)
-    chosen[0], chosen[1], first_bound = n_kept, max(n_added, 0), n_added
-    if n_added >= 0:
-        first_bound = _first_bound_below_pivots(mass, G, kept, n_kept, bounds, A, solved, S, sizes)
-    workspace[0] = scale
-    return first_bound
+    chosen[1], workspace[0] = max(n_added, 0), scale
+    if n_added < 0:
+        return n_added
+    if not _fill_scaled_products(mass, G, A, solved, S, sizes):
+        return NOT_DEFINITE
+    return _first_bound_below_pivots(S, kept, n_kept, bounds, scratch)
