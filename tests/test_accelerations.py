@@ -15,6 +15,7 @@ from tests.marks import slow
 from tests.problems import assert_same, quick, worst
 from twoloop import mechanisms, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.generate import compile_equations
 from twoloop.generate.compile_equations import generated_code, write_accelerations, write_function
 from twoloop.generate.elimination import Elimination, PivotChoice
 from twoloop.generate.lane_series import LaneEmitter
@@ -39,8 +40,8 @@ def function_of(module, name, *kinds):
     return lambda *given, made=made: function(*(x if isinstance(x, float) else x.ctypes.data for x in given))
 
 
-def on_arrays(address):
-    return ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_double, *[ctypes.c_void_p] * 4)(address)
+def on_arrays(address, n_arrays=4):
+    return ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_double, *[ctypes.c_void_p] * n_arrays)(address)
 
 
 class Code:
@@ -271,14 +272,34 @@ def test_little_inertia_on_long_bars(inertia):
     assert result.success and np.abs(result.a[5]).max() < 1e-9 and result.stats.n_rejected_error < 10
 
 
+def rescale(problem, power, is_refined, monkeypatch):
+    """Make code with other scales of the rows added to M, which cost digits that no pivot shows."""
+    choice = PivotChoice.choose(problem.system, 0.0, problem.q0)
+    changed = replace(choice, scales=tuple(2.0**power * scale for scale in choice.scales), is_refined=is_refined)
+    monkeypatch.setattr(PivotChoice, "choose", lambda *position: changed)
+
+
 def test_digits_that_a_projection_loses_are_found(monkeypatch):
     """Accelerations alone are right there: they take other pivots."""
     problem = mechanisms.spatial_slider_crank()
-    choice = PivotChoice.choose(problem.system, 0.0, problem.q0)
-    changed = replace(choice, scales=tuple(2.0**45 * scale for scale in choice.scales), is_refined=None)
-    monkeypatch.setattr(PivotChoice, "choose", lambda *position: changed)
+    rescale(problem, 45, False, monkeypatch)
     with pytest.raises(ValueError, match="loses the digits of little inertia"):
         generated_code(problem.system, 0.0, problem.q0)
+
+
+@pytest.mark.parametrize("longest", [0, np.inf], ids=["in parts", "in one"])
+@pytest.mark.parametrize(("power", "holds"), [(9, True), (24, False)])
+def test_results_that_refinement_changes_much_are_invalid(power, holds, longest, monkeypatch):
+    problem = mechanisms.spatial_four_bar()
+    system, n = problem.system, problem.system.n_q
+    rescale(problem, power, True, monkeypatch)
+    for name, value in (("LARGEST_LOSS", np.inf), ("SPLIT_PROJECTIONS", longest), ("SPLIT_ALL", longest)):
+        monkeypatch.setattr(compile_equations, name, value)
+    code = generated_code(system, 0.0, problem.q0)
+    project = on_arrays(code.shared.functions.addresses["own_project"], 8)
+    a, moved, q, v, lam = (np.zeros(size) for size in (n, n, n, n, system.n_c))
+    given = problem.q0.copy(), np.linspace(0.5, 1.5, n), code.numbers
+    assert project(0.0, *(x.ctypes.data for x in (*given, a, moved, q, v, lam))) == holds
 
 
 @pytest.mark.parametrize("position", [(3.0, 1.5, -1.0), (0.0, 0.0, 0.0)])

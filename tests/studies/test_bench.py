@@ -176,16 +176,17 @@ def test_a_limit_is_one_whatever_a_foreign_library_makes_of_it(kept, made):
     assert got["status"] == "TIME_LIMIT" and "0.05 s" in got["message"] and got["error_q"] is None
 
 
-def test_what_is_built_for_a_time_span_is_built_by_the_warm_up(kept):
-    ends = []
+@pytest.mark.parametrize(("builds_span", "warm_up"), [(True, (T_END, 7.0)), (False, (1e-3 * T_END, bench.COMPILING))])
+def test_the_warm_up_builds_the_time_span_or_may_take_longer_than_a_run(kept, builds_span, warm_up):
+    calls = []
 
     def run(case, value, repeat):
-        ends.append((case.t_end, case.time_limit))
+        calls.append((case.t_end, case.time_limit))
         return ours(case, value, repeat)
 
     with kept:
-        collect([Run(case(time_limit=7.0), solver(run, builds_span=True), 1e-6, repeats=1)], kept)
-    assert ends == [(T_END, 7.0)] * 2
+        collect([Run(case(time_limit=7.0), solver(run, builds_span=builds_span), 1e-6, repeats=1)], kept)
+    assert calls == [warm_up, (T_END, 7.0)]
 
 
 def test_the_time_limit_sets_no_timer_of_cpu_time(kept):
@@ -197,17 +198,6 @@ def test_the_time_limit_sets_no_timer_of_cpu_time(kept):
 
     assert row(kept, run, case(time_limit=60.0))["status"] == "REACHED_END"
     assert set_ == [[False, True]] * 2 and signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
-
-
-def test_the_warm_up_may_take_longer_than_a_run(kept):
-    limits = []
-
-    def run(case, value, repeat):
-        limits.append(case.time_limit)
-        return ours(case, value, repeat)
-
-    assert row(kept, run, case(time_limit=7.0))["status"] == "REACHED_END"
-    assert limits == [bench.COMPILING, 7.0]  # the first call compiles
 
 
 def test_a_failed_run_keeps_what_it_had(kept):

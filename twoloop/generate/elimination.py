@@ -30,7 +30,6 @@ from twoloop.generate.null_space import (
     DependentCoordinates,
     Factors,
     ReductionFailed,
-    loses_digits,
     solve,
     solve_reduced_system,
     solve_refined,
@@ -80,8 +79,7 @@ class PivotChoice:
     min_pivot : smallest allowed pivot of a row of G, relative to its pivot without the other rows; a power of ten.
     blocks : pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which
         these rows are solved. Empty if expressing dependent coordinates saves no operations, or no pivots are suitable.
-    is_refined : whether solutions are improved by one step of refinement. None: no, because pivots are so large that no
-        digits are lost.
+    is_refined : whether solutions are improved by one step of refinement, because pivots may lose digits.
     """
 
     rows: tuple[int, ...]
@@ -89,7 +87,7 @@ class PivotChoice:
     scales: tuple[float, ...]
     min_pivot: float
     blocks: PivotBlocks = ()
-    is_refined: bool | None = None
+    is_refined: bool = False
 
     @classmethod
     def choose(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
@@ -99,10 +97,9 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # no test with larger pivots, as random models then kept 10 digits, or with added rows, which set `is_refined`
-        is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or len(set(choice.scales)) > 1
-        if choice.rows and is_uncertain and choice.is_refined is None:
-            choice = replace(choice, is_refined=loses_digits(mass, G, choice))
+        # with larger pivots, and one scale of added rows, random models kept 9 digits
+        is_refined = bool(choice.rows) and (choice.min_pivot <= MIN_PIVOTS[-1] or len(set(choice.scales)) > 1)
+        choice = replace(choice, is_refined=choice.is_refined or is_refined)
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
 
@@ -367,8 +364,11 @@ class Elimination:
                     matrix[n + k, i] = matrix[i, n + k] = row[i]
         return matrix
 
-    def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> list[Affine]:
-        """Return a and lam of the independent rows for M a + G^T lam = r, G a = c; `c`: one entry for each row of G."""
+    def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
+        """Return a and lam of the independent rows for M a + G^T lam = r, G a = c, and conditions, see `solve_refined`.
+
+        `c`: one entry for each row of G.
+        """
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -381,9 +381,9 @@ class Elimination:
     @cached_property
     def mass_first_program(self) -> Program:
         """Return the program for the accelerations by an elimination that begins with M."""
-        solution = self._accelerations(self.v)
+        solution, conditions = self._accelerations(self.v)
         self._check_length()
-        return Program(self.graph, {"a": solution[: self.system.n_q]}, self.conditions)
+        return Program(self.graph, {"a": solution[: self.system.n_q]}, [*self.conditions, *conditions])
 
     @cached_property
     def reduced_program(self) -> Program | None:
@@ -418,8 +418,8 @@ class Elimination:
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
-    def _accelerations(self, v: Sequence[Affine]) -> list[Affine]:
-        """Return a list of the accelerations and the multipliers of the independent rows, at velocities v."""
+    def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
+        """Return the accelerations and the multipliers of the independent rows, at velocities v, and conditions."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
@@ -460,19 +460,19 @@ class Elimination:
         independent = [arrays["lam"][k] for k in self.choice.rows]
         lam = multipliers_of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
         self._check_length()
-        return Program(self.graph, {**arrays, "lam": lam}, self.conditions)
+        return Program(self.graph, {**arrays, "lam": lam}, self.basic_projection.conditions)
 
     @cached_property
     def basic_projection(self) -> Program:
         """Return the program for projected "q" and "v", and "a" and "lam" at this v; "lam" is 0 for dependent rows."""
         n, position = self.system.n_q, self.position_projection.arrays
         v = [(u + change).as_term() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
-        solution = self._accelerations(v)
+        solution, conditions = self._accelerations(v)
         self._check_length()
         return Program(
             self.graph,
             {"a": solution[:n], **position, "v": v, "lam": self._expand_to_all_rows(solution[n:])},
-            self.conditions,
+            [*self.conditions, *conditions],
         )
 
     def _correction(self, c: Program) -> list[Affine]:
@@ -574,10 +574,10 @@ class Solution:
 
     def _make_solution_program(self) -> Program:
         lam = [self._zero] * len(self._c)
-        solution = solve_refined(self._solve, self._choice, self._mass, self._rows, self._r, self._c)
+        solution, conditions = solve_refined(self._solve, self._choice, self._mass, self._rows, self._r, self._c)
         for k, value in zip(self._choice.rows, solution[self._n :], strict=True):
             lam[k] = value
-        return Program(self.graph, {"a": solution[: self._n], "lam": lam})
+        return Program(self.graph, {"a": solution[: self._n], "lam": lam}, conditions)
 
     @cached_property
     def least_norm_program(self) -> Program:

@@ -431,9 +431,8 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # kernels do not measure the loss of digits: Python makes a choice that depends on it
-    of_kernels = choice.is_refined is None and len(set(choice.scales)) < 2
-    index = int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot)) if of_kernels else cached_run().OF_PYTHON
+    # kernels do not compare rows added to M: Python makes a choice that may depend on this
+    index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
 
