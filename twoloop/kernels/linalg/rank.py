@@ -159,6 +159,8 @@ MAX_COEFFICIENT = 1.5
 # two coefficients are tied, and the first row decides, up to this ratio: in symmetrical mechanisms many are equal,
 # and rounding would decide among them, at each start anew
 TIE_RATIO = 1.01
+# largest entry of a row, relative to its largest entry, that counts as zero: rounding of a start leaves such entries
+ZERO_ENTRY = 1e-12
 
 
 def workspace_size(n_rows: int, n: int) -> int:
@@ -226,9 +228,9 @@ def _scale_of_added_rows(mass, G):
 def _sort_rows_by_entries(G, order, counts):
     """Store in `order` the indices of the rows of G, sorted by number of entries, and in `counts` these numbers."""
     for k in range(len(G)):
-        count, i = 0.0, k
+        count, i, zero = 0.0, k, ZERO_ENTRY * largest_of(G[k])
         for j in range(G.shape[1]):
-            count += G[k, j] != 0.0
+            count += abs(G[k, j]) > zero
         while i > 0 and counts[i - 1] > count:
             counts[i], order[i] = counts[i - 1], order[i - 1]
             i -= 1
