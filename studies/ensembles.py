@@ -304,7 +304,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     lines = [line | {"case": each["case"]} for each in found["cases"] for line in each["at"]]
     ratios = [line["ratio"] for line in lines if line["ratio"] is not None]
     found["ratios"] = [min(ratios), max(ratios)] if ratios else None
-    found["compared"], found["ahead"] = len(ratios), sum(line["verdict"] == "ahead" for line in lines)
+    verdicts = [line["verdict"] for line in lines if line["verdict"] not in ("alone", "none")]
+    found["compared"], found["ahead"] = len(verdicts), verdicts.count("ahead")
     kept = ("case", "error", "ratio", "solver")
     found["not_ahead"] = [{name: line[name] for name in kept} for line in lines if (line["ratio"] or 2.0) <= 1.0]
     found["refused"] = rows.reindex(columns=["way", "case", "message"]).dropna().to_dict("records")

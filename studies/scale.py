@@ -317,7 +317,7 @@ def _growth(found: dict[str, Any]) -> str:
 def _answer(found: dict[str, Any]) -> str:
     text, largest = _growth(found), found["chains"][-1] if found["chains"] else {"fastest": {}}
     if best := largest["fastest"].get(power(COMPARED)):
-        text += f"; on {largest['n']} bodies the fastest other solver takes {number(best['ratio'])} times as long"
+        text += f"; on {largest['n']} bodies {_short(best['solver'])} takes {number(best['ratio'])} times as long"
         text += f" ({power(COMPARED)})"
     return f"{text}."
 

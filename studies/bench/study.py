@@ -142,7 +142,7 @@ class Study:
 
 REPORTS = {  # and their questions, in the order of the index
     "engines": "On closed loops, is twoloop faster than physics engines?",
-    "validation": "Do the methods reproduce published mechanisms?",
+    "validation": "Are the methods right on published and textbook mechanisms?",
     "honesty": "How often is a solver wrong without saying so?",
     "table3": "Does the paper's Table 3 come out again?",
     "claims": "Which of the paper's claims hold?",

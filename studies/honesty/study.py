@@ -183,7 +183,7 @@ TABLE: dict[str, tuple[str, Callable[[pd.DataFrame], pd.Series]]] = {  # kinds o
     "linkages": ("random four-bar linkages", _of(traps.LINKAGE)),
     "mistakes": ("mistakes and hard motions", _of(traps.MISTAKE)),
     "input": ("inconsistent start, wrong derivative", _of(traps.INPUT)),
-    "published": ("published mechanisms", _of(PUBLISHED)),
+    "published": ("published and textbook mechanisms", _of(PUBLISHED)),
     "authors": ("benchmark authors' own conditions", _of(AUTHORS)),
 }
 

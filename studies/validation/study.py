@@ -1,4 +1,4 @@
-"""Published mechanisms: which solver is right, to how many digits, on which of them."""
+"""Published and textbook mechanisms: which solver is right, to how many digits, on which of them."""
 
 import warnings
 from collections.abc import Callable

@@ -49,7 +49,7 @@ def test_powers_and_ratios_follow_the_rows():
     assert kind["slope"] == pytest.approx(1.0) and not kind["bends"] and "|200|1.00|" in text
     assert chain["fastest"]["1e-4"] == {"solver": EXUDYN, "ratio": pytest.approx(50.0)}
     assert chain["call_s"][scale.DEFAULT]["1e-4"] == pytest.approx(0.1, rel=1e-2)
-    assert found["answer"].endswith("power 1.00; on 20 bodies the fastest other solver takes 50 times as long (1e-4).")
+    assert found["answer"].endswith("power 1.00; on 20 bodies Exudyn takes 50 times as long (1e-4).")
     assert f"**Answer**: {found['answer']}" in text and "With 20 bodies" not in text
     found, text = said(evaluations(2.0), chains(ours=1.0, exudyn=0.5))
     assert found["kinds"][0]["slope"] == pytest.approx(2.0) and "power 2.00; on 20" in found["answer"]
