@@ -155,7 +155,7 @@ def solve_dae(
     states outside the region of earlier runs are compared, and the 2nd, 4th, 8th, ... run as a whole. A system with
     other parameters (`with_parameters`) is checked at the start like a new one.
 
-    *Generated code* usually makes the integrator three to eight times as fast. Making it takes 0.1 to 7 s, once for
+    *Generated code* usually makes the integrator five to nine times as fast. Making it takes about a second, once for
     equations of the same structure, as it is kept on disk. The callbacks must not branch on t, q or v. Near a singular
     position, steps that cannot be trusted to this code are computed without it. The choice by "auto" depends only on
     the arguments, so the same call gives the same numbers whatever ran before.
