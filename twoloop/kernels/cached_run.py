@@ -34,6 +34,7 @@ from twoloop.kernels.data.common import (
 )
 from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
+from twoloop.kernels.linalg.dense import copy
 
 ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate; a smaller correction is omitted
 
@@ -221,12 +222,6 @@ def _has_same_choices(b):
 
 
 @merged
-def _copy_vector(source, target):
-    for k in range(target.size):
-        target[k] = source[k]
-
-
-@merged
 def _has_consistent_rows(w, b, n):
     """Return whether the accelerations a in b.state satisfy all rows of G a = Gamma within CONTRADICTS."""
     if w.rows_v.size == len(b.rows):
@@ -278,12 +273,12 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, checks):
             return UNCHOSEN
         if not _has_same_choices(b):
             return REFUSED
-    _copy_vector(b.start_numbers, b.numbers)
+    copy(b.start_numbers, b.numbers)
     for j in range(b.state.size):
         b.state[j] = q[j] if j < n else v[j - n] if j < 2 * n else 0.0
     b.clock[at.T] = b.clock[at.T_START] = t
     prepare_work(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
-    _copy_vector(b.lapack, w.lapack[: b.lapack.size])
+    copy(b.lapack, w.lapack[: b.lapack.size])
     w.nearly_singular = b.constants[NEARLY_SINGULAR]
     if b.start(f, w, t, b.state) != indices.DONE or not _has_consistent_rows(w, b, n):
         return REFUSED
@@ -295,26 +290,26 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, checks):
         _set_step_limits(b.control, b.tolerances, span, b.constants[LONGEST], within)
         b.clock[at.H_NEXT] = min(h if h > 0.0 else _first_step_size(b.state, n, t, span, b.constants[LEAST]), span)
         b.control[at.SHORTEST] = SHORTEST_STEP * b.clock[at.H_NEXT]
-    _copy_vector(w.rows_v, b.start_rows)
+    copy(w.rows_v, b.start_rows)
     return 0
 
 
 @merged
 def _save_start(b):
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
-    _copy_vector(b.numbers, b.saved[:i])
-    _copy_vector(b.lasting, b.saved[i:j])
-    _copy_vector(b.state, b.saved[j:])
-    _copy_vector(b.lasting_integers, b.saved_integers)
+    copy(b.numbers, b.saved[:i])
+    copy(b.lasting, b.saved[i:j])
+    copy(b.state, b.saved[j:])
+    copy(b.lasting_integers, b.saved_integers)
 
 
 @merged
 def _restore_start(b):
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
-    _copy_vector(b.saved[:i], b.numbers)
-    _copy_vector(b.saved[i:j], b.lasting)
-    _copy_vector(b.saved[j:], b.state)
-    _copy_vector(b.saved_integers, b.lasting_integers)
+    copy(b.saved[:i], b.numbers)
+    copy(b.saved[i:j], b.lasting)
+    copy(b.saved[j:], b.state)
+    copy(b.saved_integers, b.lasting_integers)
 
 
 # indices in `last_start`. N_EQUAL: number of successive runs from this start, at most 2. START: index of [t, t1, q, v]
@@ -373,9 +368,9 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     report[DEFECT], report[LONGEST_GAP] = w.largest_defect, w.widest_gap
     for k in range(N_COUNTERS):
         report[N_REPORT + k] = w.counters[k]
-    _copy_vector(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
+    copy(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
     for k in range(n_steps):
-        _copy_vector(b.steps[k], report[N_HEAD + 1 + n_rows + k * width : N_HEAD + 1 + n_rows + (k + 1) * width])
+        copy(b.steps[k], report[N_HEAD + 1 + n_rows + k * width : N_HEAD + 1 + n_rows + (k + 1) * width])
     is_usual = code == at.ALL_OUTPUT_DONE and nothing_to_check and is_inside and n_rows == n_steps
     b.filled[0], b.filled[1] = n_rows, n_steps
     return n_steps if is_usual else UNUSUAL
@@ -406,7 +401,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, checks):
     for k in range(b.memory_places.size):
         b.memory[b.memory_places[k]] = b.start_memory[k]
     b.end[0], b.t[0] = t1, t
-    _copy_vector(b.state, b.states[0])
+    copy(b.state, b.states[0])
     arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
     code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
     return _write_report(w, b, region, b.filled[0], b.filled[1], code, not is_repeated)

@@ -188,33 +188,28 @@ def _factor_and_count_negative(A):
 
 
 @compiled
-def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Return the number of eigenvalues of M below b, and store the factors of M - b I in A.
-
-    b is `weak_ratio` times an upper bound on the largest eigenvalue.
-    """
-    largest = 0.0
-    for i in range(len(mass)):
-        row_sum = 0.0
-        for j in range(len(mass)):
-            row_sum += abs(mass[i, j])
-        largest = max(largest, row_sum)
-    copy_matrix(mass, A)
-    for i in range(len(mass)):
-        A[i, i] -= weak_ratio * largest
-    return _factor_and_count_negative(A)
-
-
-@compiled
-def _has_similar_eigenvalues(mass):
-    """Return whether, by Gershgorin's circles, all eigenvalues of M exceed SIMILAR_EIGENVALUES times the largest."""
+def _eigenvalue_bounds(mass):
+    """Return bounds of the eigenvalues of M, below the smallest and above the largest, by Gershgorin's circles."""
     smallest, largest = math.inf, 0.0
     for i in range(len(mass)):
         row_sum = 0.0
         for j in range(len(mass)):
             row_sum += abs(mass[i, j])
         smallest, largest = min(smallest, 2.0 * mass[i, i] - row_sum), max(largest, row_sum)
-    return smallest > SIMILAR_EIGENVALUES * largest
+    return smallest, largest
+
+
+@compiled
+def _count_weak_eigenvalues(mass, weak_ratio, A):
+    """Return the number of eigenvalues of M below b, and store the factors of M - b I in A.
+
+    b is `weak_ratio` times an upper bound on the largest eigenvalue.
+    """
+    _, largest = _eigenvalue_bounds(mass)
+    copy_matrix(mass, A)
+    for i in range(len(mass)):
+        A[i, i] -= weak_ratio * largest
+    return _factor_and_count_negative(A)
 
 
 @merged
@@ -361,9 +356,7 @@ def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
     scaled to norm 1. U and `remainder` are scratch.
     """
     n_rows = len(S)
-    for i in range(n_rows):
-        for k in range(i, n_rows):
-            U[i, k] = S[i, k]
+    copy_matrix(S, U)
     for k in range(n_rows):
         is_kept[k] = 1 if U[k, k] > INDEPENDENT else 0
         if is_kept[k] == 1:
@@ -470,9 +463,9 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
     matrices = workspace[end : end + 3 * n_rows * n_rows].reshape((3 * n_rows, n_rows))
     U, S, C = matrices[:n_rows], matrices[n_rows : 2 * n_rows], matrices[2 * n_rows :]
     chosen[1], workspace[0] = 0, 1.0
-    is_definite = _has_similar_eigenvalues(original_mass) and _fill_scaled_products(
-        original_mass, G, A, solved, S, sizes
-    )
+    smallest, largest = _eigenvalue_bounds(original_mass)
+    is_definite = smallest > SIMILAR_EIGENVALUES * largest
+    is_definite = is_definite and _fill_scaled_products(original_mass, G, A, solved, S, sizes)
     if is_definite and _find_dependent_rows(S, G, sizes, U, C, x, order):
         chosen[0] = n_kept = _exchange_rows(C, order, kept)
         first_bound = _first_bound_below_pivots(S, kept, n_kept, bounds, scratch)
