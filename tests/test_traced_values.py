@@ -10,7 +10,7 @@ import pytest
 from tests import problems
 from tests.problems import kept, pendulum, quick, unconstrained, worst
 from twoloop import ConstrainedSystem, Status, consistent_state, mechanisms, solve_dae
-from twoloop.generate.derived_callbacks import with_derived_callbacks
+from twoloop.generate.derived_callbacks import derive_callbacks
 from twoloop.generate.series import series_program
 from twoloop.generate.traced_values import accept_traces
 from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
@@ -239,7 +239,7 @@ def rows_and_gamma(f, w, t, q, v):
 
 def in_kernels(system, t, q, v):
     """C_q and Gamma as used in an evaluation."""
-    system, traced = with_derived_callbacks(system, accept_traces)
+    system, traced = derive_callbacks(system, accept_traces)
     kit = kit_of(system, t, q)
     work = workspace(system, kit, np.ones((system.n_c + system.n_a, system.n_q)), q, 1e-8, 0.0)
     assert rows_and_gamma(kit, work, t, q, v) == DONE
@@ -294,7 +294,7 @@ def test_a_fast_bar_is_as_right_without_gamma_as_with():
 
 def test_what_branches_is_differenced():
     system = constant_pendulum(jacobian=lambda t, q: q[None, :] if q[0] > -2.0 else 2.0 * q[None, :], gamma=None)
-    other, traced = with_derived_callbacks(system, accept_traces)
+    other, traced = derive_callbacks(system, accept_traces)
     assert other is system and traced == () and solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6]).success
 
 

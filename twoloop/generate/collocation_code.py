@@ -206,9 +206,9 @@ class CollocationCode:
     def iterate_step(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
         """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
 
-        The accelerations are those of the program with the fewest operations. Its conditions are checked once, after
-        the last sweep. If they fail, the iteration is repeated with the elimination that begins with M, which the next
-        STEPS_BY_MASS_FIRST steps use, too.
+        The program with the fewest operations computes the accelerations. Its conditions are checked once, after the
+        last sweep. If they fail, the iteration is repeated with the elimination that begins with M, as in the next
+        STEPS_BY_MASS_FIRST steps.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers

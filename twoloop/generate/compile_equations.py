@@ -179,7 +179,7 @@ SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 class SplitFunctions:
     """Generator that splits long equations into parts: functions of the module that other functions call.
 
-    solution : solution of the linear equations; its `stored_indices` are those of the quantities that the parts share.
+    solution : solution of the linear equations; `stored_indices` lists the quantities that the parts share.
     position_programs, solution_programs : programs by names of parts. Their inputs are t, q, v (position_programs), or
         r, c and the stored factors.
     """

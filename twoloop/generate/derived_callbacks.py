@@ -38,7 +38,7 @@ class DerivedPrograms:
         """Return a system with these programs in place of its missing callbacks."""
         functions: dict[str, Any] = {}
         for name, (program, indices) in self.programs.items():
-            vectors = program.with_coefficients(evaluate).as_arrays(indices)
+            vectors = program.replace_coefficients(evaluate).as_arrays(indices)
             functions |= dict(zip((f"{name}_program", f"{name}_numbers"), vectors, strict=True))
         derived = copy.copy(system)
         derived.functions = system.functions._replace(**functions)
@@ -57,9 +57,7 @@ class DerivedSystem(NamedTuple):
         return self.traced.kinds
 
 
-def with_derived_callbacks(
-    system: ConstrainedSystem, check: Check
-) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
+def derive_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
     """Return a system with programs in place of missing C_q and Gamma, and a tuple with the traces used for them.
 
     If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple: finite
@@ -127,7 +125,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
     equations = cache.equations(system)
     callbacks = [kind for kind in ("jacobian", *GAMMA_SOURCES) if kind in system.given]
     exprs = {kind: equations.derivatives(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
-    # the derivatives are those of traces, so these callbacks must agree with their traces
+    # the derivatives come from traces, with which these callbacks must agree
     exprs |= {kind: equations.expressions(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return CallbackTraces(system, equations.graph, exprs)
 
@@ -159,7 +157,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v about as large as those of `states`."""
+    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v of about the same size."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

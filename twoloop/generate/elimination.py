@@ -50,8 +50,8 @@ PIVOT_FRACTION = 0.01  # smallest allowed pivot of a row of G in a run, relative
 # possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to its pivot without
 # the other rows; with pivots below the last value, rounding errors would dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
-# MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] at or below the smallest pivot at the start; if there is
-# none, MIN_PIVOTS[-1] is chosen
+# smallest pivots at a start for which MIN_PIVOTS[i] is chosen: i is the first index with START_LIMITS[i] at or below
+# the smallest pivot; without such an index, MIN_PIVOTS[-1] is chosen
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 N_FEW_COORDINATES = 24  # largest number of coordinates for which MIN_INDEX_FEW, not MIN_INDEX_MANY, applies
 # smallest index in MIN_PIVOTS, that is, largest pivots, at which all rows of G may be added to M. MIN_INDEX_FEW: with
@@ -191,7 +191,7 @@ class PivotChooser:
             if len(mass) <= N_FEW_COORDINATES
             else MIN_INDEX_MANY + is_singular
         ):
-            return self._with_added_rows(choice, factors, mass, G, index)
+            return self._try_added_rows(choice, factors, mass, G, index)
         return choice
 
     def _index_with(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
@@ -205,7 +205,7 @@ class PivotChooser:
         index = int(self._kernel(stiffened, G, RANK_TOL, 0.0, START_LIMITS, scratch, chosen))
         return index if index >= 0 and chosen[2 : 2 + chosen[0]].tolist() == list(choice.rows) else -1
 
-    def _with_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
+    def _try_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
         """Return the choice for M + s G^T G if its smallest pivot is much larger than for M, else `choice`.
 
         G: the independent rows. `index`: index in MIN_PIVOTS of the choice for M. If a body has little inertia about
@@ -423,7 +423,7 @@ class Elimination:
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
-        """Return a list with one value for each row of G: those of `independent`, and 0 for dependent rows."""
+        """Return a list with one value for each row of G: the values `independent`, and 0 for dependent rows."""
         values = [self.zero] * len(self.all_rows)
         for k, value in zip(self.choice.rows, independent, strict=True):
             values[k] = value
@@ -488,7 +488,7 @@ def multipliers_of_least_norm(
     rows: Sequence[int],
     solve: Callable[[Sequence[Affine]], list[Affine]],
 ) -> list[Affine]:
-    """Return the multipliers lam (one per row) of least norm with the same G^T lam as those of the independent rows.
+    """Return the multipliers lam (one per row) of least norm with the same G^T lam as the `independent` multipliers.
 
     `all_rows`: G. `rows`, `independent`: indices and multipliers of the independent rows. `solve`: solution with the
     factors of [M G^T; G 0]. Dependent row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of G^T

@@ -248,7 +248,7 @@ class Affine:
             return factor, Affine(self.graph, self.constant * inverse, {i: c * inverse for i, c in self.terms.items()})
         return factor, Affine(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
-    def _as_expression(self, other: Any) -> "Affine":
+    def _convert_operand(self, other: Any) -> "Affine":
         """Return an operand, a number or an expression, as an expression; refuse expressions of other graphs."""
         if type(other) is not Affine:
             return Affine(self.graph, as_number(other), {})
@@ -260,7 +260,7 @@ class Affine:
     def __add__(self, other: Any) -> Any:
         if type(other) is not Affine and isinstance(other, np.ndarray):
             return elementwise(lambda x: x + self, [other])
-        other = self._as_expression(other)
+        other = self._convert_operand(other)
         terms = dict(self.terms)
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
@@ -294,7 +294,7 @@ class Affine:
     def __mul__(self, other: Any) -> Any:
         if type(other) is not Affine and isinstance(other, np.ndarray):
             return elementwise(lambda x: x * self, [other])
-        return self.graph.product(self, self._as_expression(other))
+        return self.graph.product(self, self._convert_operand(other))
 
     __rmul__ = __mul__
 
@@ -332,9 +332,9 @@ class Affine:
             square = self.graph.square(square, is_high_power) if n else square
         return result.reciprocal() if exponent < 0.0 else result
 
-    def _function(self, kind: int, of_number: Callable[[float], float]) -> "Affine":
+    def _function(self, kind: int, numeric_function: Callable[[float], float]) -> "Affine":
         if not self.terms:
-            return Affine(self.graph, of_number(self.constant), {})
+            return Affine(self.graph, numeric_function(self.constant), {})
         return self.graph.operation(kind, self)
 
     def reciprocal(self) -> "Affine":

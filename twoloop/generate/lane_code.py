@@ -180,7 +180,7 @@ class LaneSteps:
     def compute_defect(self, emit: LaneEmitter, control: Value, memory: LaneMemory, a: list[Value]) -> Value:
         """Return the defect of the series at NEW, relative to the tolerances, see control/step_size.py.
 
-        The defect is the difference between the accelerations of the series and `a`, those by the equations of motion.
+        The defect is the difference between the accelerations of the series and `a`, by the equations of motion.
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)

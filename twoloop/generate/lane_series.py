@@ -47,7 +47,7 @@ class LaneEmitter(Emitter):
         self.double_type, self.integer_type, self.bit_type = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
 
     def copy_for_builder(self, builder: Builder) -> "LaneEmitter":
-        """Return an emitter with the same number of lanes that writes to another function, that of `builder`."""
+        """Return an emitter with the same number of lanes that writes to the function of `builder`."""
         return LaneEmitter(builder, self.lanes)
 
     def broadcast(self, value: Value) -> Value:
@@ -160,7 +160,7 @@ def store_lanes(emit: LaneEmitter, value: Value, base: Value, index: int = 0) ->
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """Return the sum of the elements of a, and that of b; both are computed by the same instructions."""
+    """Return the sums of the elements of a, and of b, which are computed by the same instructions."""
     builder, half = emit.builder, STAGES // 2
     lower_half, upper_half = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
     total = emit.add(builder.shuffle(a, b, lower_half), builder.shuffle(a, b, upper_half))

@@ -59,7 +59,7 @@ class Emitter:
         self.numbers: Any = None
 
     def copy_for_builder(self, builder: Builder) -> "Emitter":
-        """Return an emitter of the same class that writes to another function, that of `builder`."""
+        """Return an emitter of the same class that writes to the function of `builder`."""
         return type(self)(builder)
 
     def constant(self, value: float) -> Value:

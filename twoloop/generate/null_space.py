@@ -147,7 +147,7 @@ def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tup
 
 
 def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    """Return the rows (indices) except those in `pairs`, ordered by minimum degree, as tuples of one or two rows.
+    """Return the indices of all rows that are not in `pairs`, by minimum degree, in tuples of one or two rows.
 
     Two rows with the same neighbours are in one tuple. A row of G (index n and later) comes after its coordinates.
     Among rows of equal degree, the one after the shortest chain of divisions comes first, so that operations overlap.
@@ -300,7 +300,7 @@ class DependentCoordinates:
             self.conditions.append((pivot * pivot, (a * b).times(MIN_PIVOT_SQUARE)))
 
     def _substitute(self, j: int, row: Terms) -> None:
-        """Store T[j] and g[j] of a dependent coordinate j, computed from those of the coordinates in its solved row."""
+        """Store T[j] and g[j] of a dependent coordinate j, computed from T and g of coordinates in its solved row."""
         self.check_length()
         rhs, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():

@@ -335,7 +335,7 @@ for _name in _UNARY_FUNCTIONS:
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
     """Return an array of function values at all entries of arrays, without calls of the entries' `__array_ufunc__`."""
-    operands = list(map(_as_object_array, inputs))
+    operands = list(map(_object_array, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:
         return results
@@ -343,7 +343,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
     return out[0]
 
 
-def _as_object_array(value: Any) -> Any:
+def _object_array(value: Any) -> Any:
     """Return a value as an array of objects; its type is tested by type(), because symbols refuse isinstance()."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)

@@ -82,7 +82,7 @@ class Program:
     """Arrays to be computed from the inputs of a graph, and conditions under which they are valid.
 
     arrays : names of the arrays, and their entries: affine expressions.
-    conditions : pairs of expressions: the arrays are valid if the first one is larger than the second in each pair.
+    conditions : pairs of expressions. The arrays are valid if in each pair the first is larger than the second.
     """
 
     graph: Graph
@@ -216,7 +216,7 @@ class OperationTable(NamedTuple):
         integers = np.concatenate([header, rows.ravel(), self.columns, result_indices])
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
-    def with_coefficients(self, convert: Callable[[Any], Array]) -> "OperationTable":
+    def replace_coefficients(self, convert: Callable[[Any], Array]) -> "OperationTable":
         """Return a copy of the table with `convert` applied to its two arrays of coefficients and constants."""
         return self._replace(constants=convert(self.constants), coefficients=convert(self.coefficients))
 

@@ -179,7 +179,7 @@ def _expand_sums(sums: dict[int, Affine], expr: Affine) -> Affine:
     sum_quantities = [i for i in expr.terms if i in sums]
     if not sum_quantities:
         return expr
-    total = _without_terms(expr, sum_quantities)
+    total = _remove_terms(expr, sum_quantities)
     for i in sum_quantities:
         total = total + sums[i].times(expr.terms[i])
     return total
@@ -274,8 +274,8 @@ def _assemble_program(
         n_rows,
         _make_groups(tables[0], nodes),
         _make_groups(tables[1], nodes),
-        *_nonzero_sums([_without_terms(expr, v_and_a) for expr in rows], nodes),
-        *_nonzero_sums([_without_terms(expr, lam_and_a) for expr in balance], nodes),
+        *_nonzero_sums([_remove_terms(expr, v_and_a) for expr in rows], nodes),
+        *_nonzero_sums([_remove_terms(expr, lam_and_a) for expr in balance], nodes),
     )
 
 
@@ -294,12 +294,12 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
     """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: node of each quantity."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
-    sums = _as_sums([exprs[k] for k in indices], nodes)
+    sums = _convert_to_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)
     return sums._replace(row=index_array[sums.row]), index_array
 
 
-def _without_terms(expr: Affine, inputs: Container[int]) -> Affine:
+def _remove_terms(expr: Affine, inputs: Container[int]) -> Affine:
     """Return an expression without its terms in the quantities `inputs`."""
     return Affine(expr.graph, expr.constant, {i: c for i, c in expr.terms.items() if i not in inputs})
 
@@ -335,7 +335,7 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
 def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> OperationGroups:
     """Return the OperationGroups of groups (kind, operations); `nodes`: node of each quantity."""
     members = [member for _, group in groups for member in group]
-    sums = [_as_sums([member[k] for member in members], nodes) for k in (1, 2)]
+    sums = [_convert_to_sums([member[k] for member in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
     for kind, group in groups:
         end = begin + len(group)
@@ -345,7 +345,7 @@ def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> 
     return OperationGroups(np.array(rows, dtype=np.int64), *sums)
 
 
-def _as_sums(exprs: list[Affine], nodes: dict[int, int]) -> Sums:
+def _convert_to_sums(exprs: list[Affine], nodes: dict[int, int]) -> Sums:
     """Return expressions as Sums; `nodes`: node of each quantity."""
     terms = [[(nodes[i], c) for i, c in expr.terms.items()] or [(0, 0.0)] for expr in exprs]
     further_terms = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]

@@ -70,14 +70,14 @@ class CallbackTraces:
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
         """Return a copy for another system of the same trace cache; `evaluate` computes the system's coefficients."""
-        traced = self.with_coefficients(evaluate)
+        traced = self.replace_coefficients(evaluate)
         traced.name = system.name
         return traced
 
-    def with_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
+    def replace_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
         """Return a copy that is not trusted yet, in which `convert` has replaced each array of coefficients."""
         traced = copy.copy(self)
-        traced.program = self.program.with_coefficients(convert)
+        traced.program = self.program.replace_coefficients(convert)
         traced.is_trusted = False
         return traced
 
@@ -281,7 +281,7 @@ class CheckedRegion:
         return bool((smallest - margin <= parameters).all() and (parameters <= largest + margin).all())
 
     def add_parameters(self, parameters: Array) -> None:
-        """Extend the ranges of parameters to those of a run in which calls and traces agreed."""
+        """Extend the ranges to the parameters of a run in which calls and traces agreed."""
         smallest, largest = self._parameters or (parameters, parameters)
         self._parameters = np.minimum(smallest, parameters), np.maximum(largest, parameters)
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.checks.arguments import Array, shown
-from twoloop.generate.derived_callbacks import with_derived_callbacks
+from twoloop.generate.derived_callbacks import derive_callbacks
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.program import MAX_TRACE_DIFFERENCE, N_COMPARED, TIME_SPACING, OperationTable
 from twoloop.generate.trace import convert_to_expressions, trace
@@ -137,7 +137,7 @@ class ContactSystem:
         self._slides, self._sticking, self._slipping = slides, list(sticking), slipping
         self._offsets = np.array(list(sticking.values()))
         self._zero_velocity = np.zeros(system.n_q)
-        self._derived = with_derived_callbacks(system, accept_traces)[0] if slipping else system
+        self._derived = derive_callbacks(system, accept_traces)[0] if slipping else system
 
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
         """Return a field of the `Gap` of closed stops, followed by the same field for constant displacements."""
@@ -214,7 +214,7 @@ class Accelerations:
     """Compute accelerations and multipliers of a system at any state, as in its runs."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, v: Array, atol: Array):
-        derived, _ = with_derived_callbacks(system, accept_traces)
+        derived, _ = derive_callbacks(system, accept_traces)
         # any explicit method will do: only the accelerations at the start of its steps are used
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)

@@ -83,7 +83,7 @@ def start(f, w, t, state):
 
 
 @merged
-def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
+def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
     """Return JUMP, RAMP or SMOOTH for C_t and b within a step, and beginning and end (s) of the jump or ramp."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
@@ -122,12 +122,12 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 
 
 @merged
-def _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
+def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
     """Return whether a step must be repeated because C_t or b jumps, or has a ramp, within the step.
 
     For a jump, JUMP_FROM, at which the repeated step ends, and JUMP_TO are stored in `clock`; for a ramp, H_NEXT.
     """
-    kind, low, high = _locate_kink(f, w, t, size, tolerances, accepted, state, new_state)
+    kind, low, high = _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
         clock[at.JUMP_FROM] = t if low - t <= EQUAL_SPACINGS * np.spacing(abs(t)) else low
         clock[at.JUMP_TO] = high
@@ -144,7 +144,7 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
     """Prepare the repetition of a failed step and return CONTINUE, or return an end code.
 
     The step is repeated with a smaller size, with a new partition, or with both. A step of fixed size is repeated only
-    once, with a new partition; `t_repeated` (s) is the time at which the last step of fixed size to be repeated begins.
+    once, with a new partition; `t_repeated`: time, s, at the beginning of the fixed step that was repeated last.
     """
     n = w.Q.size
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
@@ -306,7 +306,7 @@ def advance(
             clock[at.FAILURE_CODE] = SINGULAR
             return at.NEAR_SINGULAR
         checks_rates = control[at.MAY_JUMP] == 1.0 and not jumps
-        if checks_rates and _must_repeat_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
+        if checks_rates and _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.commit(f, w, options, memory, tolerances, False)
             w.n_rejected_error += 1
             clock[at.FAILURE_CODE] = DONE

@@ -122,7 +122,7 @@ def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longes
 
 @merged
 def _is_within_bounds(t, rows, bounds):
-    """Return whether [t[k], rows[k]], cut to the length of bounds[0], is between bounds[0] and bounds[1] for all k."""
+    """Return whether [t[k], rows[k]] is between bounds[0] and bounds[1] for all k, as far as the bounds reach."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False

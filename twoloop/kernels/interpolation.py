@@ -135,8 +135,8 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
     """Store [q, v] at times[p] in row p of `out`; return the number of failed projections.
 
     A projection fails if dependent coordinates cannot be determined, or if rounding errors determine the projected
-    velocities near a singular position. Row p then gets the values of the polynomials. `groups` is the table of
-    intervals described in data/indices.py; `z` and `coefficients` are scratch; `tolerance` is that of the projection.
+    velocities near a singular position. Row p then gets the values of the polynomials. `groups`: the table of intervals
+    described in data/indices.py. `tolerance`: tolerance of the projection. `z`, `coefficients`: scratch.
     """
     n = w.Q.size
     half = z.size // 2

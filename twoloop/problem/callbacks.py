@@ -16,7 +16,7 @@ from numba import njit, objmode
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array, check_call, check_real, shaped, shown
-from twoloop.kernels.compile.caches import digests_of, with_unique_name
+from twoloop.kernels.compile.caches import digests_of, give_unique_name
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback, zero_callback
 from twoloop.kernels.compile.dependencies import digest_of, register_digest
 from twoloop.kernels.compile.linking import Dispatcher
@@ -294,7 +294,7 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
             f"{kind}: compile=True takes functions made by def or lambda, with numbers that they enclose; given "
             f"{function!r} of type {type(function).__name__}. Write such a function, or leave compile=True out"
         )
-    user = function if isinstance(function, Dispatcher) else njit(with_unique_name(function, digests_of(function)))
+    user = function if isinstance(function, Dispatcher) else njit(give_unique_name(function, digests_of(function)))
     message = f"{kind} returned an array of the wrong shape"
 
     def at_position(t, q, p, out):  # type: ignore[no-untyped-def]

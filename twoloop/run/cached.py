@@ -20,7 +20,7 @@ from twoloop.checks.arguments import check_vector
 from twoloop.checks.consistency import StartEvaluation, check_start, is_consistent
 from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.compile_equations import GeneratedCode
-from twoloop.generate.derived_callbacks import has_exact_derivatives, with_derived_callbacks
+from twoloop.generate.derived_callbacks import derive_callbacks, has_exact_derivatives
 from twoloop.generate.elimination import (
     MIN_PIVOTS,
     RANK_TOL,
@@ -605,7 +605,7 @@ def _new_run(
     def check(traced: CallbackTraces) -> None:
         traced.refuse_if_wrong(system, t0, t1, q0, v0)
 
-    system, derived = with_derived_callbacks(system, check)
+    system, derived = derive_callbacks(system, check)
     run, code = _create_run(system, t0, q0, v0, options, derived, check)
     if run.static_form is None:
         branch = branch_at(system, t0, run.state, run.rank, options.atol + options.rtol * np.abs(v0).max())

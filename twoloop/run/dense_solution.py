@@ -240,9 +240,9 @@ class Interpolator:
         return out
 
     def _repair_interval(self, table: StateTable, group: Groups, smallest: float) -> None:
-        """Cache other states for the polynomial of an interval if they reduce its residual, `smallest` on entry.
+        """Cache other states for the polynomial of an interval if its residual with them is below `smallest`.
 
-        Sets to try: states of a step across a singular position, states of N_REPAIR_STEPS steps, and only the two ends.
+        Tried are states of a step across a singular position, states of N_REPAIR_STEPS steps, and only the two ends.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
@@ -365,7 +365,7 @@ class Interpolator:
             yield t, states
 
     def restore_interior_states(self, t: Array, states: Array) -> None:
-        """Replace the cached interior states by those that `interior_blocks` yielded; compute no others from now on."""
+        """Replace cached interior states by states from `interior_blocks`; compute no interior states from now on."""
         self.parts, self.may_divide = t.shape[1] - 1, False
         self._allocate_scratch()
         sizes = np.isfinite(t).sum(axis=1).tolist()

@@ -56,7 +56,7 @@ def warn_of_missed_changes(run: Run) -> str:
 Array = NDArray[np.float64]
 
 N_CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
-# largest singular value, relative to the largest of all, that counts as zero, such as that of a redundant row
+# largest singular value, relative to the largest of all, that counts as zero, as a redundant row causes it
 NEGLIGIBLE_RATIO = 1e-12
 MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to their right-hand side
 
@@ -117,7 +117,7 @@ class Origin(NamedTuple):
 # largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times a step from the
 # current state to its mirror image beyond the singular position (see _find_base)
 MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
-# smallest distance of an earlier state, relative to that of the base: states before it are beyond another position
+# ratio of the distances of an earlier state and the base, below which another singular position is between them
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
 FAR_BEYOND = 0.3  # smallest distance beyond a singular position at which the run continues with its own method

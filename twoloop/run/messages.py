@@ -61,7 +61,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether a run from t to t1 would take too many steps; evaluated once in STAGNATION_STEPS steps."""
+        """Return whether a run from t to t1 would take too many steps; False between checks, STAGNATION_STEPS apart."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n

@@ -81,12 +81,12 @@ class ParametricRun:
         self.shared, self.run, self._expression_arrays = shared, run, ParameterArrays()
         functions, array, exact = run.system.functions, self._expression_arrays.array, shared.exact_derivatives
         self._functions = functions._replace(p=functions.p.copy(), flags=functions.flags.copy())
-        run.plan = self._with_parameter_arrays(shared.plan).fresh()
-        run.interior_plans = {kind: self._with_parameter_arrays(each) for kind, each in shared.interior_plans.items()}
+        run.plan = self._replace_arrays(shared.plan).fresh()
+        run.interior_plans = {kind: self._replace_arrays(each) for kind, each in shared.interior_plans.items()}
         run.traced, run.varied_parameters = run.plan.traced, self._functions.p
         self._initial_cache: dict[Any, Any] = {
             ("family", trace_cache_of): shared.trace_cache,
-            ("derivatives", trace_cache_of): None if exact is None else exact.with_coefficients(array),
+            ("derivatives", trace_cache_of): None if exact is None else exact.replace_coefficients(array),
             ("kit", id(self._functions)): Kit(self._functions),
             "kits": {},
         }
@@ -128,12 +128,12 @@ class ParametricRun:
             return False
         return self._mass_agrees
 
-    def _with_parameter_arrays(self, plan: Plan) -> Plan:
+    def _replace_arrays(self, plan: Plan) -> Plan:
         """Return a copy of a plan in which arrays that `_fill_arrays` fills replace arrays of expressions."""
         array, values = self._expression_arrays.array, vars(plan)
         changes: dict[str, Any] = {name: array(values[name]) for name in NUMBER_FIELDS if values[name] is not None}
-        changes |= {name: self._with_parameter_arrays(values[name]) for name in PLAN_FIELDS if values[name] is not None}
-        return plan.changed(traced=tuple(each.with_coefficients(array) for each in plan.traced), **changes)
+        changes |= {name: self._replace_arrays(values[name]) for name in PLAN_FIELDS if values[name] is not None}
+        return plan.changed(traced=tuple(each.replace_coefficients(array) for each in plan.traced), **changes)
 
 
 def _values_of_plans(run: Run) -> list[Any]:

@@ -217,7 +217,7 @@ class Recorder:
     def _store_states(self, t: Array, rows: Array) -> None:
         """Store times and rows: [q, v, a, lam], or [q, v], to which [a, lam] are added now or at the end of the run."""
         self.request.store.add("t", t)
-        self.request.store.add("states", self._with_accelerations(t, rows) if self.request.store.append_only else rows)
+        self.request.store.add("states", self._complete_rows(t, rows) if self.request.store.append_only else rows)
 
     @property
     def end_state(self) -> tuple[float, Array] | None:
@@ -282,11 +282,11 @@ class Recorder:
         t = store.array("t")
         if self.request.times is None and self.end_state is not None and t[-1] < self.end_state[0]:
             end_time = np.array([self.end_state[0]])
-            self._store_states(end_time, self._with_accelerations(end_time, self.end_state[1][None, :]))
+            self._store_states(end_time, self._complete_rows(end_time, self.end_state[1][None, :]))
             t = store.array("t")
-        return t, self._with_accelerations(t, store.array("states"))
+        return t, self._complete_rows(t, store.array("states"))
 
-    def _with_accelerations(self, times: Array, rows: Array) -> Array:
+    def _complete_rows(self, times: Array, rows: Array) -> Array:
         """Return rows [q, v, a, lam] for states given by rows [q, v]; rows [q, v, a, lam] are returned unchanged."""
         if self.interpolator is None or rows.shape[1] == self._width:
             return rows

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import check_finite, check_real, shown
 from twoloop.checks.consistency import check_start
 from twoloop.checks.structure import dependent_rows, parts_of
-from twoloop.generate.derived_callbacks import has_exact_derivatives, with_derived_callbacks
+from twoloop.generate.derived_callbacks import derive_callbacks, has_exact_derivatives
 from twoloop.generate.traced_values import CallbackTraces
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import entry_point
@@ -91,7 +91,7 @@ class SampledRun:
         def check(traced: CallbackTraces) -> None:
             traced.refuse_if_wrong(system, t0, t0 + 1.0, q0, v0)
 
-        self._derived_system, _ = with_derived_callbacks(system, check)
+        self._derived_system, _ = derive_callbacks(system, check)
         self._plan = method.plan(system.n_q, rtol, float(atol.min()), False)
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
         self._tolerances = rtol, atol

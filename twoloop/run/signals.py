@@ -63,7 +63,7 @@ class SignalHandlers:
             raise self._handler_error from None
 
     def restore(self) -> None:
-        """Restore the user's handlers, except those that the user has changed since; then call the delayed ones."""
+        """Restore the user's handlers, except where the user has set other ones since; then call delayed handlers."""
         for number, handler in self._user_handlers.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)

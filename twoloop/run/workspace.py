@@ -369,7 +369,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
         if len(kits) == MAX_KITS:
             del kits[next(iter(kits))]
         entry = kits[key] = Kit(functions, inner, *steps), system.functions
-    return _with_own_flags(entry[0]) if flags[FORM] == AUGMENTED else entry[0]  # a run may change these flags
+    return _copy_with_flags(entry[0]) if flags[FORM] == AUGMENTED else entry[0]  # a run may change these flags
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
@@ -377,7 +377,7 @@ def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 
-def _with_own_flags(kit: Kit) -> Kit:
+def _copy_with_flags(kit: Kit) -> Kit:
     """Return a copy of a kit with its own flags, which a run may change; a new kit would take ten times as long."""
     new_kit, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.offsets["flags"]] = flags.ctypes.data

@@ -258,7 +258,7 @@ def compile_cached(
     announcement : text printed on stderr before the first compilation of this process.
     **options : options of numba.njit.
     """
-    dispatcher = njit(**options)(with_unique_name(function, digests))
+    dispatcher = njit(**options)(give_unique_name(function, digests))
     function = dispatcher.py_func
     if digests is not None:
         try:
@@ -316,7 +316,7 @@ def cache_folder(package: types.ModuleType) -> Path | None:
         return None
 
 
-def with_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
+def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
     """Return a copy of a nested function or lambda with a unique name; return any other function unchanged.
 
     Numba's symbols consist of the qualified name of a function and the number of functions compiled so far in the
@@ -393,7 +393,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 
     def decorate(function: Callable[..., Any]) -> Dispatcher:
         digests = digests_of(function)
-        dispatcher = njit(**options)(with_unique_name(function, digests))
+        dispatcher = njit(**options)(give_unique_name(function, digests))
         if digests is not None:
             # a callback that uses this function as a closure variable need not compile the function again
             _COMPILED_DIGESTS[dispatcher] = digests

@@ -21,7 +21,7 @@ import numba
 from numba import jit
 from numba.core.dispatcher import Dispatcher
 
-from twoloop.kernels.compile.caches import compile_cached, digests_of, with_unique_name
+from twoloop.kernels.compile.caches import compile_cached, digests_of, give_unique_name
 from twoloop.kernels.compile.dependencies import (
     FunctionCopier,
     frozen_locations,
@@ -38,7 +38,7 @@ BOUNDS_CHECK = {"boundscheck": True}  # numba's option to check all indices
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
-def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
+def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
     """Return the function to compile instead of `function`, and numba's options, with bounds checks if needed.
 
     The function is `function` or, if a helper computes indices, a copy that calls bounds-checked copies of its helpers.
@@ -55,7 +55,7 @@ def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
     if helper is None:
         return copy
     copy.__qualname__ = f"{helper.__qualname__}.watched"  # so that numba's symbols differ from those of the helper
-    return jit(**{**options_of(original), **BOUNDS_CHECK})(with_unique_name(copy, digests_of(helper)))
+    return jit(**{**options_of(original), **BOUNDS_CHECK})(give_unique_name(copy, digests_of(helper)))
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
@@ -379,7 +379,7 @@ def compile_callback(
     `digests`: see `compile_cached`; `named_function`: the function that error messages name, by default `function`;
     `allocates`: see `callback`.
     """
-    compiled, more = with_bounds_checks(function)
+    compiled, more = add_bounds_checks(function)
     options = {**_NUMBA_OPTIONS, **more} if allocates else {**_NUMBA_OPTIONS, **more, "_nrt": False}
     if digests is not None:
         digests = f"{digests[0]} {options}", digests[1]
@@ -412,7 +412,7 @@ def _compile_with_writable_inputs(
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)
     except Exception as second_error:
         raise TypeError(_failure_message(kind, named_function, second_error)) from None
-    if _HELPER_REJECTS_READ_ONLY.search(plain := _without_colours(error)) and "setitem" not in plain:
+    if _HELPER_REJECTS_READ_ONLY.search(plain := _remove_colours(error)) and "setitem" not in plain:
         return dispatcher
     raise TypeError(
         f"{kind}: the function {_name_and_location(named_function)} must not change the arrays that it is given "
@@ -466,14 +466,14 @@ _UNINFORMATIVE_LINE = re.compile(
 )
 
 
-def _without_colours(error: Exception) -> str:
+def _remove_colours(error: Exception) -> str:
     """Return the text of an error without the codes that colour it in a terminal."""
     return re.sub(r"\x1b\[[0-9;]*m", "", str(error))
 
 
 def _informative_line(error: Exception) -> str:
     """Return the type of an error, and the last line of numba's message that gives a reason."""
-    message = _without_colours(error)
+    message = _remove_colours(error)
     message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # >>> marks a signature without a match
     lines = [line.strip() for line in message.splitlines() if line and not line.startswith("    ")]
     useful = [line for line in lines if line and not _UNINFORMATIVE_LINE.match(line) and not line.startswith("def ")]

@@ -203,8 +203,8 @@ def _load_registries_once(self: Any) -> None:
 _LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of events that numba reports when it takes a lock
 
 
-def _without_lock_events(report: Any) -> Any:
-    """Return a function that reports all events except those of locks, of which each kernel has thousands."""
+def _skip_lock_events(report: Any) -> Any:
+    """Return a function that reports all events except locks, of which each kernel has thousands."""
     return lambda kind, *args, **named: None if kind in _LOCK_EVENTS else report(kind, *args, **named)
 
 
@@ -217,8 +217,8 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (InlineWorker, "run_untyped_passes", _cached_inlined_code),
     (ir.Inst, "_rec_list_vars", _variables_of_statement),
     (CPUContext, "load_additional_registries", _load_registries_once),
-    (event, "start_event", _without_lock_events(event.start_event)),
-    (event, "end_event", _without_lock_events(event.end_event)),
+    (event, "start_event", _skip_lock_events(event.start_event)),
+    (event, "end_event", _skip_lock_events(event.end_event)),
 ]
 _MISSING_ATTRIBUTE = object()  # placeholder for an attribute that the owner does not have itself
 _depth = [0]  # number of nested compilations of kernels

@@ -176,8 +176,8 @@ MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0
 SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
-# an acceleration decays, see _acceleration_lasts, if it changes by more than this, relative to the largest
-# acceleration, while a velocity changes by its tolerance
+# change of an acceleration, relative to the largest acceleration, while a velocity changes by its tolerance, above
+# which the acceleration decays, see _acceleration_lasts
 MAX_LASTING_CHANGE = 0.5
 CHANGE_MARGIN = 0.01  # a change up to this time after a step's beginning, in spacings of samples, counts as passed
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes, after the samples, that stores the largest |value| of each column

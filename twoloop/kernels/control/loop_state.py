@@ -32,7 +32,7 @@ SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
 # indices in the history of step-size control: size (s) and error (in tolerances) of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
 
-# indices in `control`, after those of the rule
+# indices in `control`, after the rule
 (
     MAX_STEP,  # largest step, s
     FIXED_STEP,  # fixed step size, s; 0: step-size control
@@ -68,7 +68,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
 # the run began, of rejections by the error, failures, partitions, and Jacobians (0 after an explicit step)
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
-# indices in `clock`, after those of the history
+# indices in `clock`, after the history
 (
     T,  # present time, s
     H_NEXT,  # size of the next step, s
@@ -110,5 +110,5 @@ INNER_TOL = 1e-8  # tolerance of Newton's method for the projection of positions
 
 
 def initial_direction(n_q: int) -> NDArray[np.float64]:
-    """Return the first direction (n_q) of a power iteration; its components differ, as those of vibrations do."""
+    """Return the first direction (n_q) of a power iteration, with different components, as in a vibration."""
     return np.asarray(0.3 + 0.1 * (np.arange(n_q) % 7))

@@ -21,8 +21,8 @@ MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, r
 # smallest pivot, relative to its largest value so far, below which the run ends, as rounding spoils accelerations
 UNDETERMINED_PIVOT = 1e-6
 CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that generated code does not use
-# the augmented form checks a partition every k + 1 steps if the mechanism has k times this number of degrees of
-# freedom, because a check computes the full matrix T
+# the augmented form checks a partition every 1 + n // FREEDOMS_PER_CHECK steps for n degrees of freedom, because a
+# check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
 # pivot at an end of a step, relative to the largest pivot so far, below which the step is checked
@@ -192,7 +192,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:
-        # the partition may have been chosen at a distant state: with a new one an implicit method may still continue
+        # an implicit method may still continue with a new partition, if the old one was chosen at a distant state
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.MAY_CROSS] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:

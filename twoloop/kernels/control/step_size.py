@@ -162,7 +162,7 @@ def departure(w, tolerances, h, q, v, q1):
     """Return the largest difference of w.predicted from the dependent positions in q1, relative to the allowed one.
 
     The allowed difference is the smaller of two: the tolerance, and about FRACTION_OF_MOTION times the motion.
-    The factors of C_qd in `w` must be those at q1. With steps of fixed size the result is 0.
+    The factors of C_qd in `w` must belong to q1. With steps of fixed size the result is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0

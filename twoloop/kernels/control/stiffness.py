@@ -202,7 +202,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     growth_by_q = growth_by_v = 0.0
-    # with generated code the partition may be an old one, whose independent coordinates hardly move
+    # generated code does not use the partition, which may be so old that its independent coordinates hardly move
     is_explicit = memory[PHASE] == EXPLICIT
     if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -373,7 +373,7 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by the active method, which is chosen anew if an estimate of rho or the end of a trial is due.
 
-    The memory of a method is cleared when this method becomes active. The step-size rule is that of the active method.
+    The memory of a method is cleared when this method becomes active. The active method determines the step-size rule.
     """
     n = w.Q.size
     first, second = _memory_views(memory, n)

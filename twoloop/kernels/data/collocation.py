@@ -18,7 +18,7 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: accelerations are predicted by a polynomial; 0: they are predicted to be constant
     CURRENT,  # index (0 or 1) of the polynomial of the last accepted step
-    TRIED,  # 1: the polynomial that is not CURRENT is that of the attempted step
+    TRIED,  # 1: the polynomial that is not CURRENT belongs to the attempted step
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     OLD_DEGREE,  # value of DEGREE before a step was rejected, which a later step restores; 0: no step was rejected
     MAY_GUESS,  # 1: the step size is a guess, and is replaced if the contraction is far from its target

@@ -46,7 +46,7 @@ class Work(NamedTuple):
     L: Any  # (n_q, n_q) inverse of a constant M, else the factors of M, dense (see ldl_factor) or banded
     G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
     entries: Any  # view of `G` as a vector
-    augmented: Any  # view of the memory of `G`, followed by that of `M`
+    augmented: Any  # view of the memory of `G` and, after it, of `M`
     S: Any  # (r_v, r_v) G M^-1 G^T, with the independent rows of G, and its factors
     W: Any  # (r_v, n_q) G M^-1, with the independent rows of G
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
@@ -91,7 +91,7 @@ class Work(NamedTuple):
     notes: Any  # (N_NOTES) values that one kernel stores for another, see indices.py
     nodes: Any  # results of the operations of a traced program
     matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
-    # the fields from here to `solutions` are those of the static form, and are empty in other forms; N is n_q + n_c
+    # the fields from here to `solutions` belong to the static form, and are empty in other forms; N is n_q + n_c
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
     is_independent: Any  # (n_c) 1 for independent rows, else 0

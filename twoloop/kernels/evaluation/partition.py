@@ -323,7 +323,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| in w.minimum, of independent rows in redundant rows, all rows scaled to 1."""
+    """Return the largest |coefficient| in w.minimum of an independent row in a redundant row, with rows scaled to 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0

@@ -53,7 +53,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     LARGEST_Q,  # largest correction of positions, divided by the square of the step size
     LARGEST_V,  # largest correction of velocities, divided by the step size
     H_PREVIOUS,  # size of the step with the accelerations PREVIOUS, s; 0 if there is no such step
-    CONSTANT,  # 1: the predicted accelerations of all stages are those at the beginning of the step; else 0
+    CONSTANT,  # 1: the predicted accelerations of all stages equal the accelerations at the beginning; else 0
     DURATION,  # duration of an error of the velocities, s, see velocity_errors.py; 0: not known
     N_SINGLE_VECTORS,
 ) = range(11)
@@ -193,7 +193,7 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Store predicted stage accelerations in STAGES: values of the polynomial through those in PREVIOUS.
+    """Store predicted stage accelerations in STAGES: values of the polynomial through the accelerations in PREVIOUS.
 
     If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, the prediction is constant. `begins` is 1 if
     PREVIOUS belongs to the last step, and 0 if it belongs to this step.

@@ -73,7 +73,7 @@ MIN_BANDED_SIZE = 56
 
 
 def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
-    """Return whether banded algebra is faster than dense algebra, and its arrays fit in those of dense algebra."""
+    """Return whether banded algebra is faster than dense algebra, and fits in the arrays for dense algebra."""
     return n_q >= max(MIN_BANDED_SIZE, 3 * bandwidth + 2 + 2 * n_c)
 
 

@@ -45,8 +45,8 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants for equal steps, used as lower bounds of those for the actual steps: after a decrease of h, these are
-# smaller, and would underestimate the error if the force jumps
+# error constants for equal steps, used as lower bounds of the constants for the actual steps. After a decrease of h,
+# the actual constants are smaller, and would underestimate the error if the force jumps
 ERROR_CONSTANTS = _error_constants()
 
 # indices in `options`. THETA: a projection has converged when its last correction is at most THETA, see `project`

@@ -128,7 +128,7 @@ def _velocity_weight(tolerances, m, n, h, state):
 def _estimate_error(tolerances, h, state, legendre, a, n_kept):
     """Return the error of a step, in units of the tolerances, estimated from the last Legendre coefficients.
 
-    The coefficients are those of the accelerations a (S, n). The estimate is that of collocation_code.py. `n_kept`:
+    They are coefficients of the accelerations a (S, n), and estimate the error as in collocation_code.py. `n_kept`:
     number of nodes that are not left out; coefficients of degrees from `n_kept` on are rounding errors.
     """
     n, largest = a.shape[1], 0.0

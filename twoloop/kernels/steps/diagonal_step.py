@@ -463,7 +463,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
     The first estimate has small weights in the first half of the step, and hardly shows a jump there. `jump_weights`
     (s) are those of another embedded formula. The sum of jump_weights[k] A_stage[k] is zero if the accelerations are
     quadratic in time, small relative to their range if they are smooth, and large if they jump. The second estimate
-    contains the ratio of this sum to the range as a factor, so that its order exceeds that of the first.
+    contains the ratio of this sum to the range as a factor, so that its order is higher.
     """
     n = w.Q.size
     deviation, widest = 0.0, 0.0

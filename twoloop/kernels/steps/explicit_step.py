@@ -22,8 +22,8 @@ STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
 # numbers, padded to a multiple of BLOCK_SIZE
 STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
 BLOCK_SIZE = 8  # number of sums that `_weighted_sum` accumulates in registers
-# STRICT: factor on the error estimate once a run has come near a singular position, because phase errors grow at each
-# singular position. If the smallest tolerance is below STRICT * LEAST_STRICT, the factor is smaller, but at least 1
+# STRICT: factor on the error estimate after a run has come near a singular position, because phase errors grow at each
+# such position. It decreases to 1 as the smallest tolerance falls from STRICT * LEAST_STRICT to LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -123,9 +123,9 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
     """Return the error e^2 / sqrt(e^2 + d^2) of a step from y to y1 (2 n each), in units of the tolerances.
 
     e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
-    velocities), relative to atol + rtol |y|. A formula for each component alone would give e, of low order, where the
-    component's d passes through zero, and cost up to 30 % more evaluations. If `strict`, the error is e^(3/2) / (e^2 +
-    d^2)^(1/4): near a singular position, terms of high order are not small (47 tolerances were estimated as 1.4).
+    velocities), relative to atol + rtol |y|. If the formula were applied to each component, it would give e, of low
+    order, where d of this component passes through zero, and cost up to 30 % more evaluations. If `strict`, the error
+    is e^(3/2) / (e^2 + d^2)^(1/4), because terms of high order are not small near a singular position.
     """
     n = fine_error.size // 2
     rtol = tolerances[RTOL]

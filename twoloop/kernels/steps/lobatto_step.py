@@ -48,13 +48,13 @@ START_CONTRACTION = 0.12  # contraction rho for which the first step size is cho
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
-MAX_LIMITED = 24.0  # value of the field LIMITED at which the motion counts as stiff, and another method takes over
+MAX_LIMITED = 24.0  # value of LIMITED at which the motion counts as stiff, and another method takes over
 MIN_CURVATURE = 0.1  # value of CURVATURE below which accelerations hardly vary within a step
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
 MIN_PIVOT_RATIO = 0.4  # pivot, relative to that at the beginning of a step, below which a singular position is near
-# after a singular position, another method takes over with smaller tolerances: five more runs of A02 would be wrong
+# tolerance below which another method takes over after a singular position: otherwise five more runs of A02 are wrong
 TIGHT_TOLERANCE = 1e-8
-# another method takes over if FAILURES reaches this; a step without convergence adds 2, an accepted step subtracts 1
+# value of FAILURES, to which a step without convergence adds 2, at which another method takes over
 MAX_FAILURES = 12.0
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
@@ -169,10 +169,10 @@ def _must_change_method(w, data, tolerances):
 
 @compiled
 def _passes_singular_position(f, w, t, h, state, new_state):
-    """Return whether the smallest pivot of C_q within a step is below MIN_PIVOT_RATIO times that at the beginning.
+    """Return whether the smallest pivot of C_q within a step is below MIN_PIVOT_RATIO times the pivot at its beginning.
 
     Another method then has to cross the singular position, near which stages that violate the constraints have wrong
-    accelerations. Positions within the step are those of the cubic through the states at both ends.
+    accelerations. Positions within the step are on the cubic through the states at both ends.
     """
     n, pivot = w.Q.size, w.pivot
     for k in range(1, N_PIVOT_PARTS):
@@ -188,7 +188,7 @@ def _passes_singular_position(f, w, t, h, state, new_state):
 
 @kernel(COMMIT)
 def commit_lobatto(f, w, options, memory, tolerances, accepted):
-    """Keep the polynomial of an accepted attempt to predict the next step; discard that of a rejected attempt."""
+    """Keep the polynomial of an accepted attempt to predict the next step; discard a rejected polynomial."""
     data = _aligned_view(memory)
     if accepted and data[field.TRIED] == 1.0:
         _accept_polynomial(data)

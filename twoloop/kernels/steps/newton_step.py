@@ -238,8 +238,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage, whose stiff directions differ least from those of other stages;
-            # at times between the stages, a force might act that acts at no stage
+            # compute derivatives at the middle stage, where stiff directions differ least from all other stages. At a
+            # time between the stages, a force might act that acts at no stage
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])
@@ -270,8 +270,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the state extrapolated to the middle stage may be so wrong that its derivatives are, for example those of
-        # friction: repeat with derivatives at the beginning of the step
+        # the state extrapolated to the middle stage, and with it derivatives such as those of friction, may be wrong:
+        # repeat with derivatives at the beginning of the step
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

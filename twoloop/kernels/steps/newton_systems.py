@@ -326,8 +326,8 @@ def _band_view(numbers, n, b):
 def _border_views(w, n, r, b):
     """Return views of three arrays stored after K: independent rows of C_q (r, n), D (n - r + 1, r), and indices (r).
 
-    C_q and D, a copy of w.D, belong to the state at which K was computed; the indices are those of the dependent
-    coordinates to which the columns of D belong.
+    C_q and D, a copy of w.D, belong to the state at which K was computed; the columns of D belong to the dependent
+    coordinates with these indices.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -623,8 +623,8 @@ def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, mo
 def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
     """Return whether the `entries` of K or D explain the difference between the residuals `base` and `residual` (n_q).
 
-    `base` is the residual at `base_point` (q or v), `residual` that at `moved`; `largest` is the largest term of
-    a residual. `residual` and `predicted` (n_q) are overwritten.
+    `base`, `residual`: residuals at `base_point` (q or v), and at `moved`. `largest`: largest term of a residual.
+    `residual` and `predicted` (n_q) are overwritten.
     """
     rows, columns, _ = tangent_entries_of(f.newton_program)
     predicted[:] = 0.0

@@ -155,7 +155,7 @@ PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 # indices of the vectors (n_q) after the blocks: accelerations, displaced positions and velocities, estimated errors of
 # positions and velocities, state and accelerations at the middle stage
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# indices of the parts of w.matrices, each with n_q^2 entries: the derivatives by q, those by v, the factors of the real
+# indices of the parts of w.matrices, each with n_q^2 entries: derivatives by q, derivatives by v, factors of the real
 # filter matrix, and from SYSTEMS on, two parts for each eigenvalue: the factors of a complex matrix
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
@@ -163,7 +163,7 @@ DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], tests_velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the entries of `options` for Newton's method, which follow those of `options_array`; see N_REAL.
+    """Return the entries of `options` for Newton's method, which follow the entries by `options_array`; see N_REAL.
 
     A must be diagonalizable. `tests_velocities`: whether the error of velocities is tested, too.
     """
@@ -207,9 +207,9 @@ def n_matrices(n_systems: int) -> int:
     return SYSTEMS + 2 * n_systems
 
 
-# `options` of a diagonally implicit method begin with those of Newton's method for one stage, A = [[gamma]], of which
-# NEWTON_OFFSET is the index of N_REAL. From DIAGONAL_OFFSET on, they contain the number of stages, A, c, b - b^, the
-# jump weights, and 1 if steps with an error estimate continue from the embedded formula, otherwise 0
+# `options` of a diagonally implicit method begin with the options of Newton's method for one stage, A = [[gamma]], in
+# which N_REAL has the index NEWTON_OFFSET. From DIAGONAL_OFFSET on, they contain the number of stages, A, c, b - b^,
+# the jump weights, and 1 if steps with an error estimate continue from the embedded formula, otherwise 0
 NEWTON_OFFSET = N_SCALARS + 2 + 5
 DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 

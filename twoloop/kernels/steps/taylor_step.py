@@ -249,7 +249,7 @@ def _fill_second_factors(options, table, values, y):
 def array_views(options, memory, n, n_rows):
     """Return views N, X1, Y1, X2, Y2, total1, total2, r and c of `memory`.
 
-    N contains the coefficients of the quantities, X1 to Y2 those of the arguments of early and late operations, total1
+    N contains coefficients of the quantities, X1 to Y2 coefficients of arguments of early and late operations, total1
     and total2 sums of products; r (n) and c (n_rows) are right-hand sides.
     """
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])

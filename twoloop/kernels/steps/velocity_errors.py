@@ -20,8 +20,8 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# a velocity error that changes as slowly as the motion is not due to a vibration: it has the same sign in later steps,
-# so that errors add up. Therefore its duration is multiplied by a factor, at most this one
+# largest factor on the duration of a velocity error that changes as slowly as the motion: no vibration causes the
+# error, which has the same sign in later steps, so that errors add up
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, in units of tolerances[GAP]
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
