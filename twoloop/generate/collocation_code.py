@@ -611,9 +611,9 @@ class CollocationCode:
                 num.store(builder.extract(a, last), target, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, work: Value, max_error: Value) -> None:
-        """Store NEXT_DEGREE, at most 2 from DEGREE: the lowest degree with an error of at most 1.2 times the least one.
+        """Store NEXT_DEGREE, within 2 of DEGREE: the lowest degree with an error of at most 1.2 times the least error.
 
-        `worst`: errors of the predictions of degree 1 to 8 at the end of the step.
+        `max_error`: errors of the predictions of degree 1 to 8 at the end of the step.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         least = num.negate(emit.max_over_lanes(emit.negate(max_error)))

@@ -38,7 +38,7 @@ from twoloop.problem.system import ConstrainedSystem
 DOUBLE_POINTER = f"{DOUBLE}*"
 # largest relative error of accelerations at a start with which generated code is used: in runs it grew up to 200 times
 LARGEST_LOSS = 1e-8
-# number of positions, and their distance, at which this error is tried to be measured until pivots are large enough
+# number of positions, and their distance, at which a measurement of this error is tried until pivots are large enough
 MAX_POSITIONS, DISTANCE = 4, 0.02
 
 

@@ -97,7 +97,7 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # with larger pivots, and one scale of added rows, random models kept 9 digits
+        # without refinement, random models kept 9 digits if pivots were larger, and all added rows had one scale
         is_refined = bool(choice.rows) and (choice.min_pivot <= MIN_PIVOTS[-1] or len(set(choice.scales)) > 1)
         choice = replace(choice, is_refined=choice.is_refined or is_refined)
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))

@@ -19,8 +19,9 @@ import numpy as np
 
 from twoloop.generate.graph import Affine, is_zero
 
-# largest change of accelerations by a step of refinement, relative to their size, after which they are valid: they may
-# then be off by as much, if a part of little inertia loses all digits, though most often by the square of it
+# largest change of accelerations by a step of refinement, relative to their size, after which they are valid. Their
+# error is then mostly the square of this change, but as large as the change if a part of little inertia loses all
+# digits
 LARGEST_CHANGE = 1e-7
 
 
@@ -369,8 +370,8 @@ def solve_refined(
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
     """Return a and lam of the independent rows for M a + G^T lam = r, G a = c, with refinement if `choice.is_refined`.
 
-    Also return conditions, pairs of expressions: the first one is larger than the second, unless the solution has lost
-    too many digits. Near equilibrium, where a is small, its size is that of the acceleration of all masses by r.
+    Also return conditions, pairs of expressions of which the first is larger than the second, unless the solution has
+    lost too many digits. If a is small, near equilibrium, it counts as large as the acceleration of all masses by r.
 
     `solve`: solution of a linear system with the factors of [M + s g^T g, G^T; G 0], where rows g are added to M as in
     PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.

@@ -265,7 +265,7 @@ class CheckedRegion:
         self._runs += 1
 
     def states_outside(self, states: Array) -> Array:
-        """Return those of `states` (rows [t, q, v]) that are outside `bounds`; all of them if there are no bounds."""
+        """Return the rows [t, q, v] of `states` that are outside `bounds`; all rows if there are no bounds."""
         if not self._ranges.size:
             return states
         smallest, largest = self.bounds

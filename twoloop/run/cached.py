@@ -214,7 +214,7 @@ class CachedIntegrator:
         return fields
 
     def _has_same_choice(self, t0: float, q0: Array) -> bool:
-        """Return whether the choice of pivots at a start, whose M and G are in the arrays, is that of the code."""
+        """Return whether the pivots of the code suit the start (T0, Q0), whose M and G are in the arrays."""
         system, arrays = self.evaluation.system, self.arrays
         system.remember_at("mass and rows", (t0, q0.tobytes()), (arrays.mass.copy(), arrays.rows.copy()))
         return self.code is not None and self.code.is_valid_from(system, t0, q0)
@@ -291,7 +291,7 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Describe the rows that are redundant beside these independent rows."""
+        """Store the redundant rows, and the warning about them, that belong to these independent rows."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows
@@ -431,7 +431,7 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # kernels do not compare rows added to M: Python makes a choice that may depend on this
+    # kernels do not compare rows added to M: if the choice is refined, Python has to make it
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]

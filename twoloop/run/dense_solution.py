@@ -242,7 +242,7 @@ class Interpolator:
     def _repair_interval(self, table: StateTable, group: Groups, smallest: float) -> None:
         """Cache other states for the polynomial of an interval if its residual with them is below `smallest`.
 
-        Tried are states of a step across a singular position, states of N_REPAIR_STEPS steps, and only the two ends.
+        The sets tried are states of a step across a singular position, states of N_REPAIR_STEPS steps, and two ends.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])

@@ -78,7 +78,7 @@ MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over th
 N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
 INITIAL_FACTOR = 0.1  # `initial_direction` times this is added to the last eigenvectors, so that no component stays 0
-# the dominant eigenvalue counts as negative if the cosine between a direction and its image is below -MIN_ALIGNMENT
+# the dominant eigenvalue is negative if the cosine between a direction and its image is below -MIN_ALIGNMENT
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
 # median of h * rate / limit over the samples from which on a problem counts as stiff. `rate`: fastest rate of vibration

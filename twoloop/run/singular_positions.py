@@ -192,7 +192,7 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-# rounding errors are estimated along singular vectors with at most this singular value, relative to the largest
+# singular value, relative to the largest, up to which rounding errors are estimated along its singular vector
 WEAK_RATIO = 1e-2
 # SMALL_PIVOT: with smaller ratios of pivots, rounding errors are always estimated; PIVOT_FACTOR: typical ratio of
 # pivots, divided by the ratio of singular values

@@ -109,12 +109,12 @@ def _derivative_entries(
     return entries
 
 
-# a direction of a body has no mass if its eigenvalue of M, relative to the largest one, is at most this
+# eigenvalue of M, relative to the largest one, up to which a direction of a body has no mass
 MASSLESS_RATIO = 1e-10
 # smallest norm of a row's component along massless directions, relative to the norm of the row, with which the row can
 # give a body a mass in these directions
 MIN_MASSLESS_FRACTION = 1e-3
-# Newton's matrix has sparse factors if the number of coordinates, relative to LARGE, is at least this
+# number of coordinates, relative to LARGE, from which on Newton's matrix has sparse factors
 MIN_SIZE_NEWTON = 1.6
 MAX_STATIC_SHARE = 0.05  # the static form has at most this share of the entries, and operations, of dense factors
 

@@ -9,7 +9,7 @@ from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ld
 
 # rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# a row is orthogonalised again if the squared norm of its orthogonal part, relative to that of the row, is smaller
+# squared norm of the orthogonal part of a row, relative to the whole row, below which it is orthogonalised again
 REORTHOGONALISE_BELOW = 0.5
 
 
@@ -81,7 +81,7 @@ def independent_rows(G, min_sine, basis, factors, kept):
 
 @merged
 def _fill_coefficients(n, basis, factors, row, coefficients):
-    """Store the `coefficients` (n) of that combination of the n selected rows which is nearest to `row`."""
+    """Store the `coefficients` (n) of the combination of the n selected rows that is nearest to `row`."""
     for k in range(n):
         coefficients[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -144,20 +144,21 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # largest amount, relative to a bound of pivots, by which rounding may put a pivot below it
+BOUND_ROUNDING = 1e-12  # largest rounding error of a pivot, relative to the bound with which it is compared
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
-# smallest ratio of the smallest to the largest eigenvalue of M at which the pivots of S = G M^-1 G^T decide which rows
-# are independent, and no row must be added to M. A pivot above INDEPENDENT shows that the part of the row that is
-# orthogonal to the rows before it is at least 3e-9 of the row; for a dependent row, this part must be at most DEPENDENT
+# SIMILAR_EIGENVALUES: ratio of the smallest to the largest eigenvalue of M above which no row is added to M, and the
+# pivots of S = G M^-1 G^T decide which rows are independent. If a pivot is above INDEPENDENT, the part of the row that
+# is orthogonal to the rows before it is at least 3e-9 of the row; for a dependent row, this part must be at most
+# DEPENDENT
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
-# largest coefficient of an independent row in a redundant one, both scaled to norm 1: above it the two rows are
-# exchanged. If the coefficient passes through zero during the motion, the independent rows become dependent, as at each
-# dead centre of the slider-crank with two rods; hence redundant rows with large coefficients become independent ones.
-# The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
+# coefficient of an independent row in a redundant row, both scaled to norm 1, above which the two rows are exchanged.
+# If a coefficient passes through zero during the motion, the independent rows become dependent, as at each dead centre
+# of the slider-crank with two rods: rows with large coefficients should be independent. The limit exceeds 1, because
+# equal coefficients of magnitude 1 are common, and must not lead to exchanges
 MAX_COEFFICIENT = 1.5
-# two coefficients are tied, and the first row decides, up to this ratio: in symmetrical mechanisms many are equal,
-# and rounding would decide among them, at each start anew
+# ratio up to which two coefficients count as equal, and the first row is chosen: in symmetrical mechanisms, rounding
+# would choose among many equal coefficients, differently at each start
 TIE_RATIO = 1.01
 # largest entry of a row, relative to its largest entry, that counts as zero: rounding of a start leaves such entries
 ZERO_ENTRY = 1e-12
@@ -324,7 +325,7 @@ def _exchange_rows(C, is_kept, kept):
 def _fill_scaled_products(mass, G, factors, solved, S, sizes):
     """Store the upper triangle of S = G M^-1 G^T, scaled to a diagonal of 1, in S; return whether M is definite.
 
-    `sizes` receives the factors that scale the rows; 0 for a row of zeros. `factors` and `solved` are scratch.
+    `sizes` receives the factors that scale the rows, or 0 for a row of zeros. `factors` and `solved` are scratch.
     """
     n_rows, n = G.shape
     copy_matrix(mass, factors)
