@@ -644,6 +644,7 @@ class CollocationCode:
     # methods that write parts of the functions
 
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, program: Program) -> None:
+        """Project states at the ends of eight steps by a program that gives "moved", the change, and new values."""
         emit.numbers = emit.constants = numbers
         inputs = [load_lanes(emit, work, self.end_offset + LANES * k) for k in range(1 + 2 * self.n)]
         lowering, arrays = lower_program(emit, program, inputs, self.numbers)
@@ -665,6 +666,7 @@ class CollocationCode:
         self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], is_valid)
 
     def _end_offsets(self) -> dict[str, int]:
+        """Return where `work` contains the quantities at the ends of steps, by name."""
         return {
             "q": self.end_offset + LANES,
             "v": self.end_offset + LANES * (1 + self.n),

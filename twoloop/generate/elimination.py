@@ -330,6 +330,7 @@ class Elimination:
         return elementwise(Affine.as_term, [self.equations.expressions(kind, v)])
 
     def _redundant_rows(self, rates: Any) -> Program:
+        """Return a program whose conditions hold if a state satisfies the redundant rows; `rates`: C_t and b."""
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
         violations = self._callback_terms("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
@@ -573,6 +574,7 @@ class Solution:
         return [self._c[k] for k in self._choice.rows]
 
     def _make_solution_program(self) -> Program:
+        """Return the program for "a" and "lam", the solution of the equations of motion."""
         lam = [self._zero] * len(self._c)
         solution, conditions = solve_refined(self._solve, self._choice, self._mass, self._rows, self._r, self._c)
         for k, value in zip(self._choice.rows, solution[self._n :], strict=True):

@@ -482,6 +482,7 @@ class Derivative:
         return total
 
     def _differentiate_quantity(self, i: int) -> Affine:
+        """Return the derivative of quantity i; first, differentiate the quantities on which it depends."""
         stack = [i]  # an explicit stack, as products may be nested more deeply than Python allows recursion
         while i not in self._derivatives:
             op = self.graph.operations[stack[-1]]
@@ -502,6 +503,7 @@ class Derivative:
         return self._derivatives[i]
 
     def _differentiate_operation(self, i: int, kind: int, first: Affine, second: Affine | None) -> Affine:
+        """Return the derivative of quantity i, the result of an operation on two expressions."""
         result, change = self.graph.quantity(i), self.differentiate(first)
         if kind == op.PRODUCT:
             assert second is not None

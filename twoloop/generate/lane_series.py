@@ -249,7 +249,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return terms and constant of each expression in `sums`; `rows`: their indices, to which `sums.row` refers."""
+        """Return terms and constant of each expression in `sums`; `rows`: its number in `sums.row`."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True

@@ -623,6 +623,7 @@ class ParameterArrays:
         return self._arrays[id(exprs)][1]
 
     def _numbers_for(self, exprs: Any) -> Array:
+        """Return an array of numbers for `exprs`: constants now, values of Parameters when `write` is called."""
         entries, begin = exprs.ravel().tolist(), len(self._scales)
         varying = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in varying:

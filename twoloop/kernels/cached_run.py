@@ -238,6 +238,7 @@ def _has_consistent_rows(w, b, n):
 
 @merged
 def _evaluate_start(checked_kit, b, t, q, v, sizes, shifts):
+    """Evaluate all callbacks at a start, store the results in arrays of `b`; return the flags, see `evaluate_start`."""
     for k in range(b.start_values.size):
         b.start_values[k] = 0.0
     return b.evaluate_start(checked_kit, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings)

@@ -340,7 +340,7 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Return a dict with the deferred field `name` of a result, and with other fields that are computed with it."""
+    """Return a dict with the deferred field `name` of a result and the fields that the same computation gives."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -559,6 +559,7 @@ def _new_entry(run: Run, code: GeneratedCode | None, t1: float, options: Options
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
+    """Return `trace_cache_of` a system, which the system remembers."""
     cache: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
     return cache
 

@@ -494,6 +494,7 @@ class DenseState:
 
     @cached_property
     def _a_and_lam(self) -> Array:
+        """Return accelerations and multipliers in one array, a row for each time in ascending order."""
         system, times = self._interpolator.system, np.atleast_1d(self.t)[self._order]
         out = np.empty((len(times), system.n_q + system.n_c + system.n_a))
         with signals_of(system):

@@ -156,7 +156,7 @@ class IntegrationLoop:
     """Loop that integrates a run to its end, and records it.
 
     The run is at its start, or after a first chunk of steps, which `add_first_chunk` then records. In the second case,
-    `start` is the row [q, v, a, lam] at the start. `system`: the system of the result, if that of the run is a copy
+    `start` is the row [q, v, a, lam] at the start. `system`: the system of the result, if the run has a copy of it
     whose arrays will be overwritten. `report` is called with the time reached after each chunk. `is_final_attempt`:
     whether the run warns if it may have missed short changes; else the caller repeats it.
     """
@@ -403,6 +403,7 @@ class IntegrationLoop:
         return is_too_small and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
 
     def _build_record(self, check_derivatives: bool) -> Record:
+        """Return the record of the ended run; cut what was stored after an interruption or the event that ended it."""
         run, recorder, code = self.run, self.recorder, self.code
         t, table = recorder.output()
         stats, store = statistics(run.work.counters, self.cpu_time), self.request.store

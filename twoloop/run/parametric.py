@@ -143,6 +143,7 @@ def _values_of_plans(run: Run) -> list[Any]:
 
 
 def _values_of_plan(plan: Plan) -> Iterator[Any]:
+    """Yield the values of a plan and of the plans in it, for comparison with another plan."""
     for name, value in vars(plan).items():
         if isinstance(value, Plan):
             yield from _values_of_plan(value)

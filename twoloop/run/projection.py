@@ -454,6 +454,7 @@ def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff
 
 
 def _rank(scaled: Array) -> int:
+    """Return the number of singular values above RANK_CUTOFF times the largest one."""
     values = np.linalg.svd(scaled, compute_uv=False)
     return int((values > RANK_CUTOFF * max(float(values.max(initial=0.0)), 1e-300)).sum())
 

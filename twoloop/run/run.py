@@ -190,7 +190,7 @@ class Run:
         """Take compiled steps to the last output time, or until Python must act; return the code of the reason.
 
         Steps must end at the times `outputs`. `filled` becomes the numbers of states and of steps in the buffers.
-        `active`: plan, controls and kit for this call, if they are not those of the run.
+        `active`: plan, controls and kit for this call, if they differ from `plan`, `control` and `kit`.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
         tolerances = self.tolerances if plan is self.plan else self.crossing_tolerances

@@ -112,6 +112,7 @@ class SampledRun:
         self._store_sample(t0)
 
     def _create_run(self, t: float, q: Array, v: Array) -> Run:
+        """Return a run that starts at a state; raise ValueError if the position is singular."""
         run = Run(self._derived_system, self._plan.fresh(), t, q, v, *self._tolerances, None)
         allowed = self._tolerances[1] + self._tolerances[0] * np.abs(v).max()
         if run.static_form is None and branch_at(self._derived_system, t, run.state, run.rank, allowed) is not None:

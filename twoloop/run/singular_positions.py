@@ -66,6 +66,7 @@ def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) ->
 
 
 def _ratio(rows: Array, rank: int) -> float:
+    """Return the ratio of the `rank`-th largest singular value to the largest; 1 if there are no rows."""
     values = np.linalg.svd(rows, compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 

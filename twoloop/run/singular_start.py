@@ -26,9 +26,9 @@ CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
 # largest relative error of derivatives by finite differences; smaller derivatives count as 0
 MAX_DIFFERENCE_ERROR = 1e-8
-# the rank rises if zero singular values of C_q have larger derivatives than this, relative to those of C_q
+# the rank rises if derivatives of zero singular values, relative to the derivatives of C_q, are larger than this
 MIN_RANK_DERIVATIVE = 1e-6
-# smallest derivative of the rows along v that counts, relative to that along a velocity of the size of its tolerance
+# smallest derivative of the rows along v that counts, relative to the derivative along a velocity of tolerance size
 MIN_CLARITY = 10.0
 # relative change of the rows. BESIDE_CHANGE: from the start to a state beside it; STEP_CHANGE: in the first trial step
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6

@@ -169,6 +169,7 @@ def add_newton_program(system: ConstrainedSystem, t0: float, q0: Array, form: St
 
 
 def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
+    """Return the static form of a sparse system, or None if dense factorizations are expected to be faster."""
     pattern, mass_pattern = np.zeros((0, system.n_q)), np.zeros((0, 0))
     dense_mass = False
     if "jacobian" in system.entries:

@@ -406,7 +406,7 @@ def _compile_with_writable_inputs(
 ) -> Dispatcher:
     """Compile a callback with writable inputs, because its helpers may not accept read-only arrays.
 
-    Raises TypeError if the callback itself writes to its inputs. `error`: that of compilation with read-only inputs.
+    Raises TypeError if the callback itself writes to its inputs. `error`: raised with read-only inputs.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)

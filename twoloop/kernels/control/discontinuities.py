@@ -56,6 +56,7 @@ def _sample_rates(f, w, t, q, velocity, begin, end):
 
 @compiled
 def _twelfth_difference(w, row):
+    """Return the absolute value of the twelfth difference of the samples w.rates[:, row]."""
     total = 0.0
     for k in range(N_PARTS + 1):
         total += BINOMIAL[k] * w.rates[k, row]

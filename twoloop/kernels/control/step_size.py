@@ -12,7 +12,7 @@ Errors that the embedded formula does not show are measured in two ways:
   the wrong assembly with a small difference. But then det C_qd changes its sign, which along a motion happens only at a
   singular position. So if the sign changes in a step, the prediction must be nearly exact, as in short steps through a
   singular position.
-- `defect_ratio` is the defect of a Taylor step: the difference between the accelerations of the series and those of the
+- `defect_ratio` is the defect of a Taylor step: the difference between the accelerations by the series and by the
   equations at the same states. A series contains the forces at the beginning of the step, but no later sudden change.
   So the equations are evaluated at the end of the step, and within it at times at most tolerances[DEFECT_GAP] apart.
 """

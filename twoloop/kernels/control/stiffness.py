@@ -62,7 +62,7 @@ STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limi
 # is computed by finite differences, which take about eight evaluations per coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-# smallest cost of the run so far, in trials, at which a trial that may not pay can begin
+# a trial that may not pay begins only if the run so far has cost at least as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
 # cost of the run, in units of MIN_COST_IN_TRIALS trials, at which a trial begins whatever the rates are. After k

@@ -248,7 +248,7 @@ def record_entries(w):
 def choose_partition(f, w, t, q):
     """Choose and store the dependent and independent coordinates and the independent rows at (t, q); return a code.
 
-    The code is SINGULAR if the rank is less than that of the previous partition. It is RANK_DIFFERS, with the ranks in
+    The code is SINGULAR if the rank is less than the previous partition's. It is RANK_DIFFERS, with the ranks in
     w, if this is the first partition and the workspace is allocated for other ranks.
     """
     w.entries[:] = 0.0

@@ -6,7 +6,7 @@ factors do not show which rows are independent, a task returns NEEDS_DENSE, and 
 saddle_point.py, which methods with a partition always use. If callbacks return values of entries, no array has n_c
 times n_q numbers. Callbacks may also fill dense matrices, from which the entries are copied.
 
-If rows are redundant, multipliers have the least norm. Of all lam with G^T lam = b, that of least norm is G x for some
+If rows are redundant, multipliers have the least norm. Of all lam with G^T lam = b, the shortest is G x for some
 x, and both solve
 
     [0  G^T] [ x ]   [b]

@@ -3,8 +3,8 @@
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
 
-The order of elimination is that of symbolic_factorization.py with couplings; pivots are single entries, chosen by the
-pattern alone. The program lists the entries of M first, then those of K and D. It ends with groups of columns of K and
+The order of elimination is chosen by symbolic_factorization.py with couplings; pivots are single entries, chosen by the
+pattern alone. The program lists the entries of M, then of K and D. It ends with groups of columns of K and
 D: no two columns of a group have an entry in the same row, so that one displacement gives all columns of the group by
 differences (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 """

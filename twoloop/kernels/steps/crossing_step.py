@@ -40,7 +40,7 @@ MAX_SWEEPS, FEW_SWEEPS = 40, 12
 DISTANCE_FACTOR = 2.0
 MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of
-# `begin_polynomial`. BEGIN, DURATION, END (s): those of the polynomial of the last converged attempt; END = -inf: none
+# `begin_polynomial`. BEGIN, DURATION, END (s): of the polynomial of the last converged attempt; if none, END = -inf
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
 # duration of the shortest and of the longest step along the polynomial, relative to the duration of the polynomial
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2

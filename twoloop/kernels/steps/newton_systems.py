@@ -235,7 +235,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store J_q, or J_v if `by_v`, at (t, q, v) with the accelerations a in J; return a code. Others: scratch."""
+    """Store J_q, or J_v if `by_v`, in J, at (t, q, v) with accelerations a; return a code. Other arrays are scratch."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     for column in range(w.independent.size):
         j = w.independent[column]
@@ -695,7 +695,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store the right-hand side [M r; G r] of the bordered system in `right`, with M stiffened by redundant rows."""
+    """Store [M r; G r], the right-hand side of the bordered system, in `right`; redundant rows add stiffness to M."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)

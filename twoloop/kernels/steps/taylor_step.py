@@ -457,7 +457,7 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 @compiled
 def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the first defect within the step that is too large, or 0; update w.defect by smaller defects.
+    """Return the first defect within the step that is too large, or 0; w.defect becomes the largest allowed defect.
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
