@@ -351,17 +351,19 @@ def _fill_scaled_products(mass, G, factors, solved, S, sizes):
 
 @compiled
 def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
-    """Set `is_kept` to 0 for each row that depends on the rows before it, else to 1; return whether there is no doubt.
+    """Set `is_kept` to 0 for each row that depends on the rows before it, else to 1; return the largest 1 / pivot.
 
+    Returns 0 if a row is neither dependent nor independent beyond doubt.
     For S and `sizes` see `_fill_scaled_products`. C[i, k] receives the coefficient of row k in a dependent row i, both
     scaled to norm 1. U and `remainder` are scratch.
     """
-    n_rows = len(S)
+    n_rows, largest_inverse = len(S), 1.0
     copy_matrix(S, U)
     for k in range(n_rows):
         is_kept[k] = 1 if U[k, k] > INDEPENDENT else 0
         if is_kept[k] == 1:
             U[k, k] = 1.0 / U[k, k]
+            largest_inverse = max(largest_inverse, U[k, k])
             for i in range(k + 1, n_rows):
                 if U[k, i] != 0.0:
                     factor = U[k, i] * U[k, k]
@@ -383,11 +385,11 @@ def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
                     for j in range(remainder.size):
                         remainder[j] -= coefficient * sizes[i] * G[i, j]
         if not math.sqrt(_dot(remainder, remainder)) <= DEPENDENT * norm:
-            return False
+            return 0.0
         for i in range(k):
             if C[k, i] != 0.0:
                 C[k, i] *= sizes[i] * math.sqrt(_dot(G[i], G[i])) / norm
-    return True
+    return largest_inverse
 
 
 @merged
@@ -399,19 +401,20 @@ def _fill_shifted(S, kept, shift, shifted):
 
 
 @compiled
-def _first_bound_below_pivots(S, kept, n_kept, bounds, scratch):
+def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch):
     """Return the index of the first entry of `bounds` below all pivots of the rows `kept`; bounds.size if none is.
 
     Pivots are relative to the diagonal entries of G M^-1 G^T. No pivot is below the smallest eigenvalue of S, which is
     scaled to a diagonal of 1, and this eigenvalue exceeds a bound b if S - b I is positive definite. It is at most the
-    smallest pivot of S: larger bounds need no test.
+    smallest pivot of S, 1 / `largest_inverse` (0: unknown): larger bounds need no test.
     """
-    shifted, largest_inverse = scratch[: n_kept * n_kept].reshape((n_kept, n_kept)), 0.0
-    _fill_shifted(S, kept, 0.0, shifted)
-    if not ldl_factor(shifted):
-        return bounds.size
-    for k in range(n_kept):
-        largest_inverse = max(largest_inverse, shifted[k, k])
+    shifted = scratch[: n_kept * n_kept].reshape((n_kept, n_kept))
+    if largest_inverse == 0.0:
+        _fill_shifted(S, kept, 0.0, shifted)
+        if not ldl_factor(shifted):
+            return bounds.size
+        for k in range(n_kept):
+            largest_inverse = max(largest_inverse, shifted[k, k])
     for index in range(bounds.size):
         shift = bounds[index] * (1.0 - BOUND_ROUNDING)
         if shift * largest_inverse < 1.0:
@@ -465,11 +468,13 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
     U, S, C = matrices[:n_rows], matrices[n_rows : 2 * n_rows], matrices[2 * n_rows :]
     chosen[1], workspace[0] = 0, 1.0
     smallest, largest = _eigenvalue_bounds(original_mass)
-    is_definite = smallest > SIMILAR_EIGENVALUES * largest
-    is_definite = is_definite and _fill_scaled_products(original_mass, G, A, solved, S, sizes)
-    if is_definite and _find_dependent_rows(S, G, sizes, U, C, x, order):
+    is_definite, largest_inverse = smallest > SIMILAR_EIGENVALUES * largest, 0.0
+    if is_definite and _fill_scaled_products(original_mass, G, A, solved, S, sizes):
+        largest_inverse = _find_dependent_rows(S, G, sizes, U, C, x, order)
+    if largest_inverse > 0.0:
         chosen[0] = n_kept = _exchange_rows(C, order, kept)
-        first_bound = _first_bound_below_pivots(S, kept, n_kept, bounds, scratch)
+        largest_inverse = largest_inverse if n_kept == n_rows else 0.0  # unknown if rows were exchanged
+        first_bound = _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
         if first_bound < bounds.size:  # the chosen rows are independent beyond doubt
             return first_bound
     _select_dependent_rows(G, min_sine, basis, factors, sizes, C, kept, order)
@@ -485,4 +490,4 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
         return n_added
     if not _fill_scaled_products(mass, G, A, solved, S, sizes):
         return NOT_DEFINITE
-    return _first_bound_below_pivots(S, kept, n_kept, bounds, scratch)
+    return _first_bound_below_pivots(S, kept, n_kept, 0.0, bounds, scratch)
