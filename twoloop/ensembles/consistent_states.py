@@ -146,7 +146,7 @@ class _LaneProjection:
         control = np.concatenate([[starts.t0], np.zeros(layout.ATOL - 1 + n), code.numbers.values])
         n_vectors = (
             layout.array_offsets(n, n_rows, code.n_numbers)[-1]
-            + kernels.offsets_in_memory(n, n_rows, len(code.pattern) - n_rows - 1, n_redundant)[-1]
+            + kernels.offsets_in_memory(0, n, n_rows, len(code.pattern) - n_rows - 1, n_redundant)[-1]
         )
 
         def project_block(rows: slice) -> None:

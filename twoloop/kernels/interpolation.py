@@ -8,7 +8,7 @@ import numpy as np
 from numba import types
 
 from twoloop.kernels.data import indices as kinds
-from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, compiled, f8, i8, kernel, merged
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, compiled, f8, i8, inlined, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, GAMMA_INACCURATE, NULL_SPACE, REPORTED_ERROR, RTOL, SINGULAR
 from twoloop.kernels.evaluation.inner_loop import accelerations, find_tangents, renew_partition, restore_constraints
 from twoloop.kernels.evaluation.partition import min_pivot_ratio, partition_is_poor
@@ -103,6 +103,23 @@ def _kind_by_duration(kind, tolerances, h, states, i):
     return kind
 
 
+@inlined
+def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
+    """Store the polynomials of an interval, a row of the table of intervals, in (z_q, c_q) and (z_v, c_v).
+
+    Returns kind and duration of the interval, first and last node, number of derivatives at a node, and the numbers of
+    coefficients of both polynomials.
+    """
+    i, last, kind = group[kinds.FIRST_OWN], group[kinds.LAST_OWN], group[kinds.KIND]
+    h = t[last] - t[i]
+    kind = kind if kind == kinds.JUMP else _kind_by_duration(kind, tolerances, h, states, i)
+    lo, hi = _node_range(group[kinds.LOW], group[kinds.HIGH], i, last)
+    order = 3 if kind >= kinds.ACCELERATIONS else 2
+    size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
+    size_v = _divided_differences(t, states, lo, hi, i, h, c_v.shape[1], 2, z_v, c_v) if kind == kinds.SEPARATE else 0
+    return kind, h, lo, hi, order, size, size_v
+
+
 @merged
 def _velocity_change(tolerances, v_before, v):
     """Return the largest change of a velocity from v_before to v, relative to its tolerance."""
@@ -145,13 +162,9 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
     has_D = f.form == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
     failures = 0
     for g in range(groups.shape[0]):
-        i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
-        h = t[last] - t[i]
-        kind = kind if kind == kinds.JUMP else _kind_by_duration(kind, tolerances, h, states, i)
-        lo, hi = _node_range(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
-        order = 3 if kind >= kinds.ACCELERATIONS else 2
-        size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
-        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.SEPARATE else 0
+        i, last = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN]
+        fit = _fit_polynomials(tolerances, t, states, groups[g], z_q, c_q, z_v, c_v)
+        kind, h, _, _, _, size, size_v = fit
         # choose independent coordinates anew in each interval, so that results do not depend on other output times
         has_partition = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
@@ -248,13 +261,9 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
     z_q, z_v, c_q, c_v = z[:half], z[half:], coefficients[:half], coefficients[half:]
     q, v, q_1, v_1 = rows[0, :n], rows[0, n:], rows[1, :n], rows[1, n:]
     for g in range(groups.shape[0]):
-        i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
-        h = t[last] - t[i]
-        kind = kind if kind == kinds.JUMP else _kind_by_duration(kind, tolerances, h, states, i)
-        lo, hi = _node_range(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
-        order = 3 if kind >= kinds.ACCELERATIONS else 2
-        size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
-        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.SEPARATE else 0
+        i, last = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN]
+        fit = _fit_polynomials(tolerances, t, states, groups[g], z_q, c_q, z_v, c_v)
+        kind, h, lo, hi, order, size, size_v = fit
         out[g] = 0.0
         if kind < kinds.ACCELERATIONS and last == i + 1 and hi - lo > 1 and _has_similar_gaps(t, lo, hi):
             continue

@@ -28,6 +28,7 @@ from twoloop.kernels.control.step_size import project_and_evaluate
 from twoloop.kernels.data.common import allowed_error, compiled, finite_vector
 from twoloop.kernels.data.indices import ATOL, DONE, GAP, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
+from twoloop.kernels.linalg.dense import largest_of
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
 N_PARTS = 12  # number of equal parts of an interval; C_t and b are sampled at the ends of the parts
@@ -198,12 +199,10 @@ def _sample_forces(f, w, time, elapsed, q, v, a, values):
 
 
 @compiled
-def _largest_value(values):
-    """Return the largest of `values`, the scale for all components of a vector; 0 if all are negative."""
-    largest = 0.0
-    for x in values:
-        largest = max(largest, x)
-    return largest
+def _least_ranges(tolerances, largest, n):
+    """Return the smallest ranges of samples that matter, of forces (the first n components) and of C_t and b."""
+    least = LEAST_RANGE * tolerances[RTOL]
+    return max(LEAST_VALUE, least * largest_of(largest[:n])), max(LEAST_VALUE, least * largest_of(largest[n:]))
 
 
 @compiled
@@ -323,9 +322,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
         if t_first < np.inf:
             break
         n = k
-    relative_range = LEAST_RANGE * tolerances[RTOL]
-    min_force_range = max(LEAST_VALUE, relative_range * _largest_value(changes[LARGEST_ROW, : q.size]))
-    min_rate_range = max(LEAST_VALUE, relative_range * _largest_value(changes[LARGEST_ROW, q.size :]))
+    min_force_range, min_rate_range = _least_ranges(tolerances, changes[LARGEST_ROW], q.size)
     bend, column, limit = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]
@@ -349,9 +346,7 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
         return
     for k, time in enumerate((t - 2.0 * spacing, t - spacing, end + spacing, end + 2.0 * spacing)):
         _sample_forces(f, w, min(max(time, begin), last), 0.0, q, v, a, changes[k + (k > 1)])
-    relative_range = LEAST_RANGE * tolerances[RTOL]
-    min_force_range = max(LEAST_VALUE, relative_range * _largest_value(changes[LARGEST_ROW, : q.size]))
-    min_rate_range = max(LEAST_VALUE, relative_range * _largest_value(changes[LARGEST_ROW, q.size :]))
+    min_force_range, min_rate_range = _least_ranges(tolerances, changes[LARGEST_ROW], q.size)
     for k in range(N_SAMPLES_IN_SHORT_STEP):
         time = t + k * size / N_SAMPLES_IN_SHORT_STEP
         _sample_forces(f, w, time, 0.0, q, v, a, changes[2])

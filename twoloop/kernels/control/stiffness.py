@@ -345,13 +345,6 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     return -1
 
 
-@compiled
-def _clear_memory(memory):
-    """Set a method's memory to zeros, as at the beginning of a run."""
-    for i in range(memory.size):
-        memory[i] = 0.0
-
-
 @kernel(COMMIT)
 def commit_switching(f, w, options, memory, tolerances, accepted):
     """Commit or discard the attempted step in the memory of the active method, and count it if it is accepted."""
@@ -390,7 +383,8 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             was_explicit = _is_explicit(memory)
             _begin_phase(w, options, memory, phase, t)
             if was_explicit != _is_explicit(memory):
-                _clear_memory(second if was_explicit else first)
+                started = second if was_explicit else first
+                started[:] = 0.0
     is_explicit = _is_explicit(memory)
     w.explicit_step = 1.0 if is_explicit else 0.0
     begin = N_OPTIONS + int(options[SIZE_1])
@@ -401,7 +395,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         # a step of fixed size that does not converge cannot be shortened: use the implicit method from now on
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != STATIC:
             _begin_phase(w, options, memory, IMPLICIT, t)
-            _clear_memory(second)
+            second[:] = 0.0
             w.explicit_step = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:

@@ -27,7 +27,6 @@ from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates, gamma_by_differences, kinematics, row_residual
 from twoloop.kernels.evaluation.operations import gamma_by_program
 from twoloop.kernels.evaluation.partition import (
-    AMPLIFICATION,
     CONTRACTION,
     MAX_ITERATIONS,
     MIN_CORRECTION,
@@ -38,7 +37,7 @@ from twoloop.kernels.evaluation.partition import (
     evaluate_and_factor_columns,
     factor_dependent_columns,
     find_null_space,
-    is_on_constraints,
+    is_rounding_of_positions,
     record_entries,
     restore_positions,
     restore_velocities,
@@ -226,8 +225,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
             w.has_gamma = 0.0  # Gamma was computed at the old velocities: compute it again
             break
         if correction_q > CONTRACTION * last_correction:
-            limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            if not (correction_q <= limit or (correction_q <= AMPLIFICATION * limit and is_on_constraints(w, q))):
+            if not is_rounding_of_positions(w, q, correction_q):
                 return INNER_DIVERGED
             break
         last_correction = max(correction_q, theta)

@@ -116,20 +116,26 @@ def min_pivot_ratio(f, w, t, q):
         return w.pivot
     if w.rows_v.size == 0:
         return 1.0
-    G, order, row_order = w.Gx, w.order, w.row_order
+    G = w.Gx
     G[:, :] = 0.0
     constraint_rows(f, w, t, q, G)
-    for j in range(order.size):
-        order[j] = j
-    for i in range(row_order.size):
-        row_order[i] = i
-    rank = full_pivoting(G, order, row_order, w.g, 0, row_order.size, w.rows_v.size)
+    rank = _pivot_rows(w, w.Rate.size, w.rows_v.size)
     if rank < w.rows_v.size:
         return 0.0
     smallest, largest = np.inf, 0.0
     for k in range(rank):
         smallest, largest = min(smallest, abs(G[k, k])), max(largest, abs(G[k, k]))
     return smallest / largest
+
+
+@compiled
+def _pivot_rows(w, n_rows, max_rank):
+    """Eliminate the first `n_rows` rows of w.Gx by full pivoting, in a new order; return their rank."""
+    for j in range(w.order.size):
+        w.order[j] = j
+    for i in range(w.row_order.size):
+        w.row_order[i] = i
+    return full_pivoting(w.Gx, w.order, w.row_order, w.g, 0, n_rows, max_rank)
 
 
 @compiled
@@ -141,11 +147,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     G, order, row_order = w.Gx, w.order, w.row_order
     n_c, n_rows = w.C.size, w.Rate.size
     scale_rows(G)
-    for j in range(order.size):
-        order[j] = j
-    for i in range(n_rows):
-        row_order[i] = i
-    rank = full_pivoting(G, order, row_order, w.g, 0, n_c, max_rank)
+    rank = _pivot_rows(w, n_c, max_rank)
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
@@ -164,17 +166,10 @@ def smallest_pivot(f, w, t, q):
     rank = w.rows.size
     if rank == 0:
         return 1.0
-    G, order, row_order = w.Gx, w.order, w.row_order
-    G[:, :] = 0.0
-    constraint_rows(f, w, t, q, G)
-    scale_rows(G)
-    for j in range(order.size):
-        order[j] = j
-    for i in range(row_order.size):
-        row_order[i] = i
-    if full_pivoting(G, order, row_order, w.g, 0, w.C.size, rank) < rank:
-        return 0.0
-    return abs(G[rank - 1, rank - 1])
+    w.Gx[:, :] = 0.0
+    constraint_rows(f, w, t, q, w.Gx)
+    scale_rows(w.Gx)
+    return abs(w.Gx[rank - 1, rank - 1]) if _pivot_rows(w, w.C.size, rank) == rank else 0.0
 
 
 @merged
@@ -410,7 +405,14 @@ def evaluate_and_factor_columns(f, w, t, q):
 
 
 @compiled
-def is_on_constraints(w, q):
+def is_rounding_of_positions(w, q, correction):
+    """Return whether a correction of q may be due to rounding, see ROUNDING_OF_CORRECTIONS and AMPLIFICATION."""
+    limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
+    return correction <= limit or (correction <= AMPLIFICATION * limit and _is_on_constraints(w, q))
+
+
+@compiled
+def _is_on_constraints(w, q):
     """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
     for i in range(w.C.size):
         largest_term = 0.0
@@ -460,8 +462,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
         if not has_converged and correction > CONTRACTION * last_correction:
             # accept a correction that is due to rounding; otherwise Newton's method has left its region of convergence,
             # and could converge to another assembly of the mechanism
-            limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            has_converged = correction <= limit or (correction <= AMPLIFICATION * limit and is_on_constraints(w, q))
+            has_converged = is_rounding_of_positions(w, q, correction)
             if not has_converged:
                 return INNER_DIVERGED
         last_correction = correction

@@ -153,22 +153,6 @@ def copy_vectors(work, source, target, count):
         work[target * LANES + i] = work[source * LANES + i]
 
 
-@compiled
-def sum_rows(weights, rows, total):
-    """Store in `total` the sum over k of weights[k] rows[k]; four rows are added at once, so that LLVM vectorises."""
-    remainder = weights.size % 4
-    for m in range(total.size):
-        total[m] = 0.0
-    for k in range(remainder):
-        weight, row = weights[k], rows[k]
-        for m in range(total.size):
-            total[m] += weight * row[m]
-    for k in range(remainder, weights.size, 4):
-        a, b, c, d = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
-        for m in range(total.size):
-            total[m] += (a * rows[k, m] + b * rows[k + 1, m]) + (c * rows[k + 2, m] + d * rows[k + 3, m])
-
-
 @merged
 def _add_four(work, t, p, q, sign):
     """Add sign * x * y to a vector in four adjacent lanes; t, p and q are indices in `work` of the vector, x and y."""

@@ -25,9 +25,9 @@ from twoloop.kernels.lanes.layout import (
     offsets_in_work,
     raise_to_ratio,
     solve_systems,
-    sum_rows,
     vector_range,
 )
+from twoloop.kernels.linalg.dense import sum_rows
 from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import (
     GAMMA0,

@@ -214,8 +214,8 @@ N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
-def offsets_in_memory(n, n_rows, n_entries, n_redundant):
-    """Return the offsets, in vectors, of the parts of the method's memory, and its length.
+def offsets_in_memory(memory, n, n_rows, n_entries, n_redundant):
+    """Return the offsets, in vectors, of the parts of the method's memory, which begins at `memory`, and its end.
 
     The memory begins with C and C_t (n_rows each), and the entries of G; the generated code writes these parts. The
     other parts are a right-hand side x (n_rows); a change of positions or velocities, the projected positions, the
@@ -223,7 +223,7 @@ def offsets_in_memory(n, n_rows, n_entries, n_redundant):
     and the results of `factor_gram` at the projected positions, and at NEW. The weakest direction is the direction that
     the rows of G determine least.
     """
-    G = 2 * n_rows
+    G = memory + 2 * n_rows
     x = G + n_entries
     change = x + n_rows
     nearest_positions = change + n
@@ -280,8 +280,8 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
     """Project the positions of NEW onto the constraints by Gauss-Newton steps; clear RUNNING where this fails."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
-    G, x, change, _, _, _, _, row, _, factors, _ = _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors
+    n_entries = pattern[n_rows] - pattern[0]
+    G, x, change, _, _, _, _, row, _, factors, _ = _memory_offsets(memory, n, n_rows, n_entries, n_redundant)
     for k in range(LANES):
         work[at.UNCONVERGED * LANES + k] = work[at.RUNNING * LANES + k]
     for _ in range(MAX_ITERATIONS):
@@ -316,8 +316,8 @@ def _project_velocities(code, settings, control, pattern, moves, work):
     """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at its positions."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
-    G, x, change, _, _, _, _, row, factors, _, _ = _memory_offsets(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + factors
+    n_entries = pattern[n_rows] - pattern[0]
+    G, x, change, _, _, _, _, row, factors, _, _ = _memory_offsets(memory, n, n_rows, n_entries, n_redundant)
     fill_field(work, at.ACTIVE, 1.0)
     code.compute_rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
@@ -360,10 +360,8 @@ def _check_other_guesses(code, settings, control, pattern, moves, work):
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     _, x, change, nearest, correction, weakest, displacement, _, factors, _, _ = _memory_offsets(
-        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
+        memory, n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
-    x, change, nearest, correction = memory + x, memory + change, memory + nearest, memory + correction
-    weakest, displacement, factors = memory + weakest, memory + displacement, memory + factors
     _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest)
     for by_correction, by_weakest in OTHER_GUESSES:
         for j in range(n * LANES):
@@ -398,11 +396,11 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, valid, w
     n, n_rows, n_redundant, n_runs = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = offsets_in_work(n, n_rows, numbers.shape[1])
     _, _, _, nearest_positions, change_from_guess, _, _, row, _, _, _ = _memory_offsets(
-        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
+        memory, n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
     fill_field(work, at.T_NEW, control[at.T0])
     for j in range(n):
-        fill_field(work, memory + row + j, 0.0)
+        fill_field(work, row + j, 0.0)
     for first in range(0, n_runs, LANES):
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
@@ -413,16 +411,16 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, valid, w
                 work[(own + i) * LANES + k] = numbers[run, i]
         _gauss_newton(code, settings, control, pattern, moves, work)
         _project_velocities(code, settings, control, pattern, moves, work)
-        copy_vectors(work, new, memory + nearest_positions, n)
+        copy_vectors(work, new, nearest_positions, n)
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
             for j in range(n):
-                work[(memory + change_from_guess + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
+                work[(change_from_guess + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
         _check_other_guesses(code, settings, control, pattern, moves, work)
         for k in range(min(LANES, n_runs - first)):
             valid[first + k] = int(work[at.RUNNING * LANES + k])
             for j in range(n):
-                q[first + k, j] = work[(memory + nearest_positions + j) * LANES + k]
+                q[first + k, j] = work[(nearest_positions + j) * LANES + k]
                 v[first + k, j] = work[(new + n + j) * LANES + k]
 
 

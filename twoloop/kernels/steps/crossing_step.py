@@ -23,7 +23,7 @@ from twoloop.kernels.control.step_size import commit_nothing, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, OUTER_DIVERGED, RTOL, SINGULAR
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
-from twoloop.kernels.linalg.dense import copy
+from twoloop.kernels.linalg.dense import copy, sum_rows
 from twoloop.kernels.steps.stages import lagrange_values
 
 # indices of the scalars in `options`, followed by A, A @ A and Legendre coefficients (S, S each), b, b @ A, c (S each)
@@ -105,15 +105,6 @@ def piece_ends(memory, c, t):
 
 
 @compiled
-def _weighted_sum(weights, a, total):
-    """Store sum_k weights[k] * a[k] over the nodes k in `total` (n); a (S, n) are the accelerations at the nodes."""
-    total[:] = 0.0
-    for k in range(S):
-        for m in range(total.size):
-            total[m] += weights[k] * a[k, m]
-
-
-@compiled
 def _velocity_weight(tolerances, m, n, h, state):
     """Return the reciprocal of the allowed error of velocity number m in a step of size h from `state`."""
     q, v = abs(state[m]), abs(state[n + m])
@@ -158,8 +149,8 @@ def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
 
     (q, v): state at the beginning; A, AA (S): weights of the accelerations a (S, n) in their first and second integral.
     """
-    _weighted_sum(A, a, v_end)
-    _weighted_sum(AA, a, q_end)
+    sum_rows(A, a, v_end)
+    sum_rows(AA, a, q_end)
     for m in range(q.size):
         q_end[m] = q[m] + h * (c * v[m] + h * q_end[m])
         v_end[m] = v[m] + h * v_end[m]
@@ -220,8 +211,8 @@ def _fill_integral_weights(b, c, c0, weights_v, weights_q):
 @merged
 def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
     """Set (q_0, v_0) to the state at the beginning of the polynomial; (q, v) is its state at the time c0 h later."""
-    _weighted_sum(weights_v, a, v_0)
-    _weighted_sum(weights_q, a, q_0)
+    sum_rows(weights_v, a, v_0)
+    sum_rows(weights_q, a, q_0)
     for m in range(q.size):
         v_0[m] = v[m] - h * v_0[m]
         q_0[m] = q[m] - h * (c0 * v_0[m] + h * q_0[m])
@@ -246,8 +237,8 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
     """Set q, v and `acceleration` (n each) to the values of the polynomial `time` seconds after its beginning."""
     fraction = time / duration
     _fill_integral_weights(b, c, fraction, weights_v, weights_q)
-    _weighted_sum(weights_v, a, v)
-    _weighted_sum(weights_q, a, q)
+    sum_rows(weights_v, a, v)
+    sum_rows(weights_q, a, q)
     for m in range(q.size):
         q[m] = q_0[m] + duration * (fraction * v_0[m] + duration * q[m])
         v[m] = v_0[m] + duration * v[m]

@@ -13,7 +13,7 @@ from twoloop.kernels.control.step_size import commit_nothing, departure, store_p
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, gap_ratio, inlined, kernel
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
-from twoloop.kernels.linalg.dense import copy
+from twoloop.kernels.linalg.dense import copy, sum_rows
 
 # indices of the scalars in `options`, for arguments of options_array. After the scalars, `options` contains A (s, s),
 # b (s), c (s) and the weights of the two error estimates (s each). FREE: 1 if stages are not projected
@@ -21,7 +21,7 @@ STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
 # indices of the vectors in `memory`, after which come the slopes [v, a] of the s stages. A vector or slope has 2 n_q
 # numbers, padded to a multiple of BLOCK_SIZE
 STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
-BLOCK_SIZE = 8  # number of sums that `_weighted_sum` accumulates in registers
+BLOCK_SIZE = 8  # vectors are padded to a multiple of this size, so that loops over them have no remainder
 # STRICT: factor on the error estimate after a run has come near a singular position, because phase errors grow at each
 # such position. It decreases to 1 as the smallest tolerance falls from STRICT * LEAST_STRICT to LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
@@ -86,34 +86,9 @@ def _slope_views(memory, s, n):
 
 
 @compiled
-def _weighted_sum(weights, slopes, total):
-    """Store sum_k weights[k] * slopes[k] over the stages k in `total` (2 n, padded), BLOCK_SIZE entries at a time."""
-    for m in range(0, total.size, BLOCK_SIZE):
-        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
-        for k in range(weights.size):
-            weight = weights[k]
-            s0 += weight * slopes[k, m]
-            s1 += weight * slopes[k, m + 1]
-            s2 += weight * slopes[k, m + 2]
-            s3 += weight * slopes[k, m + 3]
-            s4 += weight * slopes[k, m + 4]
-            s5 += weight * slopes[k, m + 5]
-            s6 += weight * slopes[k, m + 6]
-            s7 += weight * slopes[k, m + 7]
-        total[m] = s0
-        total[m + 1] = s1
-        total[m + 2] = s2
-        total[m + 3] = s3
-        total[m + 4] = s4
-        total[m + 5] = s5
-        total[m + 6] = s6
-        total[m + 7] = s7
-
-
-@compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
     """Set y1 to y + h * sum_k weights[k] * slopes[k]; `total` is scratch. Adding y last avoids rounding errors."""
-    _weighted_sum(weights, slopes, total)
+    sum_rows(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
 
@@ -146,8 +121,8 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
 @compiled
 def _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
     """Return the error of a step from y to y1, in units of the tolerances; fill `fine_error` and `coarse_error`."""
-    _weighted_sum(fine, slopes, fine_error)
-    _weighted_sum(coarse, slopes, coarse_error)
+    sum_rows(fine, slopes, fine_error)
+    sum_rows(coarse, slopes, coarse_error)
     for m in range(y.size):
         fine_error[m] *= h
         coarse_error[m] *= h
