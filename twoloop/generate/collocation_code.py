@@ -32,7 +32,6 @@ from twoloop.generate.lane_series import (
     loop_over_coordinates,
     store_lanes,
     two_sums,
-    vector_index,
 )
 from twoloop.generate.llvm_code import Emitter, Lowering, lower_program
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, VOID, Module, Value, constant, constants, integer
@@ -247,8 +246,8 @@ class CollocationCode:
 
         if self.has_reduced:
             n_careful = num.load(work, mem.N_MASS_FIRST)
-            with self._returning_if(emit, builder.compare("fcmp ogt", n_careful, llvm_code.ZERO)):
-                num.store(num.subtract(n_careful, llvm_code.ONE), work, mem.N_MASS_FIRST)
+            with self._returning_if(emit, n_careful > 0.0):
+                num.store(n_careful - 1.0, work, mem.N_MASS_FIRST)
                 builder.ret(iterate_mass_first())
         self._call(emit, "begin_nodes", self._predict_nodes, [work, state, tolerances])
         return self._iterate(emit, work, state, tolerances, evaluate, fallback)
@@ -309,40 +308,38 @@ class CollocationCode:
         h, rtol = (num.load(work, mem.H), builder.select(has_fixed_size, llvm_code.ONE, num.load(tolerances, RTOL)))
         wide, begins = self._vector_emitter(emit)
         zero = wide.constant(0.0)
-        length, half, relative = (wide.broadcast(each) for each in (h, num.multiply(h, constant(DOUBLE, 0.5)), rtol))
+        length, half, relative = (wide.broadcast(each) for each in (h, h * 0.5, rtol))
         largest = [zero] * 3
         for begin in begins:
-            q, v, a = (wide.function("fabs", wide.load(num.pointer(state, m * n + begin))) for m in range(3))
-            sizes = wide.maximum(q, wide.multiply(half, v)), wide.maximum(v, wide.multiply(half, a))
+            q, v, a = (abs(wide.load(num.pointer(state, m * n + begin))) for m in range(3))
+            sizes = wide.maximum(q, half * v), wide.maximum(v, half * a)
             atol = wide.load(num.pointer(tolerances, ATOL + begin))
             atol = builder.select(has_fixed_size, wide.constant(1.0), atol)
             of_q, of_v = (wide.fma(relative, each, atol) for each in sizes)
-            is_v_stricter = builder.compare("fcmp olt", wide.multiply(of_v, length), of_q)
+            is_v_stricter = of_v * length < of_q
             allowed = wide.maximum(builder.select(is_v_stricter, of_v, of_q), wide.constant(MIN_DIVISOR))
-            weight = wide.divide(builder.select(is_v_stricter, wide.constant(1.0), length), allowed)
+            weight = builder.select(is_v_stricter, wide.constant(1.0), length) / allowed
             wide.store(weight, num.pointer(work, mem.WEIGHTS + begin))
             is_iterated = [float(begin + k in self.iterated_coordinates) for k in range(wide.lanes)]
-            iterated_weight = wide.multiply(
-                weight, constants(is_iterated) if wide.lanes > 1 else constant(DOUBLE, *is_iterated)
-            )
-            scaled_v = wide.multiply(iterated_weight, wide.fma(length, a, v))
+            iterated_weight = weight * (constants(is_iterated) if wide.lanes > 1 else is_iterated[0])
+            scaled_v = iterated_weight * wide.fma(length, a, v)
             largest = [wide.maximum(*pair) for pair in zip((weight, iterated_weight, scaled_v), largest, strict=True)]
         max_weight, max_iterated_weight, scaled_v = (wide.max_over_lanes(each) for each in largest)
         if self.iterated_coordinates:
-            num.store(num.divide(max_weight, max_iterated_weight), work, mem.STRICTER)
+            num.store(max_weight / max_iterated_weight, work, mem.STRICTER)
             num.store(scaled_v, work, mem.SIZE)
-        powers = self._powers(emit, num.divide(h, num.load(work, mem.H_BEFORE)))
+        powers = self._powers(emit, h / num.load(work, mem.H_BEFORE))
         store_lanes(emit, powers, work, mem.POWERS)
         degree = emit.broadcast(num.load(work, mem.DEGREE))
         exponents = constants([float(k) for k in range(LANES)])
-        used_powers = builder.select(builder.compare("fcmp olt", exponents, degree), powers, emit.constant(0.0))
+        used_powers = builder.select(exponents < degree, powers, emit.constant(0.0))
         polynomial = self._polynomial_pointer(emit, work, other=False)
         nodes = np.array(tables().nodes)
         # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
         with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
-            scaled = emit.multiply(load_lanes(emit, num.pointer(polynomial, vector_index(emit, k))), used_powers)
+            scaled = load_lanes(emit, num.pointer(polynomial, k * LANES)) * used_powers
             store_lanes(emit, scaled, work, mem.SCALED)
             terms = [num.load(num.pointer(state, i), 2 * n), *(num.load(work, mem.SCALED + j) for j in range(LANES))]
             self._store_stages(
@@ -356,8 +353,8 @@ class CollocationCode:
         for bit in (1, 2, 4, 8):
             has_bit = Value(emit.bit_type, f"<{', '.join(f'{BIT} {int(bool(k + 1 & bit))}' for k in range(LANES))}>")
             factors.append(builder.select(has_bit, power, emit.constant(1.0)))
-            power = emit.multiply(power, power)
-        return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
+            power = power * power
+        return factors[0] * factors[1] * (factors[2] * factors[3])
 
     def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
         """Return an emitter for vectors of coordinates, and the first coordinate of each; the last two may overlap."""
@@ -387,19 +384,17 @@ class CollocationCode:
         has_estimate = builder.compare("fcmp one", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
         degree, stricter = num.load(work, mem.DEGREE), num.load(work, mem.STRICTER)
         target = builder.select(
-            builder.compare("fcmp oge", degree, number(6.0)),
-            builder.select(
-                builder.compare("fcmp oge", degree, number(7.0)), number(TARGET_SWEEPS + 2), number(TARGET_SWEEPS + 1)
-            ),
+            degree >= 6.0,
+            builder.select(degree >= 7.0, number(TARGET_SWEEPS + 2), number(TARGET_SWEEPS + 1)),
             number(TARGET_SWEEPS),
         )
-        max_sweeps = builder.select(has_estimate, num.add(target, number(EXTRA_SWEEPS)), number(MAX_SWEEPS_OF_FIXED))
+        max_sweeps = builder.select(has_estimate, target + EXTRA_SWEEPS, number(MAX_SWEEPS_OF_FIXED))
         kappa, noise = (
             builder.select(has_estimate, number(usual), number(fixed))
             for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (mem.MAX_ROUNDING, ROUNDING_OF_FIXED))
         )
-        noise = num.multiply(noise, num.multiply(num.load(work, mem.SIZE), stricter))
-        may_guess = builder.compare("fcmp ogt", num.load(work, mem.MAY_GUESS), llvm_code.ZERO)
+        noise = noise * (num.load(work, mem.SIZE) * stricter)
+        may_guess = num.load(work, mem.MAY_GUESS) > 0.0
         t, h = num.load(work, mem.T), num.load(work, mem.H)
         times = emit.fma(constants(tables().nodes), emit.broadcast(h), emit.broadcast(t))
         rho_before = num.load(work, mem.RHO)
@@ -417,50 +412,31 @@ class CollocationCode:
                 load_lanes(emit, work, self.v_offset + LANES * k),
             )
         store_others = evaluate([times, *q, *v])
-        change = num.multiply(stricter, self._integrate(emit, work, state))
-        sweep = num.add(sweeps, llvm_code.ONE)
+        change = stricter * self._integrate(emit, work, state)
+        sweep = sweeps + 1.0
 
-        def compare(name: str, x: Value, y: Value | float) -> Value:
-            return builder.compare(f"fcmp {name}", x, y if isinstance(y, Value) else number(y))
-
-        def either(x: Value, y: Value) -> Value:
-            return builder.operation("or", x, y)
-
-        contraction = num.divide(change, num.maximum(change_before, number(MIN_DIVISOR)))
+        contraction = change / num.maximum(change_before, number(MIN_DIVISOR))
         contraction = num.minimum(num.maximum(contraction, number(MIN_RHO)), number(MAX_RHO))
-        rho_now = builder.select(compare("ogt", sweep, 1.0), contraction, rho)
-        is_out_of_range = either(compare("olt", rho_now, FAST_START), compare("ogt", rho_now, SLOW_START))
-        was_guessed = builder.bitwise_and(
-            builder.bitwise_and(may_guess, compare("oeq", sweep, 2.0)),
-            builder.bitwise_and(is_out_of_range, compare("ogt", change, 0.0)),
-        )
-        is_stagnant = builder.bitwise_and(
-            compare("ogt", sweep, 2.0),
-            builder.bitwise_and(
-                compare("oge", change, num.multiply(number(STAGNATION_RATIO), change_before)),
-                compare("ole", change, noise),
-            ),
-        )
-        has_converged = either(compare("ole", num.multiply(rho_now, change), kappa), is_stagnant)
-        is_slow = builder.bitwise_and(
-            builder.bitwise_and(compare("ogt", sweep, 3.0), has_estimate), compare("oge", rho_now, MAX_CONTRACTION)
-        )
-        is_refused = either(either(is_slow, compare("oge", sweep, max_sweeps)), compare("uge", change, INFINITE))
-        stops = builder.operation("or", either(was_guessed, has_converged), is_refused)
+        rho_now = builder.select(sweep > 1.0, contraction, rho)
+        is_out_of_range = (rho_now < FAST_START) | (rho_now > SLOW_START)
+        was_guessed = may_guess & builder.compare("fcmp oeq", sweep, number(2.0)) & (is_out_of_range & (change > 0.0))
+        is_stagnant = (sweep > 2.0) & ((change >= STAGNATION_RATIO * change_before) & (change <= noise))
+        has_converged = (rho_now * change <= kappa) | is_stagnant
+        is_slow = (sweep > 3.0) & has_estimate & (rho_now >= MAX_CONTRACTION)
+        is_refused = is_slow | (sweep >= max_sweeps) | builder.compare("fcmp uge", change, number(INFINITE))
+        stops = was_guessed | has_converged | is_refused
         for phi, value in zip(carried, (sweep, change, rho_now), strict=True):
             phi.add_incoming(value, builder.block)
         builder.branch(stops, after, loop)
         builder.position_at_end(after)
         all_valid = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [store_others()])
-        with self._returning_if(emit, builder.operation("xor", all_valid, Value(BIT, "true"))):
+        with self._returning_if(emit, all_valid ^ Value(BIT, "true")):
             builder.ret(fallback())
         for value, index in ((sweep, mem.SWEEPS), (change, mem.CHANGE), (target, mem.N_TARGET), (rho_now, mem.RHO)):
             num.store(value, work, index)
         code = builder.select(has_converged, number(mem.CONVERGED), number(mem.REJECTED))
         code = builder.select(was_guessed, number(mem.GUESSED), code)
-        with builder.if_then(
-            builder.bitwise_and(builder.compare("fcmp oeq", code, number(mem.CONVERGED)), has_estimate)
-        ):
+        with builder.if_then(builder.compare("fcmp oeq", code, number(mem.CONVERGED)) & has_estimate):
             self._call(emit, "judge_nodes", self._estimate_error, [work, state])
         return code
 
@@ -476,16 +452,16 @@ class CollocationCode:
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         n_sweeps, change, target, rho = (num.load(work, i) for i in (mem.SWEEPS, mem.CHANGE, mem.N_TARGET, mem.RHO))
         vec2 = LaneEmitter(builder, 2)
-        error_to_kappa = num.divide(num.multiply(rho, change), constant(DOUBLE, KAPPA))
-        error_to_kappa = num.add(error_to_kappa, constant(DOUBLE, SMALLEST_RATIO))
+        error_to_kappa = rho * change / KAPPA
+        error_to_kappa = error_to_kappa + SMALLEST_RATIO
         logs = vec2.logarithm(vec2.vector([error_to_kappa, rho]))
-        exponent = num.fma(num.subtract(target, n_sweeps), builder.extract(logs, 1), builder.extract(logs, 0))
-        log_convergence = num.divide(num.add(exponent, llvm_code.ONE), num.add(target, constant(DOUBLE, 2.0)))
+        exponent = num.fma(target - n_sweeps, builder.extract(logs, 1), builder.extract(logs, 0))
+        log_convergence = (exponent + 1.0) / (target + 2.0)
         with num.loop(integer(0), integer(n), []) as (i, _, _):
             a0 = num.load(num.pointer(state, i), 2 * n)
-            values = emit.function("fabs", self._weighted_accelerations(emit, tables().spectrum, a0, work, i))
+            values = abs(self._weighted_accelerations(emit, tables().spectrum, a0, work, i))
             pairs = emit.maximum(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
-            store_lanes(emit, pairs, num.pointer(work, vector_index(emit, i)), self.spectrum_offset)
+            store_lanes(emit, pairs, num.pointer(work, i * LANES), self.spectrum_offset)
         wide, begins = self._vector_emitter(emit)
         error = curved = wide.constant(0.0)
         smallest = wide.constant(MIN_DIVISOR)
@@ -494,19 +470,17 @@ class CollocationCode:
             largest_34, largest_56, largest_78 = (gather_lane(emit, vectors, lane) for lane in (2, 4, 6))
             weight = wide.load(num.pointer(work, mem.WEIGHTS + begin))
             largest_58 = wide.maximum(wide.maximum(largest_56, largest_78), smallest)
-            decay = wide.divide(largest_78, largest_58)
-            total_decay = wide.divide(largest_78, wide.maximum(largest_34, largest_58))
-            decay = wide.maximum(wide.multiply(decay, wide.function("sqrt", decay)), total_decay)
-            error = wide.maximum(wide.multiply(wide.multiply(largest_78, weight), decay), error)
-            curved = wide.maximum(wide.multiply(largest_56, weight), curved)
+            decay = largest_78 / largest_58
+            total_decay = largest_78 / wide.maximum(largest_34, largest_58)
+            decay = wide.maximum(decay * wide.function("sqrt", decay), total_decay)
+            error = wide.maximum(largest_78 * weight * decay, error)
+            curved = wide.maximum(largest_56 * weight, curved)
         h = num.load(work, mem.H)
-        error = num.multiply(num.multiply(wide.max_over_lanes(error), h), constant(DOUBLE, ERROR_WEIGHT))
+        error = wide.max_over_lanes(error) * h * ERROR_WEIGHT
         num.store(error, work, mem.ERROR)
-        num.store(num.multiply(wide.max_over_lanes(curved), h), work, mem.CURVATURE)
-        log_error = num.multiply(
-            builder.extract(vec2.logarithm(vec2.broadcast(error)), 0), constant(DOUBLE, 1.0 / mem.ORDER)
-        )
-        factors = vec2.exponential(vec2.negate(vec2.vector([log_convergence, log_error])))
+        num.store(wide.max_over_lanes(curved) * h, work, mem.CURVATURE)
+        log_error = builder.extract(vec2.logarithm(vec2.broadcast(error)), 0) * (1.0 / mem.ORDER)
+        factors = vec2.exponential(-vec2.vector([log_convergence, log_error]))
         num.store(builder.extract(factors, 0), work, mem.FACTOR)
         num.store(builder.extract(factors, 1), work, mem.FACTOR_OF_ERROR)
 
@@ -518,34 +492,30 @@ class CollocationCode:
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
         t, h = emit.broadcast(num.load(work, mem.T)), emit.broadcast(num.load(work, mem.H))
-        elapsed = emit.multiply(h, constants(tables().between))
+        elapsed = h * constants(tables().between)
         zero = emit.constant(0.0)
         q, v = [zero] * n, [zero] * n
         for i in self.iterated_coordinates:
             q0, v0, a0 = (num.load(state, m * n + i) for m in range(3))
-            of_v = self._weighted_accelerations(emit, tables().velocities_between, a0, work, integer(i))
-            of_q = self._weighted_accelerations(emit, tables().positions_between, a0, work, integer(i))
+            of_v = self._weighted_accelerations(emit, tables().velocities_between, a0, work, i)
+            of_q = self._weighted_accelerations(emit, tables().positions_between, a0, work, i)
             v[i] = emit.fma(h, of_v, emit.broadcast(v0))
-            q[i] = emit.fma(emit.multiply(h, h), of_q, emit.fma(elapsed, emit.broadcast(v0), emit.broadcast(q0)))
-        inputs, accelerations = [emit.add(t, elapsed), *q, *v], builder.allocate(DOUBLE, LANES * n)
+            q[i] = emit.fma(h * h, of_q, emit.fma(elapsed, emit.broadcast(v0), emit.broadcast(q0)))
+        inputs, accelerations = [t + elapsed, *q, *v], builder.allocate(DOUBLE, LANES * n)
         is_valid = call_accelerations(emit, self.equations, -1, inputs, self.numbers, accelerations)
         a = [emit.load(accelerations, i) for i in range(n)]
         max_error = largest = zero
         for i, value in enumerate(a):
             a0 = num.load(state, 2 * n + i)
-            difference = emit.subtract(
-                value, self._weighted_accelerations(emit, tables().values_between, a0, work, integer(i))
-            )
+            difference = value - self._weighted_accelerations(emit, tables().values_between, a0, work, i)
             weight = emit.broadcast(num.load(work, mem.WEIGHTS + i))
-            max_error = emit.maximum(emit.multiply(emit.function("fabs", difference), weight), max_error)
-            largest = emit.maximum(emit.multiply(emit.function("fabs", value), weight), largest)
+            max_error = emit.maximum(abs(difference) * weight, max_error)
+            largest = emit.maximum(abs(value) * weight, largest)
         beyond_noise = emit.fma(emit.constant(-mem.MAX_ROUNDING), largest, max_error)
-        scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED_DEFECT)))
+        scaled = beyond_noise * (h * (1.0 / ALLOWED_DEFECT))
         defect = num.maximum(emit.max_over_lanes(scaled), llvm_code.ZERO)
         vec2 = LaneEmitter(builder, 2)
-        log_factor = vec2.multiply(
-            vec2.logarithm(vec2.broadcast(num.maximum(defect, constant(DOUBLE, 1e-9)))), vec2.constant(-1.0 / 9)
-        )
+        log_factor = vec2.logarithm(vec2.broadcast(num.maximum(defect, constant(DOUBLE, 1e-09)))) * (-1.0 / 9)
         num.store(builder.extract(vec2.exponential(log_factor), 0), work, mem.FACTOR_OF_DEFECT)
         all_valid = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [is_valid])
         return builder.select(all_valid, defect, constant(DOUBLE, INVALID))
@@ -558,7 +528,7 @@ class CollocationCode:
             store_lanes(
                 emit,
                 self._weighted_accelerations(emit, tables().begin, a0, work, i),
-                num.pointer(old_polynomial, vector_index(emit, k)),
+                num.pointer(old_polynomial, k * LANES),
             )
 
     def end_step(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
@@ -571,11 +541,11 @@ class CollocationCode:
         powers, new = load_lanes(emit, work, mem.POWERS), self._polynomial_pointer(emit, work, other=True)
         old_polynomial, zero = self._polynomial_pointer(emit, work, other=False), emit.constant(0.0)
         with loop_over_coordinates(emit, self.iterated_coordinates, [zero]) as (k, i, (max_error,), carried):
-            stage = num.pointer(work, vector_index(emit, k))
+            stage = num.pointer(work, k * LANES)
             target = num.pointer(new_state, i)
             a0, a1 = (
                 num.load(num.pointer(state, i), 2 * n),
-                num.load(num.pointer(work, vector_index(emit, i)), self.a_offset + last),
+                num.load(num.pointer(work, i * LANES), self.a_offset + last),
             )
             for value, begin in (
                 (num.load(stage, self.q_offset + last), 0),
@@ -583,17 +553,17 @@ class CollocationCode:
                 (a1, 2 * n),
             ):
                 num.store(value, target, begin)
-            partial_sums = emit.multiply(load_lanes(emit, num.pointer(old_polynomial, vector_index(emit, k))), powers)
+            partial_sums = load_lanes(emit, num.pointer(old_polynomial, k * LANES)) * powers
             for distance in (1, 2, 4):  # element k becomes the sum of the elements 0 to k
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
-                partial_sums = emit.add(partial_sums, builder.shuffle(partial_sums, zero, shifted))
-            errors = emit.add(partial_sums, emit.broadcast(num.subtract(a0, a1)))
+                partial_sums = partial_sums + builder.shuffle(partial_sums, zero, shifted)
+            errors = partial_sums + emit.broadcast(a0 - a1)
             weight = emit.broadcast(num.load(num.pointer(work, i), mem.WEIGHTS))
-            carried.append(emit.maximum(emit.multiply(emit.function("fabs", errors), weight), max_error))
+            carried.append(emit.maximum(abs(errors) * weight, max_error))
             store_lanes(
                 emit,
                 self._weighted_accelerations(emit, tables().end, a0, work, i),
-                num.pointer(new, vector_index(emit, k)),
+                num.pointer(new, k * LANES),
             )
         self._choose_degree(emit, work, carried[0])
         if self.other_coordinates:
@@ -601,13 +571,13 @@ class CollocationCode:
             weights_0 = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
             with loop_over_coordinates(emit, self.other_coordinates) as (_, i, _, _):
                 first, target = num.pointer(state, i), num.pointer(new_state, i)
-                a = load_lanes(emit, num.pointer(work, vector_index(emit, i)), self.a_offset)
+                a = load_lanes(emit, num.pointer(work, i * LANES), self.a_offset)
                 q, v, a0 = (num.load(first, m * n) for m in range(3))
-                of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in last_weights))
+                of_v, of_q = two_sums(emit, *(a * end for end in last_weights))
                 of_v, of_q = (num.fma(factor, a0, each) for factor, each in zip(weights_0, (of_v, of_q), strict=True))
-                displacement = num.multiply(h, num.fma(h, of_q, v))
-                num.store(num.add(q, displacement), target, 0)
-                num.store(num.add(v, num.multiply(h, of_v)), target, n)
+                displacement = h * num.fma(h, of_q, v)
+                num.store(q + displacement, target, 0)
+                num.store(v + h * of_v, target, n)
                 num.store(builder.extract(a, last), target, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, work: Value, max_error: Value) -> None:
@@ -616,13 +586,13 @@ class CollocationCode:
         `max_error`: errors of the predictions of degree 1 to 8 at the end of the step.
         """
         builder, num = emit.builder, Emitter(emit.builder)
-        least = num.negate(emit.max_over_lanes(emit.negate(max_error)))
-        is_good = builder.compare("fcmp ole", max_error, emit.broadcast(num.multiply(least, constant(DOUBLE, 1.2))))
+        least = -emit.max_over_lanes(-max_error)
+        is_good = max_error <= emit.broadcast(least * 1.2)
         bits = builder.convert("zext", builder.convert("bitcast", is_good, f"i{LANES}"), INTEGER)
-        bits = builder.operation("or", bits, integer(1 << LANES - 1))
+        bits = bits | 1 << LANES - 1
         first = builder.call("llvm.cttz.i64", INTEGER, [bits, Value(BIT, "true")])
-        best, before = num.add(num.to_double(first), llvm_code.ONE), num.load(work, mem.DEGREE)
-        lowest, highest = (num.add(before, constant(DOUBLE, each)) for each in (-2.0, 2.0))
+        best, before = num.to_double(first) + 1.0, num.load(work, mem.DEGREE)
+        lowest, highest = (before + each for each in (-2.0, 2.0))
         degree = num.minimum(num.maximum(best, num.maximum(lowest, constant(DOUBLE, 2.0))), highest)
         predicts = builder.compare("fcmp one", num.load(work, mem.PREDICTS), llvm_code.ZERO)
         num.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, mem.NEXT_DEGREE)
@@ -677,7 +647,7 @@ class CollocationCode:
     def _store_largest_move(self, emit: LaneEmitter, work: Value, values: Sequence[Value], is_valid: Value) -> None:
         largest = emit.constant(0.0)
         for value in values:
-            largest = emit.maximum(emit.function("fabs", value), largest)
+            largest = emit.maximum(abs(value), largest)
         store_lanes(emit, largest, work, mem.MOVED)
         before = load_lanes(emit, work, mem.VALID)
         store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
@@ -686,13 +656,13 @@ class CollocationCode:
         """Store positions and velocities at the nodes; return the largest change of a velocity since the last sweep."""
         num = Emitter(emit.builder)
         with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
-            before = load_lanes(emit, num.pointer(work, vector_index(emit, k)), self.v_offset)
+            before = load_lanes(emit, num.pointer(work, k * LANES), self.v_offset)
             terms = self._node_accelerations(emit, num.load(num.pointer(state, i), 2 * self.n), work, i)
             sums = [self._weighted_sum(emit, table, terms) for table in (tables().velocities, tables().positions)]
             v = self._store_stages(emit, work, state, k, i, sums)
             weight = emit.broadcast(num.load(num.pointer(work, i), mem.WEIGHTS))
-            change = emit.function("fabs", emit.subtract(v, before))
-            new.append(emit.maximum(emit.multiply(change, weight), largest))
+            change = abs(v - before)
+            new.append(emit.maximum(change * weight, largest))
         return emit.max_over_lanes(new[0])
 
     def _store_stages(
@@ -701,27 +671,29 @@ class CollocationCode:
         """Store velocities and positions of coordinate i, the k-th iterated one, at nodes; return the velocities."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
-        index, begin = num.pointer(work, vector_index(emit, k)), num.pointer(state, i)
+        index, begin = num.pointer(work, k * LANES), num.pointer(state, i)
         q0, v0 = (emit.broadcast(num.load(begin, m * self.n)) for m in range(2))
         v = emit.fma(h, sums[0], v0)
-        displacement_rate = emit.fma(h, sums[1], emit.multiply(constants(tables().nodes), v0))
+        displacement_rate = emit.fma(h, sums[1], constants(tables().nodes) * v0)
         store_lanes(emit, v, index, self.v_offset)
         store_lanes(emit, emit.fma(h, displacement_rate, q0), index, self.q_offset)
         return v
 
-    def _node_accelerations(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
+    def _node_accelerations(self, emit: LaneEmitter, first: Value, work: Value, i: Value | int) -> list[Value]:
         """Return the accelerations of coordinate i at all nodes: `first` at the first node, and eight loaded values."""
         num = Emitter(emit.builder)
-        memory = num.pointer(work, vector_index(emit, i))
+        memory = num.pointer(work, i * LANES)
         return [first, *(num.load(memory, self.a_offset + node) for node in range(LANES))]
 
-    def _weighted_accelerations(self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value) -> Value:
+    def _weighted_accelerations(
+        self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value | int
+    ) -> Value:
         """Return the sum of the rows of a table, multiplied by the accelerations of coordinate i at the nodes."""
         return self._weighted_sum(emit, table, self._node_accelerations(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
         """Return the sum of the rows of a table, multiplied by `terms`; two independent partial sums are faster."""
-        sums = [emit.multiply(emit.broadcast(x), constants(row)) for x, row in zip(terms[:2], table[:2], strict=True)]
+        sums = [emit.broadcast(x) * constants(row) for x, row in zip(terms[:2], table[:2], strict=True)]
         for k, (x, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fma(emit.broadcast(x), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)

@@ -124,7 +124,7 @@ def _accelerations(
     name, array = _acceleration_function(emit, equations, -1, lowering.numbers), _stack_array(emit, len(a))
     fallback_valid = builder.call(name, emit.bit_type, [*state(), *_coefficient_pointers(emit), array])
     b = [builder.select(is_valid, value, emit.load(array, i)) for i, value in enumerate(a)]
-    fallback_valid, fallback_end = builder.operation("or", is_valid, fallback_valid), builder.block
+    fallback_valid, fallback_end = is_valid | fallback_valid, builder.block
     builder.jump(after)
     builder.position_at_end(after)
     merged: list[Value] = []
@@ -234,7 +234,7 @@ class SplitFunctions:
                 builder = module.function(name, emit.bit_type, [value.type for value in arguments], internal=True)
                 builder.ret(self._part_writers[part](emit.copy_for_builder(builder), *builder.arguments))
             valid = emit.builder.call(name, emit.bit_type, arguments)
-            all_valid = valid if all_valid is None else emit.builder.bitwise_and(all_valid, valid)
+            all_valid = valid if all_valid is None else all_valid & valid
         assert all_valid is not None
         return all_valid
 
@@ -330,7 +330,7 @@ class SplitFunctions:
             ("solution", [r, c, stored, numbers, a, independent_lam]),
             *([("least_norm", [c, c, stored, numbers, lam])] if self.has_redundant_rows else []),
         )
-        is_valid = emit.builder.bitwise_and(corrections_valid, is_valid)
+        is_valid = corrections_valid & is_valid
         _write_return_unless(emit, is_valid)
         _write_sum(emit, self.n, q, moved, new_q)
         _write_sum(emit, self.n, v, change, new_v)
@@ -355,7 +355,7 @@ def _write_zeros(emit: Emitter, n: int, out: Value) -> None:
 
 def _write_sum(emit: Emitter, n: int, a: Value, b: Value, out: Value) -> None:
     with emit.loop(integer(0), integer(n), []) as (j, _, _):
-        total = emit.add(emit.load(emit.pointer(a, j)), emit.load(emit.pointer(b, j)))
+        total = emit.load(emit.pointer(a, j)) + emit.load(emit.pointer(b, j))
         emit.store(total, emit.pointer(out, j))
 
 

@@ -88,12 +88,12 @@ class LaneSteps:
         """Store and return UNIT, the unit of time of the series, s; a new one in new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
-        duration = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
+        duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
         next_unit = emit.minimum(
-            emit.multiply(emit.load(work, lanes.LENGTH), unit),
-            emit.multiply(emit.constant(MAX_FACTOR), emit.load(work, lanes.H)),
+            emit.load(work, lanes.LENGTH) * unit,
+            MAX_FACTOR * emit.load(work, lanes.H),
         )
-        first_unit = emit.multiply(emit.constant(FIRST_UNIT), duration)
+        first_unit = FIRST_UNIT * duration
         unit = select(is_fresh, first_unit, select(is_accepted, next_unit, unit))
         emit.store(unit, work, lanes.UNIT)
         for field, value in ((lanes.LONGEST, math.inf), (lanes.SHIFT, 0.0)):
@@ -107,35 +107,35 @@ class LaneSteps:
         one, norms = emit.constant(1.0), []
         scales = []
         for j in range(n):
-            q, v = (emit.function("fabs", emit.load(memory.series, i)) for i in (j, n + j))
+            q, v = (abs(emit.load(memory.series, i)) for i in (j, n + j))
             of_q, of_v = (
-                emit.add(atol[j], emit.multiply(rtol, q)),
-                emit.add(emit.multiply(atol[j], unit), emit.multiply(rtol, v)),
+                atol[j] + rtol * q,
+                atol[j] * unit + rtol * v,
             )
-            scales.append(emit.divide(one, emit.minimum(of_q, emit.divide(of_v, emit.to_double(order)))))
+            scales.append(one / emit.minimum(of_q, of_v / emit.to_double(order)))
         for back in (0, 1):
-            power = builder.sub(order, integer(back))
-            row, largest = emit.pointer(memory.series, builder.mul(power, integer(n))), emit.constant(0.0)
+            power = order - back
+            row, largest = emit.pointer(memory.series, power * n), emit.constant(0.0)
             for j, scale in enumerate(scales):
-                largest = emit.maximum(emit.multiply(emit.function("fabs", emit.load(row, j)), scale), largest)
+                largest = emit.maximum(abs(emit.load(row, j)) * scale, largest)
             norms.append(largest)
         log_roots = [
-            emit.divide(emit.logarithm(value), emit.to_double(power))
-            for value, power in zip(norms, (order, builder.sub(order, integer(1))), strict=True)
+            emit.logarithm(value) / emit.to_double(power)
+            for value, power in zip(norms, (order, order - 1), strict=True)
         ]
-        h_in_units = emit.exponential(emit.negate(emit.maximum(*log_roots)))
+        h_in_units = emit.exponential(-emit.maximum(*log_roots))
         emit.store(h_in_units, work, lanes.LENGTH)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
-        time_left, zero = emit.subtract(t1, t), emit.constant(0.0)
-        h = emit.minimum_or_nan(emit.multiply(h_in_units, unit), emit.load(work, lanes.LONGEST))
-        h = builder.select(builder.compare("fcmp oge", h, time_left), time_left, h)
-        largest = emit.maximum(emit.function("fabs", t), emit.function("fabs", t1))
-        is_continued = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
+        time_left, zero = t1 - t, emit.constant(0.0)
+        h = emit.minimum_or_nan(h_in_units * unit, emit.load(work, lanes.LONGEST))
+        h = builder.select(h >= time_left, time_left, h)
+        largest = emit.maximum(abs(t), abs(t1))
+        is_continued = h > lanes.SHORTEST * largest
         for field in (lanes.RUNNING, lanes.ACTIVE):
-            is_continued = builder.bitwise_and(is_continued, is_set(emit, work, field))
+            is_continued = is_continued & is_set(emit, work, field)
         h = builder.select(is_continued, h, zero)
         emit.store(h, work, lanes.H)
-        emit.store(emit.divide(h, unit), work, lanes.X)
+        emit.store(h / unit, work, lanes.X)
         for field in (lanes.RUNNING, lanes.ACTIVE):
             store_mask(emit, work, field, is_continued)
 
@@ -148,27 +148,27 @@ class LaneSteps:
     def evaluate_positions(self, emit: LaneEmitter, memory: LaneMemory, x: Value) -> list[Value]:
         """Evaluate the series at x units of time; store NEW and the accelerations `series_a`; return the positions."""
         positions: list[Value] = []
-        builder, n, order = emit.builder, self.n, memory.order
+        n, order = self.n, memory.order
         unit, zero = emit.load(memory.work, lanes.UNIT), emit.constant(0.0)
-        per_unit = emit.divide(emit.constant(1.0), unit)
-        acceleration_unit = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
-        last_row = emit.pointer(memory.series, builder.mul(order, integer(n)))
+        per_unit = 1.0 / unit
+        acceleration_unit = 2.0 * (per_unit * per_unit)
+        last_row = emit.pointer(memory.series, order * n)
         for begin in range(0, n, N_PARALLEL):
             group = range(begin, min(begin + N_PARALLEL, n))
             initial = [each for j in group for each in (emit.load(last_row, j), zero, zero)]
             with emit.loop(integer(0), order, initial) as (m, carried, new):
-                power = builder.sub(builder.sub(order, integer(1)), m)
-                row = emit.pointer(memory.series, builder.mul(power, integer(n)))
+                power = order - 1 - m
+                row = emit.pointer(memory.series, power * n)
                 for j, (q, v, a) in zip(group, _triples(carried), strict=True):
                     # a first and q last: in this order each new number takes the register of the old one
-                    a = emit.add(emit.multiply(a, x), v)
-                    v = emit.add(emit.multiply(v, x), q)
-                    new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
+                    a = a * x + v
+                    v = v * x + q
+                    new += [q * x + emit.load(row, j), v, a]
             for j, (q, v, a) in zip(group, _triples(new), strict=True):
                 positions.append(q)
                 emit.store(q, memory.new, j)
-                emit.store(emit.multiply(v, per_unit), memory.new, n + j)
-                emit.store(emit.multiply(a, acceleration_unit), memory.series_a, j)
+                emit.store(v * per_unit, memory.new, n + j)
+                emit.store(a * acceleration_unit, memory.series_a, j)
         return positions
 
     def evaluate_defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
@@ -185,20 +185,17 @@ class LaneSteps:
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)
         # per_duration is infinite if h is 0: then positions set no limit
-        duration, per_duration = emit.divide(h, order), emit.divide(order, h)
+        duration, per_duration = h / order, order / h
         largest = max_defect = emit.constant(0.0)
         for each in a:
-            largest = emit.maximum(emit.function("fabs", each), largest)
-        noise = emit.multiply(emit.constant(ROUNDING), largest)
+            largest = emit.maximum(abs(each), largest)
+        noise = ROUNDING * largest
         for j, each in enumerate(a):
-            defect = emit.function("fabs", emit.subtract(emit.load(memory.series_a, j), each))
-            of_q, of_v = (
-                emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(memory.new, index))))
-                for index in (j, n + j)
-            )
-            allowed = emit.minimum_or_nan(of_v, emit.multiply(of_q, per_duration))
-            max_defect = emit.maximum_or_nan(emit.divide(emit.subtract(defect, noise), allowed), max_defect)
-        return emit.multiply(duration, max_defect)
+            defect = abs(emit.load(memory.series_a, j) - each)
+            of_q, of_v = (atol[j] + rtol * abs(emit.load(memory.new, index)) for index in (j, n + j))
+            allowed = emit.minimum_or_nan(of_v, of_q * per_duration)
+            max_defect = emit.maximum_or_nan((defect - noise) / allowed, max_defect)
+        return duration * max_defect
 
     def compute_departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store DEPARTURE, the ratio of |predicted - projected positions| to its limit, see control/step_size.py."""
@@ -206,32 +203,28 @@ class LaneSteps:
         h = emit.load(work, lanes.H)
 
         def magnitude(base: Value, index: int) -> Value:
-            return emit.function("fabs", emit.load(base, index))
+            return abs(emit.load(base, index))
 
         def difference(first: Value, second: Value, index: int) -> Value:
-            return emit.function("fabs", emit.subtract(emit.load(first, index), emit.load(second, index)))
+            return abs(emit.load(first, index) - emit.load(second, index))
 
         motion = error = emit.constant(0.0)
         for j in range(n):
-            distance = emit.maximum(
-                emit.multiply(h, magnitude(memory.state, n + j)), difference(memory.new, memory.state, j)
-            )
+            distance = emit.maximum(h * magnitude(memory.state, n + j), difference(memory.new, memory.state, j))
             motion = emit.maximum(distance, motion)
         is_passage, least = (
             self.crossing_mask(emit, memory),
-            emit.multiply(emit.constant(FRACTION_AT_SIGN_CHANGE), motion),
+            FRACTION_AT_SIGN_CHANGE * motion,
         )
-        motion = emit.multiply(emit.constant(FRACTION_OF_MOTION), motion)
+        motion = FRACTION_OF_MOTION * motion
         for j in range(n):
-            scale = emit.add(
-                atol[j], emit.multiply(rtol, emit.maximum(magnitude(memory.new, j), magnitude(memory.state, j)))
-            )
-            allowed = emit.add(motion, emit.multiply(emit.constant(FIXED_FRACTION), scale))
+            scale = atol[j] + rtol * emit.maximum(magnitude(memory.new, j), magnitude(memory.state, j))
+            allowed = motion + FIXED_FRACTION * scale
             allowed = emit.minimum(scale, allowed)
             if is_passage is not None:
                 allowed = emit.builder.select(is_passage, emit.minimum(scale, least), allowed)
             allowed = emit.maximum(allowed, emit.constant(LEAST))
-            error = emit.maximum_or_nan(emit.divide(difference(memory.predicted, memory.new, j), allowed), error)
+            error = emit.maximum_or_nan(difference(memory.predicted, memory.new, j) / allowed, error)
         emit.store(error, work, lanes.DEPARTURE)
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
@@ -241,35 +234,35 @@ class LaneSteps:
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store ACCEPTED, and LONGEST, the largest next step size; clear RUNNING after MAX_REJECTIONS or a NaN."""
         builder, one = emit.builder, emit.constant(1.0)
-        select, per_order = builder.select, emit.divide(one, emit.to_double(order))
+        select, per_order = builder.select, one / emit.to_double(order)
         off, *defects = (emit.load(work, field) for field in (lanes.DEPARTURE, lanes.WORST_DEFECT, lanes.DEFECT))
         is_valid = is_set(emit, work, lanes.ACTIVE)
         for value in (off, *defects):
-            magnitude = emit.function("fabs", value)
-            is_valid = builder.bitwise_and(is_valid, builder.compare("fcmp olt", magnitude, emit.constant(math.inf)))
+            magnitude = abs(value)
+            is_valid = is_valid & (magnitude < math.inf)
         defect, shortest = emit.maximum(*defects), emit.constant(MIN_FACTOR)
 
         def root(x: Value) -> Value:
-            return emit.exponential(emit.multiply(emit.logarithm(x), per_order))
+            return emit.exponential(emit.logarithm(x) * per_order)
 
-        departure_factor = root(emit.divide(emit.constant(TARGET_ERROR), off))
-        factor = select(builder.compare("fcmp ogt", off, one), departure_factor, one)
-        defect_factor = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
+        departure_factor = root(TARGET_ERROR / off)
+        factor = select(off > one, departure_factor, one)
+        defect_factor = SAFETY * root(one / defect)
         defect_factor = emit.minimum(factor, emit.maximum(shortest, defect_factor))
-        factor = select(builder.compare("fcmp ogt", defect, one), defect_factor, factor)
+        factor = select(defect > one, defect_factor, factor)
         factor = select(is_valid, factor, shortest)
-        is_running, is_refused = is_set(emit, work, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
-        is_accepted = builder.bitwise_and(is_running, builder.compare("fcmp oge", factor, one))
+        is_running, is_refused = is_set(emit, work, lanes.RUNNING), factor < one
+        is_accepted = is_running & (factor >= one)
         store_mask(emit, work, lanes.ACCEPTED, is_accepted)
         n_refused = emit.load(work, lanes.N_REJECTED)
-        n_refused = select(builder.bitwise_and(is_running, is_refused), emit.add(n_refused, one), n_refused)
+        n_refused = select(is_running & is_refused, n_refused + one, n_refused)
         # end a run with a value that is not finite: shorter steps could pass the point where equations are undefined
         n_refused = select(is_valid, n_refused, emit.constant(math.inf))
         emit.store(n_refused, work, lanes.N_REJECTED)
-        h_longest = emit.multiply(emit.load(work, lanes.H), select(is_refused, factor, emit.constant(MAX_FACTOR)))
+        h_longest = emit.load(work, lanes.H) * select(is_refused, factor, emit.constant(MAX_FACTOR))
         emit.store(select(is_running, h_longest, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
-        within_limit = builder.compare("fcmp ole", n_refused, emit.constant(float(MAX_REJECTIONS)))
-        store_mask(emit, work, lanes.RUNNING, builder.bitwise_and(is_running, within_limit))
+        within_limit = n_refused <= float(MAX_REJECTIONS)
+        store_mask(emit, work, lanes.RUNNING, is_running & within_limit)
 
     def commit(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Copy NEW to STATE in the lanes in which the step was accepted."""
@@ -291,8 +284,8 @@ class LaneSteps:
         emit.numbers = emit.pointer(work, fixed.pop())
         emit.constants = emit.builder.advance(control, integer(lanes.ATOL + self.n))
         series_memory = emit.pointer(work, series)
-        n_coefficients = emit.builder.add(order, integer(1))
-        scratch = emit.pointer(series_memory, emit.builder.mul(n_coefficients, integer(self.n)))
+        n_coefficients = order + 1
+        scratch = emit.pointer(series_memory, n_coefficients * self.n)
         state, new, predicted, series_a, a, lam = (emit.pointer(work, index) for index in fixed)
         return LaneMemory(order, work, state, new, predicted, series_a, a, lam, series_memory, scratch)
 
@@ -318,7 +311,7 @@ def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
 
 def clear_active_unless(emit: LaneEmitter, work: Value, is_valid: Value) -> None:
     """Clear ACTIVE in the lanes in which `is_valid` is false."""
-    store_mask(emit, work, lanes.ACTIVE, emit.builder.bitwise_and(is_set(emit, work, lanes.ACTIVE), is_valid))
+    store_mask(emit, work, lanes.ACTIVE, is_set(emit, work, lanes.ACTIVE) & is_valid)
 
 
 SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by column
@@ -337,8 +330,8 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
         for k, row_before in enumerate(before):
             total: Value | None = None
             for j in sorted(row.keys() & row_before.keys()):
-                term = emit.multiply(row[j], row_before[j])
-                total = term if total is None else emit.add(total, term)
+                term = row[j] * row_before[j]
+                total = term if total is None else total + term
             if total is not None:
                 matrix[i][k] = total
     one, zero, select, compare = emit.constant(1.0), emit.constant(0.0), emit.builder.select, emit.builder.compare
@@ -348,16 +341,16 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
         i = min(remaining, key=lambda each: (len(matrix[each]), each))
         remaining.remove(i)
         pivot = matrix[i].pop(i)
-        sign_unless_positive = select(compare("fcmp olt", pivot, zero), emit.negate(sign), zero)
+        sign_unless_positive = select(compare("fcmp olt", pivot, zero), -sign, zero)
         sign = select(compare("fcmp ogt", pivot, zero), sign, sign_unless_positive)
-        inverse = emit.divide(one, pivot)
+        inverse = one / pivot
         for k in sorted(remaining):
             if i in matrix[k]:
-                multiple = emit.multiply(matrix[k].pop(i), inverse)
+                multiple = matrix[k].pop(i) * inverse
                 for j, value in matrix[i].items():
-                    change = emit.multiply(multiple, value)
+                    change = multiple * value
                     entry = matrix[k].get(j)
-                    matrix[k][j] = emit.negate(change) if entry is None else emit.subtract(entry, change)
+                    matrix[k][j] = -change if entry is None else entry - change
     return compare("fcmp ule", sign, zero)
 
 
@@ -391,7 +384,7 @@ class LaneStages:
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
         for i in range(1, len(b)):
-            stage_time = emit.add(t, emit.multiply(emit.constant(c[i]), x))
+            stage_time = t + c[i] * x
             emit.store(stage_time, work, lanes.T_NEW)
             with emit.loop(integer(0), integer(self.n), []) as (j, _, _):
                 coordinate = _Coordinate(self, emit, memory, j, i)
@@ -401,23 +394,23 @@ class LaneStages:
         with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
             coordinate = _Coordinate(self, emit, memory, j, len(b))
             new_state = coordinate.store_state(b, b @ A, x)
-            atol_pointer = emit.builder.advance(control, emit.builder.add(j, integer(lanes.ATOL)))
+            atol_pointer = emit.builder.advance(control, j + lanes.ATOL)
             atol = emit.broadcast(emit.builder.load(atol_pointer))
             error_weights = [
                 coordinate.error_weight(atol, rtol, *each) for each in zip(coordinate.old_state, new_state, strict=True)
             ]
             for largest, weights in ((e, fine_weights), (d, coarse_weights)):
-                of_q, of_v = emit.multiply(x, coordinate.sum(weights @ A)), coordinate.sum(weights)
+                of_q, of_v = x * coordinate.sum(weights @ A), coordinate.sum(weights)
                 for off, weight in zip((of_q, of_v), error_weights, strict=True):
-                    largest = emit.maximum(emit.multiply(emit.function("fabs", off), weight), largest)
-                    total = emit.add(total, emit.multiply(zero, off))
+                    largest = emit.maximum(abs(off) * weight, largest)
+                    total = total + zero * off
                 new.append(largest)
             for each in new_state:
-                total = emit.add(total, emit.multiply(zero, each))
+                total = total + zero * each
             new.append(total)
-        e, d, total = (*(emit.multiply(x, each) for each in new[:2]), new[2])
-        ratio = emit.divide(d, e)
-        error = emit.divide(e, emit.function("sqrt", emit.add(emit.constant(1.0), emit.multiply(ratio, ratio))))
+        e, d, total = *(x * each for each in new[:2]), new[2]
+        ratio = d / e
+        error = e / emit.function("sqrt", 1.0 + ratio * ratio)
         select, compare = emit.builder.select, emit.builder.compare
         error = select(compare("fcmp ogt", e, zero), error, zero)
         # the maxima e and d ignore NaN; `total` is NaN if a value is not finite
@@ -445,22 +438,22 @@ class _Coordinate:
             if abs(weight) > WEIGHT_ROUNDING:
                 if k not in self._loaded:
                     self._loaded[k] = self.emit.load(*self._acceleration_locations[k])
-                term = self.emit.multiply(self.emit.constant(weight), self._loaded[k])
-                total = term if total is None else self.emit.add(total, term)
+                term = weight * self._loaded[k]
+                total = term if total is None else total + term
         return self.emit.constant(0.0) if total is None else total
 
     def error_weight(self, atol: Value, rtol: Value, before: Value, after: Value) -> Value:
         """Return the reciprocal of the allowed error of a position or velocity that goes from `before` to `after`."""
         emit = self.emit
-        magnitude = emit.maximum(emit.function("fabs", before), emit.function("fabs", after))
-        return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, magnitude)))
+        magnitude = emit.maximum(abs(before), abs(after))
+        return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
         """Store q and v at a stage in NEW; return both. Accelerations have `weights` in v, `position_weights` in q."""
         emit, (q, v) = self.emit, self.old_state
-        drift = emit.multiply(emit.constant(float(weights.sum())), v)
-        q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(position_weights)))))
-        v = emit.add(v, emit.multiply(x, self.sum(weights)))
+        drift = float(weights.sum()) * v
+        q = q + x * (drift + x * self.sum(position_weights))
+        v = v + x * self.sum(weights)
         for value, index in ((q, 0), (v, self.n)):
             emit.store(value, self.new, index)
         return q, v
@@ -550,15 +543,15 @@ class LaneCode(LaneSteps):
             emit.store(value, scratch, i)
         for j in range(n):
             emit.store(inputs[1 + j], out, j)
-            emit.store(emit.multiply(unit, inputs[1 + n + j]), out, n + j)
+            emit.store(unit * inputs[1 + n + j], out, n + j)
         assert self.recurrences is not None
         self.recurrences.write_order_0(emit, inputs, scratch)
         with emit.loop(integer(1), order, []) as (k, _, _):
             self.recurrences.write_order(emit, k, unit, out, scratch)
-        last_row, total = emit.pointer(out, builder.mul(order, integer(n))), emit.constant(0.0)
+        last_row, total = emit.pointer(out, order * n), emit.constant(0.0)
         for j in range(n):
-            total = emit.add(total, emit.multiply(emit.constant(0.0), emit.load(last_row, j)))
-        is_valid = builder.bitwise_and(is_valid, builder.compare("fcmp oeq", total, emit.constant(0.0)))
+            total = total + 0.0 * emit.load(last_row, j)
+        is_valid = is_valid & builder.compare("fcmp oeq", total, emit.constant(0.0))
         store_mask(emit, work, lanes.ACTIVE, is_valid)
 
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
@@ -570,29 +563,27 @@ class LaneCode(LaneSteps):
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
         zero, one, two = (emit.constant(x) for x in (0.0, 1.0, 2.0))
-        n_lane_parts = emit.function("ceil", emit.divide(h, gap))
+        n_lane_parts = emit.function("ceil", h / gap)
         n_lane_parts = emit.maximum(emit.minimum(n_lane_parts, emit.constant(MAX_PARTS)), one)
-        part_size = emit.divide(h, n_lane_parts)
-        shift = emit.add(emit.load(work, lanes.SHIFT), emit.constant(GOLDEN_SECTION))
-        shift = emit.subtract(shift, builder.select(builder.compare("fcmp oge", shift, one), one, zero))
+        part_size = h / n_lane_parts
+        shift = emit.load(work, lanes.SHIFT) + GOLDEN_SECTION
+        shift = shift - builder.select(shift >= one, one, zero)
         emit.store(shift, work, lanes.SHIFT)
-        offset = emit.multiply(
-            emit.subtract(emit.multiply(two, shift), one), emit.maximum(emit.subtract(gap, part_size), zero)
-        )
+        offset = (two * shift - one) * emit.maximum(gap - part_size, zero)
         n_parts = builder.convert("fptosi", emit.max_over_lanes(n_lane_parts), INTEGER)
         with emit.loop(integer(1), n_parts, [zero]) as (index, (max_defect,), new):
             part = emit.to_double(index)
-            is_inside = builder.compare("fcmp olt", part, n_lane_parts)
-            x = builder.select(is_inside, emit.add(emit.multiply(part, part_size), offset), zero)
-            emit.store(emit.add(emit.load(work, lanes.T), x), work, lanes.T_NEW)
-            self.evaluate_positions(emit, memory, emit.divide(x, emit.load(work, lanes.UNIT)))
+            is_inside = part < n_lane_parts
+            x = builder.select(is_inside, part * part_size + offset, zero)
+            emit.store(emit.load(work, lanes.T) + x, work, lanes.T_NEW)
+            self.evaluate_positions(emit, memory, x / emit.load(work, lanes.UNIT))
             is_valid, a = self._accelerations(emit, work, memory)
             defect = builder.select(is_valid, self.compute_defect(emit, control, memory, a), emit.constant(math.inf))
             new.append(emit.maximum_or_nan(builder.select(is_inside, defect, zero), max_defect))
         emit.store(new[0], work, lanes.WORST_DEFECT)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
-        is_last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
-        emit.store(builder.select(is_last, t1, emit.add(t, h)), work, lanes.T_NEW)
+        is_last = builder.compare("fcmp oeq", h, t1 - t)
+        emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Correct the positions NEW once where ACTIVE is 1; store in ACTIVE and UNCONVERGED where this succeeds."""
@@ -605,22 +596,22 @@ class LaneCode(LaneSteps):
 
     def correct_state(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Project NEW once in lanes with UNCONVERGED = 1; store a, lam, ACTIVE (converged) and UNCONVERGED."""
-        builder, memory = emit.builder, self.memory(emit, order, control, work)
+        memory = self.memory(emit, order, control, work)
         was_active, is_unfinished = (is_set(emit, work, field) for field in (lanes.ACTIVE, lanes.UNCONVERGED))
         is_active, moved = self._project(emit, self.equations.basic_projection, lanes.UNCONVERGED, memory)
         largest = emit.constant(0.0)
         for j in range(self.n):
-            largest = emit.maximum(emit.function("fabs", emit.load(memory.new, j)), largest)
-        tolerance = emit.multiply(emit.constant(RELATIVE_CORRECTION), largest)
+            largest = emit.maximum(abs(emit.load(memory.new, j)), largest)
+        tolerance = RELATIVE_CORRECTION * largest
         tolerance = emit.maximum(tolerance, emit.constant(ABSOLUTE_CORRECTION))
-        converged = builder.bitwise_and(is_active, builder.compare("fcmp ole", moved, tolerance))
-        limit = emit.multiply(emit.constant(CONTRACTION), emit.load(work, lanes.LAST_CORRECTION))
-        is_continued = builder.bitwise_and(is_active, builder.compare("fcmp ole", moved, limit))
-        is_continued = builder.bitwise_and(is_continued, builder.compare("fcmp ogt", moved, tolerance))
+        converged = is_active & (moved <= tolerance)
+        limit = CONTRACTION * emit.load(work, lanes.LAST_CORRECTION)
+        is_continued = is_active & (moved <= limit)
+        is_continued = is_continued & (moved > tolerance)
         emit.store(emit.maximum(moved, tolerance), work, lanes.LAST_CORRECTION)
         store_mask(emit, work, lanes.UNCONVERGED, is_continued)
-        has_finished = builder.operation("xor", was_active, builder.bitwise_and(was_active, is_unfinished))
-        store_mask(emit, work, lanes.ACTIVE, builder.operation("or", has_finished, converged))
+        has_finished = was_active ^ was_active & is_unfinished
+        store_mask(emit, work, lanes.ACTIVE, has_finished | converged)
 
     def _project(self, emit: LaneEmitter, outputs: Program, field: int, memory: LaneMemory) -> tuple[Value, Value]:
         """Correct NEW by a projection program, in the lanes in which `field` is 1.
@@ -631,10 +622,10 @@ class LaneCode(LaneSteps):
         inputs = self._new_state(emit, work, memory)
         lowering, arrays = lower_program(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
-        is_active = emit.builder.bitwise_and(is_set(emit, work, field), lowering.is_valid(outputs, arrays[0]))
+        is_active = is_set(emit, work, field) & lowering.is_valid(outputs, arrays[0])
         largest = emit.constant(0.0)
         for value in values["moved"]:
-            largest = emit.maximum(emit.function("fabs", value), largest)
+            largest = emit.maximum(abs(value), largest)
         for k, value in enumerate([*values["q"], *values.get("v", [])]):
             emit.store(select(is_active, value, inputs[1 + k]), memory.new, k)
         for base, name in ((memory.a, "a"), (memory.lam, "lam")):

@@ -75,9 +75,7 @@ class LaneEmitter(Emitter):
     def pointer(self, base: Value, *indices: Value | int) -> Value:
         """Return the pointer `base` advanced by the sum of `indices`, counted in vectors."""
         for index in indices:
-            offset = (
-                integer(index * self.lanes) if isinstance(index, int) else self.builder.mul(index, integer(self.lanes))
-            )
+            offset = integer(index * self.lanes) if isinstance(index, int) else index * self.lanes
             base = self.builder.advance(base, offset)
         return base
 
@@ -111,29 +109,23 @@ class LaneEmitter(Emitter):
         """Return log2 x for x >= 0 with an error below 1e-4; below MIN_ARGUMENT, return the value at MIN_ARGUMENT."""
         builder = self.builder
         bits = builder.convert("bitcast", self.maximum(x, self.constant(MIN_ARGUMENT)), self.integer_type)
-        exponent = builder.sub(builder.operation("lshr", bits, self.integer_constant(52)), self.integer_constant(1023))
-        mantissa = builder.operation(
-            "or", builder.bitwise_and(bits, self.integer_constant((1 << 52) - 1)), self.integer_constant(1023 << 52)
-        )
-        return self.add(
+        exponent = builder.operation("lshr", bits, self.integer_constant(52)) - 1023
+        mantissa = bits & (1 << 52) - 1 | 1023 << 52
+        whole, mantissa = (
             builder.convert("sitofp", exponent, self.double_type),
-            self.polynomial(LOG2_COEFFICIENTS, builder.convert("bitcast", mantissa, self.double_type)),
+            builder.convert("bitcast", mantissa, self.double_type),
         )
+        return whole + self.polynomial(LOG2_COEFFICIENTS, mantissa)
 
     def exponential(self, x: Value) -> Value:
         """Return 2^x with a relative error below 1e-4."""
         builder = self.builder
         x = self.maximum(self.minimum(x, self.constant(MAX_EXPONENT)), self.constant(-MAX_EXPONENT))
         whole = self.function("rint", x)
-        bits = builder.operation(
-            "shl",
-            builder.add(builder.convert("fptosi", whole, self.integer_type), self.integer_constant(1023)),
-            self.integer_constant(52),
-        )
-        return self.multiply(
-            builder.convert("bitcast", bits, self.double_type),
-            self.polynomial(EXP2_COEFFICIENTS, self.subtract(x, whole)),
-        )
+        exponent = builder.convert("fptosi", whole, self.integer_type) + 1023
+        bits = builder.operation("shl", exponent, self.integer_constant(52))
+        power = builder.convert("bitcast", bits, self.double_type)
+        return power * self.polynomial(EXP2_COEFFICIENTS, x - whole)
 
     def minimum_or_nan(self, a: Value, b: Value) -> Value:
         """Return the smaller of a and b, or a if one of the two is NaN: if a is NaN, the result is NaN."""
@@ -142,11 +134,6 @@ class LaneEmitter(Emitter):
     def maximum_or_nan(self, a: Value, b: Value) -> Value:
         """Return the larger of a and b, or a if one of the two is NaN: if a is NaN, the result is NaN."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
-
-
-def vector_index(emit: LaneEmitter, k: Value) -> Value:
-    """Return the index, counted in numbers, at which vector k of an array of vectors begins."""
-    return emit.builder.mul(k, integer(STAGES))
 
 
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
@@ -163,9 +150,9 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
     """Return the sums of the elements of a, and of b, which are computed by the same instructions."""
     builder, half = emit.builder, STAGES // 2
     lower_half, upper_half = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
-    total = emit.add(builder.shuffle(a, b, lower_half), builder.shuffle(a, b, upper_half))
+    total = builder.shuffle(a, b, lower_half) + builder.shuffle(a, b, upper_half)
     for distance in (2, 1):
-        total = emit.add(total, builder.shuffle(total, total, [k ^ distance for k in range(STAGES)]))
+        total = total + builder.shuffle(total, total, [k ^ distance for k in range(STAGES)])
     return [builder.extract(total, k) for k in (0, half)]
 
 
@@ -332,39 +319,39 @@ class LaneSeries:
     def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
         """Write code for order k > 0: it stores the coefficients k + 1 of q in `out`, and the factors in `scratch`."""
         builder, n = emit.builder, self.n
-        next_order = builder.add(k, integer(1))
-        q = emit.pointer(out, builder.mul(k, integer(n)))
+        next_order = k + 1
+        q = emit.pointer(out, k * n)
         order, zero = emit.to_double(k), emit.constant(0.0)
         is_first = builder.compare("icmp eq", k, integer(1))
         time_coefficient = builder.select(is_first, unit, zero)
         quantities = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time_coefficient)
         row = _Row(self, emit, self._row_pointer(emit, scratch, k))
-        per_order = emit.divide(emit.constant(1.0), order)
+        per_order = 1.0 / order
         first_row = self._row_pointer(emit, scratch, builder.select(is_first, integer(ZERO_ROW), integer(1)))
-        row_before = _Row(self, emit, self._row_pointer(emit, scratch, builder.sub(k, integer(1))))
+        row_before = _Row(self, emit, self._row_pointer(emit, scratch, k - 1))
         sums = self._write_sums(emit, scratch, k)
-        partial_sums = _PartialSums(sums, first_row, self._row_pointer(emit, scratch, integer(1)), row_before)
+        partial_sums = _PartialSums(sums, first_row, self._row_pointer(emit, scratch, 1), row_before)
         self._write_order(emit, quantities, self.early, row, scratch, partial_sums, order, per_order)
         next_sums = {pair: partial_sums.sum_of_next_order(pair, row) for pair in self.carried_pairs}
         for index, pair in enumerate(self.carried_pairs):
             emit.store(next_sums[pair], scratch, self.carried_offset + index)
-        per_unit = emit.divide(emit.constant(1.0), unit)
+        per_unit = 1.0 / unit
         for result, pair in self._carried_sums.items():
-            quantities.define(result, emit.multiply(per_unit, next_sums[pair]))
-        minus_rate = emit.negate(emit.divide(order, unit))
+            quantities.define(result, per_unit * next_sums[pair])
+        minus_rate = -(order / unit)
         c = [zero] * self.n_rows
         for index, (terms, _) in self.rows:
-            c[index] = emit.multiply(minus_rate, quantities.sum(terms))
+            c[index] = minus_rate * quantities.sum(terms)
         r = [emit.load(scratch, self.rhs_offset + i) for i in range(n)]
         stored = [emit.load(scratch, i) for i in range(self.solution.n_stored)]
         solution = self.solution
         _, (a, lam) = lower_program(emit, solution.solution_program, [*r, *c, *stored], self.numbers)
-        per_v, per_q = emit.multiply(unit, per_order), emit.divide(unit, emit.to_double(next_order))
+        per_v, per_q = unit * per_order, unit / emit.to_double(next_order)
         previous = Quantities(emit, lambda i: zero)  # values at order k - 1: a and lam; 0 for other quantities
         for j in range(n):
-            v = emit.multiply(per_v, a[j])
+            v = per_v * a[j]
             quantities.define(1 + n + j, v)
-            emit.store(emit.multiply(per_q, v), emit.pointer(out, builder.mul(next_order, integer(n))), j)
+            emit.store(per_q * v, emit.pointer(out, next_order * n), j)
             previous.define(1 + 2 * n + j, a[j])
         for i in range(self.n_rows):
             previous.define(1 + 3 * n + i, lam[i])
@@ -376,8 +363,8 @@ class LaneSeries:
         for index, (terms, _) in self.balance:
             emit.store(quantities.sum(terms), scratch, self.rhs_offset + index)
 
-    def _row_pointer(self, emit: LaneEmitter, scratch: Value, order: Value) -> Value:
-        return emit.pointer(scratch, self.row_0_offset, emit.builder.mul(order, integer(self.row_length)))
+    def _row_pointer(self, emit: LaneEmitter, scratch: Value, order: Value | int) -> Value:
+        return emit.pointer(scratch, self.row_0_offset, order * self.row_length)
 
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
@@ -396,23 +383,23 @@ class LaneSeries:
             elif kind == PRODUCT:
                 z = quantities.sum(*second)
                 row.store(second, z)
-                values = [emit.multiply(x, z)]
+                values = [x * z]
             elif kind == SINE:
                 values = list(sine_and_cosine(emit, x))
             elif kind == RECIPROCAL:
-                values = [emit.divide(one, x)]
+                values = [one / x]
             else:
                 values = [emit.function(FUNCTIONS[kind], x)]
                 if kind in (LOGARITHM, ARCTANGENT):
                     divisor = quantities.sum(*second)
                     row.store(second, divisor)
                 elif kind == SQUARE_ROOT:
-                    divisor = emit.add(values[0], values[0])
+                    divisor = values[0] + values[0]
             if kind in (SINE, EXPONENTIAL, LOGARITHM, ARCTANGENT):
                 scaled = (((results[0], 1.0),), 0.0) if kind in (LOGARITHM, ARCTANGENT) else first
                 row.store(("scaled", *scaled), zero)
             if divisor is not None:
-                emit.store(emit.divide(one, divisor), scratch, self.divisor_offset + self._divisor_indices[results[0]])
+                emit.store(one / divisor, scratch, self.divisor_offset + self._divisor_indices[results[0]])
             for result, value in zip(results, values, strict=True):
                 quantities.define(result, value)
                 row.store((((result, 1.0),), 0.0), value, "if used")
@@ -424,25 +411,25 @@ class LaneSeries:
         and last terms, which are known later, are added by `_PartialSums`. So one loop computes several sums, does not
         wait for the previous order, and loads each row once.
         """
-        builder = emit.builder
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
         keys += [(pair, False) for pair in pairs - set(self.carried_pairs)]
         keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours often share a factor
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
-        order = builder.add(k, integer(1))
+        order = k + 1
         for begin in range(0, len(keys), MAX_SUMS_IN_LOOP):
             group = keys[begin : begin + MAX_SUMS_IN_LOOP]
             with emit.loop(integer(2), k, [emit.constant(0.0)] * len(group)) as (j, totals, new):
-                up, down = self._row_pointer(emit, scratch, j), self._row_pointer(emit, scratch, builder.sub(order, j))
-                row_before = self._row_pointer(emit, scratch, builder.sub(j, integer(1)))
+                up, down = self._row_pointer(emit, scratch, j), self._row_pointer(emit, scratch, order - j)
+                row_before = self._row_pointer(emit, scratch, j - 1)
                 loaded: dict[tuple[Value, int], Value] = {}
                 for ((x, y), for_next_order), total in zip(group, totals, strict=True):
                     indices = ((up, x), (down, y)) if for_next_order else ((down, x), (row_before, y))
                     for base, index in indices:
                         if (base, index) not in loaded:
                             loaded[base, index] = emit.load(base, index)
-                    new.append(emit.add(total, emit.multiply(*(loaded[each] for each in indices))))
+                    first, second = (loaded[each] for each in indices)
+                    new.append(total + first * second)
             sums |= dict(zip(group, new, strict=True))
         return sums
 
@@ -475,31 +462,28 @@ class LaneSeries:
             u = quantities.sum(first)
             row.store(operation.first, u, "if used")
             if kind == PENDING:
-                values = [emit.add(totals[0], emit.multiply(u, start[0][1]))]
+                values = [totals[0] + u * start[0][1]]
             elif kind == PRODUCT:
                 z = quantities.sum(second)
                 row.store(operation.second, z)
-                values = [emit.add(emit.add(totals[0], emit.multiply(u, start[0][1])), emit.multiply(start[0][0], z))]
+                values = [totals[0] + u * start[0][1] + start[0][0] * z]
             elif kind == RECIPROCAL:
-                total = emit.add(totals[0], emit.multiply(u, start[0][1]))
-                values = [emit.negate(emit.multiply(total, start[0][1]))]
+                total = totals[0] + u * start[0][1]
+                values = [-(total * start[0][1])]
             elif kind == SQUARE_ROOT:
                 divisor = emit.load(scratch, self.divisor_offset + self._divisor_indices[results[0]])
-                values = [emit.multiply(emit.subtract(u, totals[0]), divisor)]
+                values = [(u - totals[0]) * divisor]
             elif kind in (LOGARITHM, ARCTANGENT):
                 divisor = emit.load(scratch, self.divisor_offset + self._divisor_indices[results[0]])
-                values = [emit.multiply(emit.subtract(u, emit.multiply(totals[0], inverse)), divisor)]
-                row.store(("scaled", ((results[0], 1.0),), 0.0), emit.multiply(order, values[0]))
+                values = [(u - totals[0] * inverse) * divisor]
+                row.store(("scaled", ((results[0], 1.0),), 0.0), order * values[0])
                 row.store(operation.second, quantities.sum(second))
             else:
-                x = emit.multiply(order, u)
+                x = order * u
                 row.store(("scaled", *operation.first), x)
-                values = [
-                    emit.multiply(emit.add(total, emit.multiply(x, y)), inverse)
-                    for total, (_, y) in zip(totals, start, strict=True)
-                ]
+                values = [(total + x * y) * inverse for total, (_, y) in zip(totals, start, strict=True)]
                 if kind == SINE:
-                    values[1] = emit.negate(values[1])
+                    values[1] = -values[1]
             for result, value in zip(results, values, strict=True):
                 quantities.define(result, value)
                 row.store((((result, 1.0),), 0.0), value, "if used")
@@ -535,10 +519,10 @@ class _PartialSums(NamedTuple):
     def sum_of_order(self, pair: tuple[int, int]) -> Value:
         """Return the sum of X[j] Y[k - j] over 0 < j < k for the factors (X, Y) = `pair`."""
         emit, (x, y) = self.row_before.emit, pair
-        return emit.add(self.sums[pair, False], emit.multiply(emit.load(self.first_row, x), self.row_before.load(y)))
+        return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
         """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k for (X, Y) = `pair`; `row` has the factors of order k."""
         emit, (x, y) = self.row_before.emit, pair
-        total = emit.add(self.sums[pair, True], emit.multiply(row.load(x), emit.load(self.first_row, y)))
-        return emit.add(total, emit.multiply(emit.load(self.row_1, x), row.load(y)))
+        total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
+        return total + emit.load(self.row_1, x) * row.load(y)

@@ -27,7 +27,6 @@ from twoloop.generate.llvm_text import (
     width_of,
 )
 from twoloop.generate.program import Algebra, Coefficient, Coefficients, Program, Terms
-from twoloop.kernels.data.common import OPTIONS
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     COSINE,
@@ -38,7 +37,6 @@ from twoloop.kernels.evaluation.operations import (
     SQUARE_ROOT,
 )
 
-FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # fast-math flags of floating-point instructions, as in kernels
 MIN_TERMS_SPLIT = 4  # a sum of at least this number of terms is computed as the sum of two halves
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
 # names of LLVM intrinsics by names of functions; a function without an intrinsic is called in libm
@@ -64,7 +62,7 @@ class Emitter:
 
     def constant(self, value: float) -> Value:
         """Return a literal number."""
-        return constant(self.double_type, value)
+        return constant(self.double_type, value, self.builder)
 
     def load_constant(self, value: float) -> Value:
         """Return a number that is loaded from memory just before its use, see `Builder.load_constant`."""
@@ -72,7 +70,7 @@ class Emitter:
 
     def integer_constant(self, value: int) -> Value:
         """Return a literal integer of 64 bits; in lanes, a vector of equal integers."""
-        return constant(self.integer_type, value)
+        return constant(self.integer_type, value, self.builder)
 
     def coefficient(self, number: float) -> Value:
         """Return a literal, or a Coefficient loaded from the array `numbers`, which does not change during a call."""
@@ -80,25 +78,9 @@ class Emitter:
             return self.constant(number)
         return self.load(self.numbers, number.index, constant=True)
 
-    def add(self, a: Value, b: Value) -> Value:
-        """Return a + b."""
-        return self.builder.operation(f"fadd {FAST_MATH_FLAGS}", a, b)
-
     def add_sums(self, a: Value, b: Value) -> Value:
         """Return a + b for two sums without reassociation: LLVM would chain the terms of both, which is slower."""
         return self.builder.operation("fadd", a, b)
-
-    def subtract(self, a: Value, b: Value) -> Value:
-        """Return a - b."""
-        return self.builder.operation(f"fsub {FAST_MATH_FLAGS}", a, b)
-
-    def multiply(self, a: Value, b: Value) -> Value:
-        """Return the product of a and b."""
-        return self.builder.operation(f"fmul {FAST_MATH_FLAGS}", a, b)
-
-    def divide(self, a: Value, b: Value) -> Value:
-        """Return a / b."""
-        return self.builder.operation(f"fdiv {FAST_MATH_FLAGS}", a, b)
 
     def fma(self, a: Value, b: Value, c: Value) -> Value:
         """Return a * b + c, rounded only once."""
@@ -114,10 +96,6 @@ class Emitter:
             total = self.fma(total, square, pairs.pop())
         return total
 
-    def negate(self, a: Value) -> Value:
-        """Return -a."""
-        return self.builder.negate(FAST_MATH_FLAGS, a)
-
     def maximum(self, a: Value, b: Value) -> Value:
         """Return the larger of two numbers."""
         return self.builder.select(self.builder.compare("fcmp ogt", a, b), a, b)
@@ -129,8 +107,8 @@ class Emitter:
     def scale(self, factor: float, a: Value) -> Value:
         """Return `factor` times a; `factor` is a literal, or a Coefficient loaded from memory."""
         if factor in (1.0, -1.0):
-            return a if factor == 1.0 else self.negate(a)
-        return self.multiply(self.coefficient(factor), a)
+            return a if factor == 1.0 else -a
+        return self.coefficient(factor) * a
 
     def to_double(self, whole: Value) -> Value:
         """Return the integer `whole` converted to a double."""
@@ -192,7 +170,7 @@ class Emitter:
         carried = [builder.phi(value.type) for value in initial]
         new: list[Any] = []
         yield index, carried, new
-        next_index = builder.add(index, integer(1))
+        next_index = index + 1
         is_entered, last = builder.compare("icmp slt", next_index, end), builder.block
         index.add_incoming(next_index, last)
         builder.branch(is_entered, body, after)
@@ -261,9 +239,9 @@ class Quantities:
                 if total is None:
                     total = self._emit.scale(coefficient, value)
                 elif coefficient == -1.0:
-                    total = self._emit.subtract(total, value)
+                    total = total - value
                 else:
-                    total = self._emit.add(total, self._emit.scale(coefficient, value))
+                    total = total + self._emit.scale(coefficient, value)
             self._sums[key] = total
         return self._sums[key]
 
@@ -314,12 +292,12 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     cosine = emit.fma(square, emit.load_constant(-0.5), emit.constant(1.0))
     cosine = emit.fma(fourth, emit.polynomial(COSINES, square), cosine)
     quarter = builder.convert("fptosi", quarter_turns, emit.integer_type)
-    is_odd, next_quarter = builder.convert("trunc", quarter, emit.bit_type), builder.add(quarter, whole(1))
+    is_odd, next_quarter = builder.convert("trunc", quarter, emit.bit_type), quarter + 1
     results = []
     for if_odd, if_even, turn in ((cosine, sine, quarter), (sine, cosine, next_quarter)):
-        sign = builder.operation("shl", builder.bitwise_and(turn, whole(2)), whole(62))
+        sign = builder.operation("shl", turn & 2, whole(62))
         bits = builder.convert("bitcast", builder.select(is_odd, if_odd, if_even), emit.integer_type)
-        results.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double_type))
+        results.append(builder.convert("bitcast", bits ^ sign, emit.double_type))
     return results[0], results[1]
 
 
@@ -341,7 +319,7 @@ class Lowering(Algebra[Value]):
         self.emit, self.numbers, self._locations = emit, numbers, dict(locations)
         self.angles: list[Value] = []  # arguments of sines and cosines, to be compared with LARGEST_ANGLE by `is_valid`
         self.functions = {kind: partial(emit.function, name) for kind, name in FUNCTIONS.items()}
-        self.functions[RECIPROCAL] = lambda x: emit.divide(emit.constant(1.0), x)
+        self.functions[RECIPROCAL] = lambda x: 1.0 / x
         self._quantities = Quantities(emit, lambda quantity: emit.load(*self._locations[quantity]))
         self._sines_and_cosines: dict[Any, tuple[Value, Value]] = {}  # sines and cosines, by the keys of their angles
         self._computed_quantities = set(locations)
@@ -373,7 +351,7 @@ class Lowering(Algebra[Value]):
 
     def product(self, a: Value, b: Value) -> Value:
         """Return the product of a and b."""
-        return self.emit.multiply(a, b)
+        return a * b
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> Value:
         """Return the result of an operation; the sine and the cosine of an angle are computed together."""
@@ -423,12 +401,12 @@ class Lowering(Algebra[Value]):
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN
-            total = emit.add(total, emit.multiply(value, zero))
+            total = total + value * zero
         is_valid = builder.compare("fcmp oeq", total, zero)
         pairs = [(self.affine(larger), self.affine(smaller)) for larger, smaller in program.conditions]
-        pairs += [(emit.constant(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in self.angles]
+        pairs += [(emit.constant(LARGEST_ANGLE), abs(angle)) for angle in self.angles]
         for larger, smaller in pairs:
-            is_valid = builder.bitwise_and(is_valid, builder.compare("fcmp ogt", larger, smaller))
+            is_valid = is_valid & (larger > smaller)
         return is_valid
 
 

@@ -6,26 +6,64 @@ of LLVM accept this.
 """
 
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
+from twoloop.kernels.data.common import OPTIONS
+
+FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # fast-math flags of floating-point instructions, as in kernels
 DOUBLE, INTEGER, WORD, BIT, VOID = "double", "i64", "i32", "i1", "void"
 DOUBLES_PER_CACHE_LINE = 8  # size of a cache line of the processor, in doubles
 # largest number of instructions in a block if blocks are split: longer blocks more than double the compile time
 MAX_BLOCK_LENGTH = 400
 
 
+def _operator(name: str, is_reflected: bool = False) -> "Callable[[Value, Value | float], Value]":
+    """Return the method of Value that appends the operation `name`; `is_reflected`: the value is the second operand."""
+    is_comparison, of_doubles = name.startswith("fcmp"), f"f{name} {FAST_MATH_FLAGS}"
+
+    def append(value: "Value", other: "Value | float") -> "Value":
+        operand = other if isinstance(other, Value) else constant(value.type, other)
+        a, b = (operand, value) if is_reflected else (value, operand)
+        builder = value.builder or operand.builder
+        if is_comparison:
+            return builder.compare(name, a, b)
+        return builder.operation(of_doubles if DOUBLE in value.type else name, a, b)
+
+    return append
+
+
 class Value:
-    """Value of an LLVM function (a number, a vector or a pointer): its type and its text."""
+    """Value of an LLVM function (a number, a vector or a pointer): its type and its text.
 
-    __slots__ = ("text", "type")
+    Operators append an instruction to the function, and return its result. One operand may be a literal number.
 
-    def __init__(self, kind: str, text: str):
+    builder : builder of the function; a literal may have none, because the other operand of an operation has one.
+    """
+
+    __slots__ = ("builder", "text", "type")
+    __array_ufunc__ = None  # operators of NumPy numbers call those of this class
+
+    def __init__(self, kind: str, text: str, builder: "Builder | None" = None):
         self.type, self.text = kind, text
+        self.builder: Any = builder
 
     def __str__(self) -> str:
         """Return the type and the text, in the form of an argument of a call."""
         return f"{self.type} {self.text}"
+
+    def __neg__(self) -> "Value":
+        return self.builder.negate(FAST_MATH_FLAGS, self)
+
+    def __abs__(self) -> "Value":
+        width = width_of(self.type)
+        return self.builder.call(f"llvm.fabs.{'f64' if width == 1 else f'v{width}f64'}", self.type, [self])
+
+    __add__, __sub__, __mul__, __truediv__ = (_operator(name) for name in ("add", "sub", "mul", "div"))
+    __radd__, __rsub__, __rmul__, __rtruediv__ = (_operator(name, True) for name in ("add", "sub", "mul", "div"))
+    __and__, __or__, __xor__ = (_operator(name) for name in ("and", "or", "xor"))
+    __gt__, __lt__, __ge__, __le__ = (_operator(f"fcmp {name}") for name in ("ogt", "olt", "oge", "ole"))
 
 
 class Phi(Value):
@@ -33,8 +71,8 @@ class Phi(Value):
 
     __slots__ = ("incoming",)
 
-    def __init__(self, kind: str, text: str):
-        super().__init__(kind, text)
+    def __init__(self, kind: str, text: str, builder: "Builder"):
+        super().__init__(kind, text, builder)
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
@@ -75,12 +113,12 @@ def element_of(kind: str) -> str:
     return kind[1:-1].split(" x ")[1] if kind.startswith("<") else kind
 
 
-def constant(kind: str, number: float) -> Value:
+def constant(kind: str, number: float, builder: "Builder | None" = None) -> Value:
     """Return the literal `number` of type `kind`; if `kind` is a vector type, all elements are `number`."""
     element, width = element_of(kind), width_of(kind)
     bits = struct.unpack("<Q", struct.pack("<d", number))[0]
     text = f"0x{bits:016X}" if element == DOUBLE else str(number)
-    return Value(kind, text if width == 1 else f"<{', '.join([f'{element} {text}'] * width)}>")
+    return Value(kind, text if width == 1 else f"<{', '.join([f'{element} {text}'] * width)}>", builder)
 
 
 def constants(numbers: Iterable[float]) -> Value:
@@ -161,7 +199,7 @@ class Builder:
 
     def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str], internal: bool = False):
         self.module, self.name, self.result, self.internal = module, name, result, internal
-        self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
+        self.arguments = [Value(kind, f"%a{k}", self) for k, kind in enumerate(arguments)]
         self._n_values = self._n_allocated = 0
         self._far_pointer: Value | None = None
         self.part = 0  # number of times that a block was split so far: index of the current part
@@ -194,7 +232,8 @@ class Builder:
     def _append_value(self, kind: str, text: str) -> Value:
         if self.module.splits_blocks and len(self.block.lines) >= MAX_BLOCK_LENGTH:
             self._split_block()
-        value = Value(kind, f"%{self._n_values}")  # LLVM reads numbered values in a third less time than named values
+        # LLVM reads numbered values in a third less time than named values
+        value = Value(kind, f"%{self._n_values}", self)
         self._n_values += 1
         self.block.lines.append(f"{value.text} = {text}")
         return value
@@ -214,22 +253,6 @@ class Builder:
     def negate(self, flags: str, a: Value) -> Value:
         """Return -a for a floating-point number a."""
         return self._append_value(a.type, f"fneg {flags} {a.type} {a.text}")
-
-    def add(self, a: Value, b: Value) -> Value:
-        """Return the sum of the integers a and b."""
-        return self.operation("add", a, b)
-
-    def sub(self, a: Value, b: Value) -> Value:
-        """Return the difference a - b of integers."""
-        return self.operation("sub", a, b)
-
-    def mul(self, a: Value, b: Value) -> Value:
-        """Return the product of the integers a and b."""
-        return self.operation("mul", a, b)
-
-    def bitwise_and(self, a: Value, b: Value) -> Value:
-        """Return the bitwise "and" of a and b."""
-        return self.operation("and", a, b)
 
     def convert(self, name: str, a: Value, kind: str) -> Value:
         """Return a value converted to the type `kind` by the instruction `name`, such as "sitofp" or "bitcast"."""
@@ -311,7 +334,7 @@ class Builder:
 
     def phi(self, kind: str) -> Phi:
         """Append a phi node to the current block, and return it; `Phi.add_incoming` adds its values."""
-        phi = Phi(kind, f"%{self._n_values}")
+        phi = Phi(kind, f"%{self._n_values}", self)
         self._n_values += 1
         self.block.lines.append(phi)
         return phi
