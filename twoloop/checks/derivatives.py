@@ -26,9 +26,10 @@ from twoloop.checks.scales import (
     generic_velocities,
     sizes,
 )
-from twoloop.checks.sparse_rows import SparseRows, column_groups, is_finite
+from twoloop.checks.sparse_rows import SparseRows, is_finite
 from twoloop.checks.structure import changed_mass, check_bandwidth, wrong_kinematics
 from twoloop.kernels.data.indices import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
+from twoloop.kernels.linalg.sparse_lu import column_groups
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
@@ -307,8 +308,9 @@ def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: Sparse
     def product(direction: Array) -> Array:
         return _rounding(lambda x: system.sparse_rows(t, x) @ direction, jacobian @ direction, q)
 
-    for group in column_groups(jacobian):
-        direction = np.zeros(len(q))
+    groups = column_groups((jacobian.rows, jacobian.columns), len(q))
+    for k in range(groups.max(initial=-1) + 1):
+        group, direction = groups == k, np.zeros(len(q))
         direction[group] = scales[group] / unit
 
         def displaced(shift: float, direction: Array = direction) -> Array:

@@ -100,22 +100,3 @@ def norms(rows: Rows) -> Array:
         return np.sqrt(np.bincount(rows.rows, rows.values**2, rows.shape[0]))
     lengths: Array = np.linalg.norm(rows, axis=1)
     return lengths
-
-
-def column_groups(rows: SparseRows) -> list[Integers]:
-    """Group the columns so that no two columns of a group have entries in the same row."""
-    in_row: list[list[int]] = [[] for _ in range(rows.shape[0])]
-    in_column: list[list[int]] = [[] for _ in range(rows.shape[1])]
-    for i, j in zip(rows.rows.tolist(), rows.columns.tolist(), strict=True):
-        in_row[i].append(j)
-        in_column[j].append(i)
-    group_of = [-1] * rows.shape[1]
-    groups: list[list[int]] = []
-    for j, of_rows in enumerate(in_column):
-        taken = {group_of[k] for i in of_rows for k in in_row[i]}
-        group = next((g for g in range(len(groups)) if g not in taken), len(groups))
-        if group == len(groups):
-            groups.append([])
-        groups[group].append(j)
-        group_of[j] = group
-    return [np.array(group, dtype=np.int64) for group in groups]
