@@ -60,11 +60,12 @@ def test_stores_every_step_in_our_order(solver):
     assert np.abs(rate - result.a[:, 1:-1])[:, 5:].max() < 0.02
 
 
-def test_failure_comes_back_as_a_row(capfd):
-    result = solve_exudyn(LINKAGES["default"], 10.0, 200)
+@pytest.mark.parametrize("of_beam", [False, True])
+def test_failure_comes_back_as_a_row(of_beam, capfd):
+    result = solve_exudyn_beam(beam(16, 0.001), 1.0, 4) if of_beam else solve_exudyn(LINKAGES["default"], 10.0, 200)
     assert result.status is Status.SOLVER_FAILED and not result.success
     assert "SolveDynamic terminated" in result.message and "Take more steps" in result.message
-    assert 0.0 < result.t[-1] < 10.0 and result.q.shape == (9, result.t.size)
+    assert result.t[-1] < (1.0 if of_beam else 10.0) and result.q.shape == (102 if of_beam else 9, result.t.size)
     assert result.stats.n_accepted == result.h.size == result.t.size - 1 and capfd.readouterr().out == ""
 
 
@@ -190,10 +191,3 @@ def test_result_is_in_our_order_and_on_the_base(model, solver):
     assert np.abs(result.q[0] + 0.01 * np.sin(2.0 * np.pi * result.t)).max() < 1e-7 and np.abs(result.q[1]).max() < 1e-9
     assert -0.3 < tip_height(result.q)[-1] < -0.2
     assert midpoint_deflection(result.q)[0] == 0.0 and np.abs(midpoint_deflection(result.q)).max() > 1e-3
-
-
-def test_a_failure_of_the_beam_comes_back_as_a_row(capfd):
-    result = solve_exudyn_beam(beam(16, 0.001), 1.0, 4)
-    assert result.status is Status.SOLVER_FAILED and "Take more steps" in result.message
-    assert result.q.shape == (102, result.t.size) and result.stats.n_accepted == result.t.size - 1 < 4
-    assert capfd.readouterr().out == ""

@@ -59,6 +59,7 @@ N_FEW_COORDINATES = 24  # largest number of coordinates for which MIN_INDEX_FEW,
 # two digits even in sound models. MIN_INDEX_MANY: with more coordinates, because the code gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
+MAX_PIVOT_RATIO = 1e5  # largest ratio of an entry of M, with added rows, to its pivot that needs no refinement
 SCALE_STEP = 1024.0  # scales of added rows differ by powers of this factor, which rarely change from start to start
 DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
 MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number
@@ -97,9 +98,9 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # without refinement, random models kept 9 digits if pivots were larger, and all added rows had one scale
-        is_refined = bool(choice.rows) and (choice.min_pivot <= MIN_PIVOTS[-1] or len(set(choice.scales)) > 1)
-        choice = replace(choice, is_refined=choice.is_refined or is_refined)
+        # without refinement, random models kept 8 digits if pivots were larger, and added rows hid no little inertia
+        is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _hides_little_inertia(choice, mass, G)
+        choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
 
@@ -264,6 +265,16 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     # add 0.25: a mechanism whose parts differ by less than one step and a quarter keeps its digits without a factor
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
+
+
+def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
+    """Return whether rows added to M, as in `choice`, differ in scale, or if pivots of the sum are much smaller."""
+    if not choice.added_rows:
+        return False
+    added, scales = G[list(choice.added_rows)], np.array(choice.scales)
+    stiffened = mass + added.T @ (scales[:, None] * added)
+    ratio = float((stiffened.diagonal() * np.linalg.inv(stiffened).diagonal()).max())
+    return len(set(choice.scales)) > 1 or ratio > MAX_PIVOT_RATIO
 
 
 MAX_OPERATIONS = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
