@@ -138,7 +138,8 @@ class RungeKutta:
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""
-        from twoloop.kernels.steps.stages import LazyStep, memory_size, options_array
+        from twoloop.kernels.paper import iterations
+        from twoloop.kernels.steps.stages import LazyStep, options_array
 
         tableau = self.tableau
         outer_tol = self.outer_tol
@@ -155,7 +156,7 @@ class RungeKutta:
             float(self.outer_test == "all"),
             tableau.order - 1.0,
         )
-        memory = np.zeros(memory_size(0, tableau.stages, n_q))
+        memory = np.zeros(iterations.memory_size(tableau.stages, n_q))
         step = LazyStep("paper.fixed_point_step", "RUNGE_KUTTA")
         plan = Plan(step, options, memory, 1.0 / (tableau.order + 1), jump_ratio=JUMP_RATIO)
         if self.outer == "paper":

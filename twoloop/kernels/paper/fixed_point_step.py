@@ -12,6 +12,8 @@ from twoloop.kernels.paper.iterations import (
     estimate_and_extrapolate,
     iterate_accelerations,
     iterate_first_order,
+    memory_block,
+    memory_vector,
     rounding_errors_of,
     step_views,
     store_rounding_errors,
@@ -19,16 +21,12 @@ from twoloop.kernels.paper.iterations import (
 from twoloop.kernels.steps.stages import (
     END_ERROR_WEIGHT,
     EXTRAPOLATION,
-    H_TRIAL,
-    HAS_TRIAL,
     INNER_TOL,
+    MAX_STEP_RATIO,
     STAGES,
     estimate_end_error,
     interpolate,
-    keep_stages,
-    predict_stages,
     tableau_of,
-    vector,
 )
 
 
@@ -36,10 +34,14 @@ from twoloop.kernels.steps.stages import (
 def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
     """Store the stage accelerations and the rounding errors of an accepted step; nothing if `accepted` is false."""
     s, n = int(options[STAGES]), w.Q.size
-    if accepted and memory[HAS_TRIAL] == 1.0:
-        keep_stages(memory, s, n)
+    if accepted and memory[at.HAS_TRIAL] == 1.0:
+        previous, trial = memory_block(memory, s, n, at.A_PREVIOUS), memory_block(memory, s, n, at.A_TRIAL)
+        for j in range(s):
+            copy(trial[j], previous[j])
+        memory[at.H_PREVIOUS] = memory[at.H_TRIAL]
+        memory[at.HAS_PREVIOUS] = 1.0
         store_rounding_errors(rounding_errors_of(memory, s, n, tolerances))
-    memory[HAS_TRIAL] = 0.0
+    memory[at.HAS_TRIAL] = 0.0
 
 
 @kernel(ATTEMPT)
@@ -55,10 +57,16 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    previous = memory_block(memory, s, n, at.A_PREVIOUS)
     trial, half, Q_stage, V_stage, q_full, v_full, q_mid, v_mid = step_views(memory, s, n)
     weights = memory[memory.size - s :]
     rounding = rounding_errors_of(memory, s, n, tolerances)
-    predict_stages(memory, c, h, a)
+    ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
+    for j in range(s):
+        if ratio <= MAX_STEP_RATIO:
+            interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
+        else:
+            copy(a, trial[j])
     code, departure = iterate_accelerations(
         f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rounding
     )
@@ -90,8 +98,8 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
-    memory[HAS_TRIAL] = 1.0
-    memory[H_TRIAL] = h
+    memory[at.HAS_TRIAL] = 1.0
+    memory[at.H_TRIAL] = h
     if code == DONE and tolerances[ESTIMATE] == 1.0:
         error = max(error, END_ERROR_WEIGHT * estimate_end_error(tolerances, options, h, state, new_state, trial))
     return Attempt(code, max(error, departure), 0.0)
@@ -112,8 +120,8 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     A_stage, A_full, Q_stage, V_stage, q_full, v_full, q_mid, v_mid = step_views(memory, s, n)
-    a_mid = vector(memory, s, n, at.A_MID)
-    q_old, v_old = vector(memory, s, n, at.Q_OLD), vector(memory, s, n, at.V_OLD)
+    a_mid = memory_vector(memory, s, n, at.A_MID)
+    q_old, v_old = memory_vector(memory, s, n, at.Q_OLD), memory_vector(memory, s, n, at.V_OLD)
     code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

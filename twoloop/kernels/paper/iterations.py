@@ -14,44 +14,50 @@ from twoloop.kernels.data.common import compiled, exact, inlined, merged
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints, rounding_floor
 from twoloop.kernels.linalg.dense import copy
-from twoloop.kernels.steps.stages import (
-    INNER_TOL,
-    N_BLOCKS,
-    N_MEMORY_SCALARS,
-    OUTER_TEST,
-    OUTER_TOL,
-    Q_STAGE,
-    RESIDUAL,
-    TRIAL,
-    V_STAGE,
-    block,
-    tableau_of,
-    vector,
-)
+from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
 # number of vectors of rounding errors of compensated sums, for steps of fixed size: two for q and v of the last
 # accepted step, two for q and v of this attempt. Without compensation, the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# `memory` has the layout of steps/stages.py. The block RESIDUAL contains the stage accelerations of half steps; indices
-# of vectors (n_q): positions Q, velocities V and accelerations A; ROUNDING is the first of N_ROUNDING vectors of
-# rounding errors
-A_HALF = RESIDUAL
-Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING = range(8)
+# indices in `memory`: first of scalars; then of blocks (s, n_q), one row for each stage, such as accelerations A; then
+# of vectors (n_q), such as positions Q and velocities V; ROUNDING is the first of N_ROUNDING vectors of rounding errors
+HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
+A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
+
+
+def memory_size(s: int, n_q: int) -> int:
+    """Return the length of `memory` for s stages and n_q coordinates."""
+    return N_MEMORY_SCALARS + N_BLOCKS * s * n_q + N_VECTORS * n_q + s
+
+
+@inlined
+def memory_block(memory, s, n, index):
+    """Return a view (s, n) of the block number `index`, such as A_PREVIOUS, in `memory`."""
+    start = N_MEMORY_SCALARS + index * s * n
+    return memory[start : start + s * n].reshape((s, n))
+
+
+@inlined
+def memory_vector(memory, s, n, index):
+    """Return a view (n) of the vector number `index`, such as Q_FULL, in `memory`."""
+    start = N_MEMORY_SCALARS + N_BLOCKS * s * n + index * n
+    return memory[start : start + n]
 
 
 @inlined
 def step_views(memory, s, n):
-    """Return views of `memory`: the blocks TRIAL, A_HALF, Q_STAGE and V_STAGE, the vectors Q_FULL to V_MID."""
+    """Return views of `memory`: the blocks A_TRIAL, A_HALF, Q_STAGE and V_STAGE, the vectors Q_FULL to V_MID."""
     return (
-        block(memory, s, n, TRIAL),
-        block(memory, s, n, A_HALF),
-        block(memory, s, n, Q_STAGE),
-        block(memory, s, n, V_STAGE),
-        vector(memory, s, n, Q_FULL),
-        vector(memory, s, n, V_FULL),
-        vector(memory, s, n, Q_MID),
-        vector(memory, s, n, V_MID),
+        memory_block(memory, s, n, A_TRIAL),
+        memory_block(memory, s, n, A_HALF),
+        memory_block(memory, s, n, Q_STAGE),
+        memory_block(memory, s, n, V_STAGE),
+        memory_vector(memory, s, n, Q_FULL),
+        memory_vector(memory, s, n, V_FULL),
+        memory_vector(memory, s, n, Q_MID),
+        memory_vector(memory, s, n, V_MID),
     )
 
 

@@ -11,6 +11,10 @@ provides tangents, the derivatives are computed in every iteration: stiff direct
 turn much in a step, the iteration with older derivatives does not converge. Methods whose stages are solved together,
 as in newton_step.py, use one set of derivatives for all stages.
 
+If the system provides tangents K and D, the dense matrix T^T (M - z^2 K - z D) T of an iteration is factored directly.
+newton_systems.py first multiplies the derivatives by the inverse of T^T M T, to use them in several systems. Direct
+factorization takes half the work if each matrix is used in one iteration only.
+
 Under step-size control, TR-BDF2 continues from the embedded formula of order 3; the difference of the two formulas is
 filtered three times, which keeps the method L-stable. Then the errors of many short steps add up to the tolerance, not
 to the tolerance times the number of steps.
@@ -20,9 +24,9 @@ import numpy as np
 
 from twoloop.kernels.control.step_size import departure, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
-from twoloop.kernels.data.indices import DONE, ESTIMATE, OUTER_DIVERGED, STATIC
-from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, multipliers
-from twoloop.kernels.linalg.dense import copy
+from twoloop.kernels.data.indices import DONE, ESTIMATE, OUTER_DIVERGED, SINGULAR, STATIC
+from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
+from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import (
     EQUAL_STEP_TOLERANCE,
@@ -30,16 +34,144 @@ from twoloop.kernels.steps.newton_systems import (
     factor_filter,
     factor_systems,
     fill_derivatives,
+    fill_tangent_by_q,
+    fill_tangent_by_v,
+    filter_error,
+    reduce_to_independents,
 )
-from twoloop.kernels.steps.stages import block, vector
+from twoloop.kernels.steps.stages import as_matrix, block, matrix_storage, pivots_of, vector
 from twoloop.kernels.steps.velocity_errors import (
+    STEPS_TO_DECAY,
     derivatives_agree,
-    error_in_slow_directions,
-    filter_errors,
     filtered_velocity_error,
-    largest_error,
     motion_time,
+    velocity_error,
 )
+
+# a matrix A counts as symmetric if |A_ij - A_ji| is at most this fraction of its largest diagonal entry
+MAX_ASYMMETRY = 1e-12
+
+
+@compiled
+def _is_symmetric(A):
+    """Return whether the matrix A is symmetric up to rounding errors, see MAX_ASYMMETRY."""
+    largest, asymmetry = 0.0, 0.0
+    for i in range(A.shape[0]):
+        largest = max(largest, abs(A[i, i]))
+        for j in range(i):
+            asymmetry = max(asymmetry, abs(A[i, j] - A[j, i]))
+    return asymmetry <= MAX_ASYMMETRY * largest
+
+
+@compiled
+def _fill_newton_matrix(w, memory, n, m, z, H):
+    """Store T^T (M - z^2 K - z D) T in H (m^2 entries, row by row); m is the number of independent coordinates."""
+    N, Kr, Dr = (
+        matrix_storage(w, n, at.SYSTEMS),
+        matrix_storage(w, n, at.DERIVATIVE_Q),
+        matrix_storage(w, n, at.DERIVATIVE_V),
+    )
+    z2 = z * z
+    if memory[at.HAS_DAMPING] == 1.0:
+        for i in range(m * m):
+            H[i] = N[i] - z2 * Kr[i] - z * Dr[i]
+    else:
+        for i in range(m * m):
+            H[i] = N[i] - z2 * Kr[i]
+
+
+@compiled
+def factor_newton_matrix(w, memory, z):
+    """Factor T^T (M - z^2 K - z D) T, with z = gamma h and the tangents K and D computed last; return a code."""
+    n, m = w.Q.size, w.independent.size
+    storage = matrix_storage(w, n, at.FILTER)
+    H = as_matrix(storage, m)
+    w.n_factorizations += 1
+    _fill_newton_matrix(w, memory, n, m, z, storage)
+    memory[at.IS_SYMMETRIC] = 0.0
+    if _is_symmetric(H):
+        if ldl_factor(H):
+            memory[at.IS_SYMMETRIC] = 1.0
+            return DONE
+        # L D L^T fails if the matrix is indefinite, as for a compressed beam: use L U instead
+        _fill_newton_matrix(w, memory, n, m, z, storage)
+    return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
+
+
+@compiled
+def compute_and_factor_matrix(f, w, memory, t, q, v, z):
+    """Compute the tangents K and D at (t, q, v) and factor T^T (M - z^2 K - z D) T; return a code.
+
+    The last evaluation must have been at (t, q, v), and w.lam must be the multipliers there.
+    """
+    n = q.size
+    m = w.independent.size
+    w.n_jacobians += 1
+    storage = matrix_storage(w, n, at.FILTER)
+    K, R = storage.reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
+    AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
+    code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
+    if code == DONE:
+        code = find_tangents(f, w, t, q)
+    if code != DONE:
+        return code
+    reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m))
+    memory[at.HAS_DAMPING] = f.force_by_v_given
+    code = fill_tangent_by_v(f, t, q, v, n - 1, K)
+    if code != DONE:
+        return code
+    if memory[at.HAS_DAMPING] == 1.0:
+        reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m))
+    reduce_to_independents(w, w.M, AT, as_matrix(matrix_storage(w, n, at.SYSTEMS), m))
+    return factor_newton_matrix(w, memory, z)
+
+
+@compiled
+def _solve_newton_system(w, memory, x):
+    """Replace the right-hand side x (n_dof) by the solution, with the factors computed by `factor_newton_matrix`."""
+    m = x.size
+    H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
+    if memory[at.IS_SYMMETRIC] == 1.0:
+        ldl_solve(H, x)
+    else:
+        lu_solve(H, pivots_of(memory, 1, w.Q.size, 0), x)
+
+
+@compiled
+def correct_stage(w, memory, residual, a):
+    """Replace `residual` (n_q) by the Newton correction of the accelerations a (n_q), and add the correction to a.
+
+    Only the entries of independent coordinates are read and changed.
+    """
+    n = w.Q.size
+    m = w.independent.size
+    N, x = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += N[i, j] * residual[w.independent[j]]
+        x[i] = total
+    _solve_newton_system(w, memory, x)
+    for i in range(m):
+        residual[w.independent[i]] = x[i]
+        a[w.independent[i]] += x[i]
+
+
+@compiled
+def filter_dense_error(w, memory, z, e_q, e_v):
+    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with the factors of `factor_newton_matrix`."""
+    n = w.Q.size
+    m = e_q.size
+    N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
+    x = vector(memory, 1, n, at.V_MOVED)[:m]
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += N[i, j] * e_v[j] + z * Kr[i, j] * e_q[j]
+        x[i] = total
+    _solve_newton_system(w, memory, x)
+    copy(x, e_v)
+
 
 MAX_ITERATIONS = 8  # largest number of Newton iterations of a stage: if they do not converge, the step fails
 DIVERGENCE_RATIO = 2.0  # ratio of successive corrections above which Newton's method has diverged
@@ -75,6 +207,12 @@ def _set_stage_state(z, q_bar, v_bar, a, Q, V):
 
 
 @merged
+def has_dense_tangents(f, w):
+    """Return whether every iteration of Newton's method factors a new dense matrix T^T (M - z^2 K - z D) T."""
+    return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != STATIC
+
+
+@merged
 def stages_at_once(options):
     """Return the number of stages solved at once, 1; for a literal 1, numba would compile newton_systems.py again."""
     return int(options[at.STAGES])
@@ -88,6 +226,8 @@ def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
         memory[at.HAS_JACOBIAN] = 1.0
         memory[at.IS_FRESH] = 1.0
         memory[at.H_FACTORED] = 0.0
+        if has_dense_tangents(f, w):
+            return compute_and_factor_matrix(f, w, memory, t, Q, V, h * gamma_of(options))
         code = fill_derivatives(f, w, options, memory, stages_at_once(options), t, Q, V, F)
         if code != DONE:
             return code
@@ -130,7 +270,10 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if code != DONE:
             memory[at.HAS_JACOBIAN] = 0.0
             return code
-        correct_stages(f, w, options, memory, stages_at_once(options), residual, A_stage)
+        if has_dense_tangents(f, w):
+            correct_stage(w, memory, residual[0], a)
+        else:
+            correct_stages(f, w, options, memory, stages_at_once(options), residual, A_stage)
         change = 0.0
         weight = max(z / scale_q, VELOCITY_WEIGHT * min(memory[at.ERROR_DURATION] / scale_q, 1.0 / scale_v))
         for m in w.independent:
@@ -167,6 +310,30 @@ N_FILTERS = 3
 # largest ratio of |sum_k jump_weights[k] a_k| to the range of the stage accelerations a_k that a single jump can cause;
 # if the ratio is smaller, `_error_at_jumps` reduces its estimate in proportion to it
 MAX_RATIO_BY_ONE_JUMP = 0.174
+
+
+@compiled
+def _filter_errors(f, w, options, memory, h, e_q, e_v):
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, with the factors computed last.
+
+    J is the Jacobian of (v, F) by (q_i, v_i). Only the first n_dof numbers of e_q and e_v (n_q) are read and changed.
+    """
+    z = h * gamma_of(options)
+    n_dof = w.independent.size
+    if has_dense_tangents(f, w):
+        filter_dense_error(w, memory, z, e_q[:n_dof], e_v[:n_dof])
+    else:
+        filter_error(f, w, options, memory, stages_at_once(options), h, e_q, e_v)
+    for i in range(n_dof):
+        e_q[i] += z * e_v[i]
+
+
+@compiled
+def _factor_filter(f, w, options, memory, h):
+    """Factor the matrix that `_filter_errors` needs for errors of steps of size h; return a code."""
+    if has_dense_tangents(f, w):
+        return factor_newton_matrix(w, memory, h * gamma_of(options))
+    return factor_filter(f, w, options, memory, stages_at_once(options), h)
 
 
 @compiled
@@ -214,13 +381,15 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
     so outdated that the filter is wrong, they are computed anew. On return, the vectors E_Q and E_V of `memory` contain
     the estimate, filtered twice.
     """
-    n, s = w.Q.size, stages_at_once(options)
+    n = w.Q.size
+    q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
     unfiltered, filtered_once = vector(memory, 1, n, at.A_NEW), vector(memory, 1, n, at.A_MID)
+    n_dof = w.independent.size
     z = h * gamma_of(options)
     _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
     copy(e_v, unfiltered)
-    filter_errors(f, w, options, memory, s, h, e_q, e_v)
+    _filter_errors(f, w, options, memory, h, e_q, e_v)
     if f.force_by_q_given == 0 and not derivatives_agree(
         f, w, options, memory, 1, t + h, z, tolerances, unfiltered, e_q, e_v, state, new_state, A_stage[-1]
     ):
@@ -229,11 +398,17 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
             return np.inf
         _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
         copy(e_v, unfiltered)
-        filter_errors(f, w, options, memory, s, h, e_q, e_v)
-    tests_velocities = options[at.NEWTON_OFFSET + at.TESTS_VELOCITIES] == 1.0
-    error = largest_error(w, tolerances, e_q, e_v, tests_velocities, state, new_state)
+        _filter_errors(f, w, options, memory, h, e_q, e_v)
+    error = 0.0
+    for i in range(n_dof):
+        j = w.independent[i]
+        scale = allowed_error(tolerances, j, q[j], q1[j])
+        error = max(error, abs(e_q[i]) / scale)
+        if options[at.NEWTON_OFFSET + at.TESTS_VELOCITIES] == 1.0:
+            scale = allowed_error(tolerances, j, v[j], v1[j])
+            error = max(error, abs(e_v[i]) / scale)
     copy(e_v, filtered_once)
-    filter_errors(f, w, options, memory, s, h, e_q, e_v)
+    _filter_errors(f, w, options, memory, h, e_q, e_v)
     return max(
         error,
         filtered_velocity_error(
@@ -250,20 +425,35 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
     """
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, N_FILTERS):
-        filter_errors(f, w, options, memory, stages_at_once(options), h, e_q, e_v)
+        _filter_errors(f, w, options, memory, h, e_q, e_v)
     for i in range(w.independent.size):
         q1[w.independent[i]] -= e_q[i]
         v1[w.independent[i]] -= e_v[i]
 
 
-@merged
+@compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the result of `error_in_slow_directions`, with accelerations at the end if derivatives were renewed."""
-    n, s = w.Q.size, stages_at_once(options)
-    duration = motion_time(w, tolerances, state, state[2 * n :])
+    """Return the effect, in units of the tolerances, of the velocity error E_V in slow directions, see newton_step.py.
+
+    The result is 0 if all of E_V has an effect of at most 1. E_Q, E_V and the factors are overwritten.
+    """
+    n = w.Q.size
+    e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
+    max_duration = motion_time(w, tolerances, state, state[2 * n :])
     if memory[at.DERIVATIVES_RENEWED] == 1.0:
-        duration = max(duration, motion_time(w, tolerances, state, A_stage[-1]))
-    return error_in_slow_directions(f, w, options, memory, s, h, tolerances, state, new_state, duration)
+        max_duration = max(max_duration, motion_time(w, tolerances, state, A_stage[-1]))
+    error = velocity_error(w, tolerances, e_v, max_duration, state, new_state)
+    if error <= 1.0:
+        return 0.0
+    for i in range(w.independent.size):
+        e_q[i] = 0.0
+    h_longer = STEPS_TO_DECAY * h / gamma_of(options)
+    if _factor_filter(f, w, options, memory, h_longer) == DONE:
+        _filter_errors(f, w, options, memory, h_longer, e_q, e_v)
+        # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
+        error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
+    memory[at.H_FACTORED] = 0.0
+    return error
 
 
 @compiled
@@ -286,7 +476,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
         deviation, widest = max(deviation, abs(total) / scale), max(widest, (high - low) / scale)
     if deviation == 0.0:
         return 0.0
-    if memory[at.H_FACTORED] == 0.0 and factor_filter(f, w, options, memory, stages_at_once(options), h) != DONE:
+    if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
     factor = min(1.0, deviation / (MAX_RATIO_BY_ONE_JUMP * widest))
     error = _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, jump_weights, factor)

@@ -14,7 +14,7 @@ Solving ODEs II, IV.8, for Radau IIA). In stiff problems, a fixed-point iteratio
 import numpy as np
 
 from twoloop.kernels.control.step_size import project_prediction
-from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, compiled, kernel
+from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, kernel
 from twoloop.kernels.data.indices import DONE, ESTIMATE, LEAST, OUTER_DIVERGED, STATIC
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
@@ -27,26 +27,21 @@ from twoloop.kernels.steps.newton_systems import (
     factor_filter,
     factor_systems,
     fill_derivatives,
+    filter_error,
 )
 from twoloop.kernels.steps.stages import (
     INNER_TOL,
+    MAX_STEP_RATIO,
     OUTER_TOL,
     STAGES,
     block,
-    keep_stages,
+    interpolate,
     middle_node,
     newton_options_index,
-    predict_stages,
     tableau_of,
     vector,
 )
-from twoloop.kernels.steps.velocity_errors import (
-    error_in_slow_directions,
-    filter_errors,
-    filtered_velocity_error,
-    largest_error,
-    motion_time,
-)
+from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
 # the next step computes new derivatives if the ratio of the last two Newton corrections is larger than this
 SLOW_CONTRACTION = 0.05
@@ -129,11 +124,24 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 
 @compiled
+def _filter_errors(f, w, options, memory, h, e_q, e_v):
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma0 and the Jacobian J of (v, F) by (q_i, v_i).
+
+    Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
+    """
+    s = int(options[STAGES])
+    m = w.independent.size
+    filter_error(f, w, options, memory, s, h, e_q, e_v)
+    for i in range(m):
+        e_q[i] += h * options[newton_options_index(s) + at.GAMMA0] * e_v[i]
+
+
+@compiled
 def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     """Return the largest component of the filtered error estimate of a step, in units of the tolerances."""
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
-    v, a = state[n : 2 * n], state[2 * n : 3 * n]
+    q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
     offset = newton_options_index(s)
     gamma0 = options[offset + at.GAMMA0]
     e = options[offset + at.N_EIGEN_SCALARS : offset + at.N_EIGEN_SCALARS + s]
@@ -152,24 +160,49 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
         e_q[i] = h * sum_q
         e_v[i] = h * sum_v
     copy(e_v, unfiltered)
-    filter_errors(f, w, options, memory, s, h, e_q, e_v)
-    tests_velocities = options[offset + at.TESTS_VELOCITIES] == 1.0
-    error = largest_error(w, tolerances, e_q, e_v, tests_velocities, state, new_state)
-    if tests_velocities:
+    _filter_errors(f, w, options, memory, h, e_q, e_v)
+    error = 0.0
+    for i in range(w.independent.size):
+        j = w.independent[i]
+        error = max(error, abs(e_q[i]) / allowed_error(tolerances, j, q[j], q1[j]))
+        if options[offset + at.TESTS_VELOCITIES] == 1.0:
+            error = max(error, abs(e_v[i]) / allowed_error(tolerances, j, v[j], v1[j]))
+    if options[offset + at.TESTS_VELOCITIES] == 1.0:
         return error
     copy(e_v, filtered_once)
-    filter_errors(f, w, options, memory, s, h, e_q, e_v)
+    _filter_errors(f, w, options, memory, h, e_q, e_v)
     error = max(
         error,
         filtered_velocity_error(w, memory, tolerances, h * gamma0, unfiltered, filtered_once, e_v, state, new_state, a),
     )
     if error <= 1.0:
-        h_factored = memory[at.H_FACTORED]
-        duration = motion_time(w, tolerances, state, a)
-        slow_error = error_in_slow_directions(f, w, options, memory, s, h, tolerances, state, new_state, duration)
-        error = max(error, slow_error)
-        if memory[at.H_FACTORED] == 0.0 and factor_filter(f, w, options, memory, s, h) == DONE:
-            memory[at.H_FACTORED] = h_factored
+        error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state))
+    return error
+
+
+@compiled
+def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
+    """Return the effect, in tolerances, of the slowly changing part of the velocity error E_V, see `velocity_error`.
+
+    In `filtered_velocity_error`, errors last as long as their fastest component. Here, a filter keeps the component
+    that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. The result is 0 if all of E_V
+    has an effect of at most 1. E_Q, E_V and the factors of the filter are overwritten.
+    """
+    s, n = int(options[STAGES]), w.Q.size
+    z = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]
+    e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
+    max_duration = motion_time(w, tolerances, state, state[2 * n :])
+    error = velocity_error(w, tolerances, e_v, max_duration, state, new_state)
+    if error <= 1.0:
+        return 0.0
+    for i in range(w.independent.size):
+        e_q[i] = 0.0
+    if factor_filter(f, w, options, memory, s, z) == DONE:
+        filter_error(f, w, options, memory, s, z, e_q, e_v)
+        # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
+        error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
+    if factor_filter(f, w, options, memory, s, h) != DONE:
+        memory[at.H_FACTORED] = 0.0
     return error
 
 
@@ -180,7 +213,10 @@ def commit_newton(f, w, options, memory, tolerances, accepted):
     if accepted:
         memory[at.IS_FRESH] = 0.0
         if memory[at.HAS_TRIAL] == 1.0:
-            keep_stages(memory, s, n)
+            for j in range(s):
+                copy(block(memory, s, n, at.TRIAL)[j], block(memory, s, n, at.PREVIOUS)[j])
+            memory[at.H_PREVIOUS] = memory[at.H_TRIAL]
+            memory[at.HAS_PREVIOUS] = 1.0
     memory[at.HAS_TRIAL] = 0.0
 
 
@@ -191,7 +227,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    trial = block(memory, s, n, at.TRIAL)
+    previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)
+    weights = memory[memory.size - s :]
     q_mid, v_mid, a_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID), vector(memory, s, n, at.A_MID)
     if memory[at.PARTITION_NUMBER] != w.generation:
         memory[at.HAS_JACOBIAN] = 0.0
@@ -222,7 +259,12 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if code != DONE:
                 memory[at.HAS_JACOBIAN] = 0.0
                 return Attempt(code, np.inf, 0.0)
-        predict_stages(memory, c, h, a)
+        ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
+        for j in range(s):
+            if ratio <= MAX_STEP_RATIO:
+                interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
+            else:
+                copy(a, trial[j])
         code = _solve_stages(f, w, options, memory, t, h, tolerances, q, v, trial)
         if code == DONE:
             break

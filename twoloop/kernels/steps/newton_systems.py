@@ -18,8 +18,7 @@ X = T x also solves a system with a bordered matrix,
 There are three kinds of storage:
 
 - dense: J_q and J_v (n_dof, n_dof), from the tangents K and D if the system provides them, otherwise by differences of
-  the right-hand side. If stages are solved one by one, with tangents, T^T K T and T^T D T with T^T M T instead: each
-  matrix is used in one iteration only, and it is mostly symmetric, which halves the work to factor it;
+  the right-hand side;
 - banded, if the system has a bandwidth b: K, D and the border, at a cost proportional to n_q. Without tangents, K and D
   are computed by differences, in 2 b + 1 groups of columns without common rows (Curtis, Powell and Reid 1974, doi
   10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
@@ -31,7 +30,7 @@ There are three kinds of storage:
 
 import numpy as np
 
-from twoloop.kernels.data.common import compiled, finite_vector, inlined, merged
+from twoloop.kernels.data.common import compiled, finite_vector, inlined
 from twoloop.kernels.data.indices import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
@@ -46,7 +45,7 @@ from twoloop.kernels.linalg.band import (
     lu_band,
     solve_bordered,
 )
-from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solve, ldl_solve_rows, lu_factor, lu_solve
+from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.linalg.markowitz_lu import columns_of
 from twoloop.kernels.linalg.sparse_ldl import add_redundant_stiffness
 from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
@@ -82,8 +81,6 @@ RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, re
 # if all coordinates are displaced at once, the displacement of coordinate i is multiplied by
 # 1 + DISPLACEMENT_INCREMENT * (i % N_INCREMENTS), because the effects of equal displacements might cancel each other
 DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
-# a matrix A counts as symmetric if |A_ij - A_ji| is at most this fraction of its largest diagonal entry
-MAX_ASYMMETRY = 1e-12
 
 # --- tangents K and D, of which only the band |i - j| <= b is computed and read
 
@@ -152,7 +149,7 @@ def _subtract_reaction_tangent(f, w, t, q, moved, b, K):
 
 
 @compiled
-def _fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
+def fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
     """Store the entries of d(Q - C_q^T lam)/dq at (t, q, v) with |i - j| <= b in K (n_q, n_q); return a code.
 
     The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
@@ -171,7 +168,7 @@ def _fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
 
 
 @compiled
-def _fill_tangent_by_v(f, t, q, v, b, D):
+def fill_tangent_by_v(f, t, q, v, b, D):
     """Store the entries of dQ/dv with |i - j| <= b in D (n_q, n_q), if the system provides dQ/dv; return a code."""
     if f.force_by_v_given == 0:
         return DONE
@@ -184,7 +181,7 @@ def _fill_tangent_by_v(f, t, q, v, b, D):
 
 
 @compiled
-def _reduce_to_independents(w, A, AT, B):
+def reduce_to_independents(w, A, AT, B):
     """Store A T in AT (n_q, n_dof) and T^T A T in B (n_dof, n_dof), with T = [I; w.D^T]."""
     n, m = AT.shape
     columns = columns_of(w.index)
@@ -206,46 +203,32 @@ def _reduce_to_independents(w, A, AT, B):
                     B[l, k] += factor * row[k]
 
 
-@merged
-def _has_dense_tangents(f, w):
-    """Return whether dense derivatives are computed from the tangents of the system."""
-    return f.force_by_q_given == 1 and w.Rate.size == w.C.size
-
-
-@merged
-def _has_mass(f, w, s):
-    """Return whether dense derivatives are T^T K T and T^T D T, and systems have T^T M T instead of I."""
-    return s == 1 and _has_dense_tangents(f, w)
-
-
 @compiled
-def _reduce_tangents(f, w, memory, s, t, q, v):
-    """Store dense derivatives at (t, q, v), the last evaluated state, in w.matrices; return a code."""
+def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
+    """Store J_q and J_v, computed from K and D at (t, q, v), the last evaluated state, in w.matrices; return a code."""
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
-    # the storage of earlier factors, which are no longer needed, receives K (later D) and products A T
+    # the storage of earlier factors, which are no longer needed, receives K (later D), T^T M T and products A T
     K, R = as_matrix(matrix_storage(w, n, at.FILTER), n), as_matrix(matrix_storage(w, n, at.SYSTEMS), n)
+    code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
+    if code != DONE:
+        return code
     AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
-    code = _fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
-    if code == DONE:
-        code = find_tangents(f, w, t, q)
+    code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
-    _reduce_to_independents(w, K, AT, Jq)
-    memory[at.HAS_DAMPING] = f.force_by_v_given
-    code = _fill_tangent_by_v(f, t, q, v, n - 1, K)
-    if memory[at.HAS_DAMPING] == 1.0:
-        _reduce_to_independents(w, K, AT, Jv)
-    N = as_matrix(matrix_storage(w, n, at.MASS), m)
-    _reduce_to_independents(w, w.M, AT, N)
-    if _has_mass(f, w, s):
-        return code
+    N = as_matrix(matrix_storage(w, n, at.SYSTEMS), m)
+    reduce_to_independents(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
+    reduce_to_independents(w, K, AT, Jq)
     ldl_solve_rows(N, Jq)
-    if memory[at.HAS_DAMPING] == 1.0:
+    memory[at.HAS_DAMPING] = f.force_by_v_given
+    code = fill_tangent_by_v(f, t, q, v, n - 1, K)
+    if code == DONE and memory[at.HAS_DAMPING] == 1.0:
+        reduce_to_independents(w, K, AT, Jv)
         ldl_solve_rows(N, Jv)
     return code
 
@@ -271,9 +254,9 @@ def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_ne
 
 @compiled
 def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
-    """Store derivatives at (t, q, v) in w.matrices; return a code. a: accelerations at (t, q, v), evaluated last."""
-    if _has_dense_tangents(f, w):
-        return _reduce_tangents(f, w, memory, s, t, q, v)
+    """Store J_q and J_v at (t, q, v) in w.matrices; return a code. a: accelerations at (t, q, v), evaluated last."""
+    if f.force_by_q_given == 1 and w.Rate.size == w.C.size:
+        return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
@@ -300,96 +283,34 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
     return _fill_by_differences(f, w, options, t, q, v, a, True, q_moved, v_moved, a_new, Jv)
 
 
-@merged
-def _fill_dense_matrix(f, w, memory, s, z, matrix):
-    """Store I - z^2 J_q - z J_v, multiplied by T^T M T if `_has_mass`, in `matrix`."""
+@compiled
+def _factor_dense_matrix(w, memory, s, index, z, matrix):
+    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, with pivots `index` in `memory`; return a code."""
     n, m = w.Q.size, w.independent.size
-    Jq, Jv = matrix_storage(w, n, at.DERIVATIVE_Q), matrix_storage(w, n, at.DERIVATIVE_V)
-    mass, entries, z2 = matrix_storage(w, n, at.MASS), matrix.reshape(m * m), z * z
-    for i in range(m * m):
-        entries[i] = -z2 * Jq[i]
-    if memory[at.HAS_DAMPING] == 1.0:
-        for i in range(m * m):
-            entries[i] -= z * Jv[i]
-    if _has_mass(f, w, s):
-        for i in range(m * m):
-            entries[i] += mass[i]
-    else:
-        for i in range(m):
-            matrix[i, i] += 1.0
+    Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
+    damped = memory[at.HAS_DAMPING] == 1.0
+    for i in range(m):
+        for j in range(m):
+            matrix[i, j] = -z * z * Jq[i, j]
+            if damped:
+                matrix[i, j] -= z * Jv[i, j]
+        matrix[i, i] += 1.0
+    return DONE if lu_factor(matrix, pivots_of(memory, s, n, index)) > 0.0 else SINGULAR
 
 
 @compiled
-def _factor_dense_matrix(f, w, memory, s, index, z, matrix):
-    """Factor the matrix of `_fill_dense_matrix` by LU in place, and store pivots in `memory`; return a code.
-
-    `index`: index of the pivots, see `pivots_of`.
-    """
-    _fill_dense_matrix(f, w, memory, s, z, matrix)
-    return DONE if lu_factor(matrix, pivots_of(memory, s, w.Q.size, index)) > 0.0 else SINGULAR
-
-
-@compiled
-def _is_symmetric(A):
-    """Return whether the matrix A is symmetric up to rounding errors, see MAX_ASYMMETRY."""
-    largest, asymmetry = 0.0, 0.0
-    for i in range(A.shape[0]):
-        largest = max(largest, abs(A[i, i]))
-        for j in range(i):
-            asymmetry = max(asymmetry, abs(A[i, j] - A[j, i]))
-    return asymmetry <= MAX_ASYMMETRY * largest
-
-
-@compiled
-def _factor_dense_filter(f, w, memory, s, z, matrix):
-    """Factor the real matrix of `_fill_dense_matrix`, by L D L^T if it is symmetric; return a code."""
-    memory[at.IS_SYMMETRIC] = 0.0
-    if _has_mass(f, w, s):
-        _fill_dense_matrix(f, w, memory, s, z, matrix)
-        # L D L^T fails if the matrix is indefinite, as for a compressed beam: use L U instead
-        if _is_symmetric(matrix) and ldl_factor(matrix):
-            memory[at.IS_SYMMETRIC] = 1.0
-            return DONE
-    return _factor_dense_matrix(f, w, memory, s, 0, z, matrix)
-
-
-@merged
-def _solve_dense_system(w, memory, s, index, matrix, x):
-    """Replace x (n_dof) by the solution, with the factors of the matrix of `_fill_dense_matrix`."""
-    if index == 0 and memory[at.IS_SYMMETRIC] == 1.0:
-        ldl_solve(matrix, x)
-    else:
-        lu_solve(matrix, pivots_of(memory, s, w.Q.size, index), x)
-
-
-@merged
-def _multiply_by_reduced_mass(f, w, s, x, X):
-    """If `_has_mass`, replace x (n_dof) by T^T M T x; X is scratch."""
-    if _has_mass(f, w, s):
-        mass, m = matrix_storage(w, w.Q.size, at.MASS), x.size
-        for i in range(m):
-            total = 0.0 * x[i]
-            for j in range(m):
-                total += mass[i * m + j] * x[j]
-            X[i] = total
-        for i in range(m):
-            x[i] = X[i]
-
-
-@compiled
-def _filter_error_dense(f, w, options, memory, s, h, e_q, e_v):
+def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
     """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
     n = w.Q.size
     m = e_q.size
-    z = h * options[newton_options_index(s) + at.GAMMA0]
+    gamma0 = options[newton_options_index(s) + at.GAMMA0]
     Jq = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
-    _multiply_by_reduced_mass(f, w, s, e_v, vector(memory, s, n, at.Q_MOVED))
     for i in range(m):
         total = 0.0
         for j in range(m):
             total += Jq[i, j] * e_q[j]
-        e_v[i] += z * total
-    _solve_dense_system(w, memory, s, 0, as_matrix(matrix_storage(w, n, at.FILTER), m), e_v)
+        e_v[i] += h * gamma0 * total
+    lu_solve(as_matrix(matrix_storage(w, n, at.FILTER), m), pivots_of(memory, s, n, 0), e_v)
 
 
 # --- banded storage
@@ -469,12 +390,12 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
     """Store the tangents K and D at (t, q, v), the last evaluated state, as bands in w.matrices; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, at.FILTER).reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
-    code = _fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
+    code = fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
         return code
     _copy_band(K, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b))
     memory[at.HAS_DAMPING] = f.force_by_v_given
-    code = _fill_tangent_by_v(f, t, q, v, b, K)
+    code = fill_tangent_by_v(f, t, q, v, b, K)
     if memory[at.HAS_DAMPING] == 1.0:
         _copy_band(K, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_V), n, b))
     return code
@@ -806,10 +727,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store the derivatives of the storage, such as K and D, in w.matrices; return a code.
-
-    (t, q, v) is the last evaluated state, and a its accelerations.
-    """
+    """Store J_q and J_v (dense storage) or K and D (else) at the last evaluated state in w.matrices; return a code."""
     if f.form == STATIC:
         return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.bandwidth >= 0:
@@ -818,16 +736,21 @@ def fill_derivatives(f, w, options, memory, s, t, q, v, a):
 
 
 @compiled
+def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
+    """Store the factors of I - z^2 J_q - z J_v, real or complex as z is, in `numbers`; see `_factor_banded`."""
+    w.n_factorizations += 1
+    if f.bandwidth >= 0:
+        return _factor_banded(w, memory, s, f.bandwidth, index, z, numbers, factorize, substitute)
+    return _factor_dense_matrix(w, memory, s, index, z, as_matrix(numbers, w.independent.size))
+
+
+@compiled
 def factor_filter(f, w, options, memory, s, h):
     """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, with z = h gamma0; return a code."""
     z = h * options[newton_options_index(s) + at.GAMMA0]
     if f.form == STATIC:
         return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 0))
-    numbers = matrix_storage(w, w.Q.size, at.FILTER)
-    w.n_factorizations += 1
-    if f.bandwidth >= 0:
-        return _factor_banded(w, memory, s, f.bandwidth, 0, z, numbers, DGBTRF, DGBTRS)
-    return _factor_dense_filter(f, w, memory, s, z, as_matrix(numbers, w.independent.size))
+    return _factor_system(f, w, memory, s, 0, z, matrix_storage(w, w.Q.size, at.FILTER), DGBTRF, DGBTRS)
 
 
 @compiled
@@ -844,12 +767,7 @@ def factor_systems(f, w, options, memory, s, h):
             if f.form == STATIC:
                 code = _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 1 + k).view(np.complex128))
             else:
-                w.n_factorizations += 1
-                numbers = system_storage(w, w.Q.size, k)
-                if f.bandwidth >= 0:
-                    code = _factor_banded(w, memory, s, f.bandwidth, 1 + k, z, numbers, ZGBTRF, ZGBTRS)
-                else:
-                    code = _factor_dense_matrix(f, w, memory, s, 1 + k, z, as_matrix(numbers, w.independent.size))
+                code = _factor_system(f, w, memory, s, 1 + k, z, system_storage(w, w.Q.size, k), ZGBTRF, ZGBTRS)
         offset += 2 + 4 * s
     memory[at.H_FACTORED] = h
     return code
@@ -857,14 +775,12 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
-    """Replace x[:n_dof] by the solution, with the dense or banded factors in `numbers`; X (n_q) is scratch."""
-    m = w.independent.size
+    """Replace x[:n_dof] by the solution, with the factors of `_factor_system` in `numbers`; X (n_q) is scratch."""
+    m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, index)
     if f.bandwidth >= 0:
-        _solve_banded_system(f, w, f.bandwidth, numbers, pivots_of(memory, s, w.Q.size, index), substitute, X, x)
+        _solve_banded_system(f, w, f.bandwidth, numbers, pivots, substitute, X, x)
     else:
-        x = x[:m]
-        _multiply_by_reduced_mass(f, w, s, x, X)
-        _solve_dense_system(w, memory, s, index, as_matrix(numbers, m), x)
+        lu_solve(as_matrix(numbers, m), pivots, x[:m])
 
 
 @compiled
@@ -911,7 +827,7 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     elif f.bandwidth >= 0:
         _filter_error_banded(f, w, options, memory, s, h, e_q, e_v)
     else:
-        _filter_error_dense(f, w, options, memory, s, h, e_q[:m], e_v[:m])
+        _filter_error_dense(w, options, memory, s, h, e_q[:m], e_v[:m])
 
 
 @compiled

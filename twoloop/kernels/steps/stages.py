@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
-from twoloop.kernels.linalg.dense import copy
 
 # largest ratio of a step size to the previous one at which the previous step's polynomial predicts the stages
 MAX_STEP_RATIO = 3.0
@@ -64,45 +63,6 @@ def tableau_of(options):
     return s, A, A2, options[o : o + s], options[o + s : o + 2 * s], options[o + 2 * s : o + 3 * s]
 
 
-# indices of the scalars in `memory`
-(
-    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt; diagonal_step.py: an attempt was made
-    H_TRIAL,  # step size of the last attempt, s
-    HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
-    H_PREVIOUS,  # size of the last accepted step, s
-    HAS_JACOBIAN,  # 1: the stored derivatives may be used
-    IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at this step's end
-    PARTITION_NUMBER,  # value of GENERATION, see data/indices.py, of the partition of the stored derivatives
-    H_FACTORED,  # step size for which the systems are factored, s; 0: none
-    CONTRACTION,  # ratio of the last two corrections of Newton's method
-    HAS_DAMPING,  # 1: forces depend on v; 0: J_v and D are zero
-    IS_SYMMETRIC,  # kind of dense factors of the filter matrix: 1: L D L^T of a symmetric matrix; 0: L U
-    ERROR_DURATION,  # duration (s) of an error of the velocities, see velocity_errors.py; 0: unknown
-    DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
-    N_MEMORY_SCALARS,
-) = range(14)
-# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous and of the attempted step, residuals,
-# positions and velocities of the stages
-PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-# indices of the vectors (n_q) after the blocks: accelerations, displaced positions and velocities, estimated errors of
-# positions and velocities, state and accelerations at the middle stage
-A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-
-
-@inlined
-def block(memory, s, n, index):
-    """Return a view (s, n) of block `index`, such as PREVIOUS, of `memory`."""
-    start = N_MEMORY_SCALARS + index * s * n
-    return memory[start : start + s * n].reshape((s, n))
-
-
-@inlined
-def vector(memory, s, n, index):
-    """Return a view (n) of vector `index`, such as A_NEW, of `memory`."""
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + index) * n
-    return memory[start : start + n]
-
-
 @merged
 def middle_node(c):
     """Return the entry of c (s) that is nearest to 1/2."""
@@ -128,31 +88,6 @@ def interpolate(c, theta, A_stage, weights, a):
         for j in range(s):
             total += weights[j] * A_stage[j, m]
         a[m] = total
-
-
-@compiled
-def predict_stages(memory, c, h, a):
-    """Store predicted stage accelerations of a step of size h in TRIAL.
-
-    They are values of the polynomial of the last accepted step or, after a much shorter step, the accelerations `a`.
-    """
-    s, n = c.size, a.size
-    previous, trial, weights = block(memory, s, n, PREVIOUS), block(memory, s, n, TRIAL), memory[memory.size - s :]
-    ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
-    for j in range(s):
-        if ratio <= MAX_STEP_RATIO:
-            interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
-        else:
-            copy(a, trial[j])
-
-
-@merged
-def keep_stages(memory, s, n):
-    """Store the stage accelerations of the attempted step, now accepted, as those of the last accepted step."""
-    previous, trial = block(memory, s, n, PREVIOUS), block(memory, s, n, TRIAL)
-    for j in range(s):
-        copy(trial[j], previous[j])
-    memory[H_PREVIOUS], memory[HAS_PREVIOUS] = memory[H_TRIAL], 1.0
 
 
 @compiled
@@ -197,10 +132,32 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 # row of T^-1 and its column of T (for both s real parts, then s imaginary parts); T contains the eigenvectors of A
 N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
 
-# indices of the parts of w.matrices, each with n_q^2 entries: derivatives by q, derivatives by v, T^T M T if these are
-# from tangents, factors of the real filter matrix, and from SYSTEMS on, two parts for each eigenvalue: the factors of a
-# complex matrix
-DERIVATIVE_Q, DERIVATIVE_V, MASS, FILTER, SYSTEMS = range(5)
+# indices of the scalars in `memory`
+(
+    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt; diagonal_step.py: an attempt was made
+    H_TRIAL,  # step size of the last attempt, s
+    HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
+    H_PREVIOUS,  # size of the last accepted step, s
+    HAS_JACOBIAN,  # 1: the stored derivatives may be used
+    IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at this step's end
+    PARTITION_NUMBER,  # value of GENERATION, see data/indices.py, of the partition of the stored derivatives
+    H_FACTORED,  # step size for which the systems are factored, s; 0: none
+    CONTRACTION,  # ratio of the last two corrections of Newton's method
+    HAS_DAMPING,  # 1: forces depend on v; 0: J_v and D are zero
+    IS_SYMMETRIC,  # kind of factors in diagonal_step.py: 1: L D L^T of a symmetric matrix; 0: L U
+    ERROR_DURATION,  # duration (s) of an error of the velocities, see velocity_errors.py; 0: unknown
+    DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
+    N_MEMORY_SCALARS,
+) = range(14)
+# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous and of the attempted step, residuals,
+# positions and velocities of the stages
+PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+# indices of the vectors (n_q) after the blocks: accelerations, displaced positions and velocities, estimated errors of
+# positions and velocities, state and accelerations at the middle stage
+A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
+# indices of the parts of w.matrices, each with n_q^2 entries: derivatives by q, derivatives by v, factors of the real
+# filter matrix, and from SYSTEMS on, two parts for each eigenvalue: the factors of a complex matrix
+DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
@@ -300,6 +257,20 @@ def count_systems(options, s):
     """Return the number of linear systems of Newton's method: real eigenvalues of A plus pairs of complex ones."""
     offset = newton_options_index(s)
     return int(options[offset + N_REAL] + options[offset + N_PAIRS])
+
+
+@inlined
+def block(memory, s, n, index):
+    """Return a view (s, n) of block `index`, such as PREVIOUS, of `memory`."""
+    start = N_MEMORY_SCALARS + index * s * n
+    return memory[start : start + s * n].reshape((s, n))
+
+
+@inlined
+def vector(memory, s, n, index):
+    """Return a view (n) of vector `index`, such as A_NEW, of `memory`."""
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + index) * n
+    return memory[start : start + n]
 
 
 @inlined

@@ -17,8 +17,8 @@ from twoloop.kernels.data.indices import DONE, GAP
 from twoloop.kernels.evaluation.inner_loop import evaluate
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import stages as at
-from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT, factor_filter, filter_error
-from twoloop.kernels.steps.stages import INNER_TOL, block, newton_options_index, vector
+from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
+from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
 # largest factor on the duration of a velocity error that changes as slowly as the motion: no vibration causes the
 # error, which has the same sign in later steps, so that errors add up
@@ -27,55 +27,6 @@ LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, in units of
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
 FAST_DURATION = 20.0  # a velocity error may change fast if its duration, in units of z = h gamma, is smaller than this
 OUTDATED_CHANGE = 0.3  # J counts as outdated if its relative change is larger than this
-
-
-@compiled
-def filter_errors(f, w, options, memory, s, h, e_q, e_v):
-    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma0 and the Jacobian J of (v, F) by (q_i, v_i).
-
-    Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
-    """
-    filter_error(f, w, options, memory, s, h, e_q, e_v)
-    z = h * options[newton_options_index(s) + at.GAMMA0]
-    for i in range(w.independent.size):
-        e_q[i] += z * e_v[i]
-
-
-@compiled
-def largest_error(w, tolerances, e_q, e_v, tests_velocities, state, new_state):
-    """Return the largest entry of e_q and, if `tests_velocities`, of e_v (n_dof each), in units of the tolerances."""
-    n, error = w.Q.size, 0.0
-    for i in range(w.independent.size):
-        j = w.independent[i]
-        error = max(error, abs(e_q[i]) / allowed_error(tolerances, j, state[j], new_state[j]))
-        if tests_velocities:
-            error = max(error, abs(e_v[i]) / allowed_error(tolerances, j, state[n + j], new_state[n + j]))
-    return error
-
-
-@compiled
-def error_in_slow_directions(f, w, options, memory, s, h, tolerances, state, new_state, max_duration):
-    """Return the effect, in tolerances, of the slowly changing part of the velocity error E_V, see `velocity_error`.
-
-    In `filtered_velocity_error`, errors last as long as their fastest component. Here, a filter keeps the component
-    that remains after STEPS_TO_DECAY steps, and this component lasts for `max_duration`, see `motion_time`. The result
-    is 0 if all of E_V has an effect of at most 1; else E_Q, E_V and the factors of the filter are overwritten, and
-    H_FACTORED is 0.
-    """
-    n = w.Q.size
-    e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
-    error = velocity_error(w, tolerances, e_v, max_duration, state, new_state)
-    if error <= 1.0:
-        return 0.0
-    for i in range(w.independent.size):
-        e_q[i] = 0.0
-    h_longer = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]
-    if factor_filter(f, w, options, memory, s, h_longer) == DONE:
-        filter_error(f, w, options, memory, s, h_longer, e_q, e_v)
-        # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
-        error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
-    memory[at.H_FACTORED] = 0.0
-    return error
 
 
 @compiled
