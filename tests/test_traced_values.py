@@ -17,7 +17,7 @@ from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
 from twoloop.kernels.data.indices import DONE
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.kernels.evaluation.inner_loop import acceleration_constraint
-from twoloop.run.workspace import kit_of, workspace
+from twoloop.run.workspace import make_kit, workspace
 
 WEIGHT = np.array([0.0, -9.81])
 START = {"t_span": (0.0, 0.3), "q0": [1.0, 0.0], "v0": [0.0, 0.0]}
@@ -240,7 +240,7 @@ def rows_and_gamma(f, w, t, q, v):
 def in_kernels(system, t, q, v):
     """C_q and Gamma as used in an evaluation."""
     system, traced = derive_callbacks(system, accept_traces)
-    kit = kit_of(system, t, q)
+    kit = make_kit(system, t, q)
     work = workspace(system, kit, np.ones((system.n_c + system.n_a, system.n_q)), q, 1e-8, 0.0)
     assert rows_and_gamma(kit, work, t, q, v) == DONE
     return work.G[:-1].copy(), work.Gamma.copy(), traced

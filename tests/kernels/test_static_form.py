@@ -17,7 +17,7 @@ from twoloop.checks.callbacks import MAX_ENTRIES
 from twoloop.kernels import advance
 from twoloop.kernels.data import indices
 from twoloop.kernels.linalg import symbolic_factorization as static_program
-from twoloop.run.workspace import kit_of, static_form, workspace
+from twoloop.run.workspace import make_kit, static_form, workspace
 
 
 class Started:
@@ -26,7 +26,7 @@ class Started:
     def __init__(self, system, q, v):
         form, n = static_form(system, 0.0, q), system.n_q
         assert form is not None
-        self.kit = kit_of(system, 0.0, q, None, form)
+        self.kit = make_kit(system, 0.0, q, None, form)
         ranks = (None, None)
         for _ in range(2):
             self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, ranks, form)

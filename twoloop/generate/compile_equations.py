@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.structure import mass_and_rows
 from twoloop.generate import llvm_code
-from twoloop.generate.elimination import Elimination, PivotChoice, Solution
+from twoloop.generate.elimination import Elimination, FactorAndSolvePrograms, PivotChoice
 from twoloop.generate.graph import Graph, Untraceable
 from twoloop.generate.llvm_code import Emitter, Location, Lowering
 from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, width_of
@@ -194,7 +194,7 @@ class SplitFunctions:
             "position_errors": equations.position_errors,
             "velocity_errors": equations.velocity_errors,
         }
-        self.solution = Solution(equations, list(self.position_programs.values()))
+        self.solution = FactorAndSolvePrograms(equations, list(self.position_programs.values()))
         self.solution_programs = {"solution": self.solution.solution_program}
         if self.has_redundant_rows:
             self.solution_programs["least_norm"] = self.solution.least_norm_program
@@ -268,7 +268,8 @@ class SplitFunctions:
                 emit.store(value, array, j)
         return lowering.is_valid(program, results[0])
 
-    # methods that write functions for kernels, or code in SIMD lanes
+    # methods called from outside: they write the bodies of functions for kernels, and the code of collocation steps in
+    # SIMD lanes
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         """Write code that stores the accelerations at (t, q, v) in `a`; return whether they are valid."""

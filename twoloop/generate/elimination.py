@@ -525,14 +525,14 @@ def multipliers_of_least_norm(
     return lam
 
 
-class Solution:
+class FactorAndSolvePrograms:
     """Programs that solve M a + G^T lam = r, G a = c in two steps: first the factors, then the solution with them.
 
     other_programs : other programs at the same state; quantities that they share with the factors are stored, too.
 
     Fields:
-    stored_indices : for each stored quantity of the graph of `equations`: its index in the array. The factors come
-        first.
+    stored_indices : for each quantity that the first step stores, by its index in the graph of `equations`: its index
+        in the array of stored quantities. The factors come first.
     factor_program : program that computes the stored quantities.
     graph : graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the stored factors.
     solution_program : program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for dependent rows.

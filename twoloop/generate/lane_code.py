@@ -26,7 +26,7 @@ from twoloop.generate import (
     series,
 )
 from twoloop.generate.compile_equations import write_accelerations
-from twoloop.generate.elimination import Elimination, PivotChoice, Solution
+from twoloop.generate.elimination import Elimination, FactorAndSolvePrograms, PivotChoice
 from twoloop.generate.graph import Untraceable, is_zero
 from twoloop.generate.lane_series import LaneEmitter, LaneSeries
 from twoloop.generate.llvm_code import lower_program
@@ -49,9 +49,8 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-TARGET_ERROR = (
-    0.3  # value of DEPARTURE for which the next step size is chosen after a step was rejected because DEPARTURE > 1
-)
+# after a step is rejected because PREDICTION_ERROR > 1, the next step size is chosen for this PREDICTION_ERROR
+TARGET_ERROR = 0.3
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
 MAX_REJECTIONS = 10  # largest number of successive rejected steps; after more, the run leaves its lane
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
@@ -197,8 +196,8 @@ class LaneSteps:
             max_defect = emit.maximum_or_nan((defect - noise) / allowed, max_defect)
         return duration * max_defect
 
-    def compute_departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store DEPARTURE, the ratio of |predicted - projected positions| to its limit, see control/step_size.py."""
+    def compute_prediction_error(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Store PREDICTION_ERROR, |predicted - projected positions| over its limit, see control/step_size.py."""
         n, memory, (rtol, atol) = self.n, self.memory(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -225,7 +224,7 @@ class LaneSteps:
                 allowed = emit.builder.select(is_passage, emit.minimum(scale, least), allowed)
             allowed = emit.maximum(allowed, emit.constant(LEAST))
             error = emit.maximum_or_nan(difference(memory.predicted, memory.new, j) / allowed, error)
-        emit.store(error, work, lanes.DEPARTURE)
+        emit.store(error, work, lanes.PREDICTION_ERROR)
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
         """Return a mask of the lanes whose step may have passed a singular position; None if steps are not checked."""
@@ -235,7 +234,7 @@ class LaneSteps:
         """Store ACCEPTED, and LONGEST, the largest next step size; clear RUNNING after MAX_REJECTIONS or a NaN."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, one / emit.to_double(order)
-        off, *defects = (emit.load(work, field) for field in (lanes.DEPARTURE, lanes.WORST_DEFECT, lanes.DEFECT))
+        off, *defects = (emit.load(work, field) for field in (lanes.PREDICTION_ERROR, lanes.WORST_DEFECT, lanes.DEFECT))
         is_valid = is_set(emit, work, lanes.ACTIVE)
         for value in (off, *defects):
             magnitude = abs(value)
@@ -245,8 +244,8 @@ class LaneSteps:
         def root(x: Value) -> Value:
             return emit.exponential(emit.logarithm(x) * per_order)
 
-        departure_factor = root(TARGET_ERROR / off)
-        factor = select(off > one, departure_factor, one)
+        prediction_factor = root(TARGET_ERROR / off)
+        factor = select(off > one, prediction_factor, one)
         defect_factor = SAFETY * root(one / defect)
         defect_factor = emit.minimum(factor, emit.maximum(shortest, defect_factor))
         factor = select(defect > one, defect_factor, factor)
@@ -485,7 +484,7 @@ class LaneCode(LaneSteps):
             raise Untraceable("it has nonholonomic rows")
         self.numbers = Coefficients(separate_varying=True)
         self.equations = equations = Elimination(system, choice, Equations(system, parameters))
-        self.solution = Solution(self.equations)
+        self.solution = FactorAndSolvePrograms(self.equations)
         super().__init__(system.n_q, system.n_c + system.n_a)
         self.recurrences: LaneSeries | None = None
         self.stage_generator = None if tableau is None else LaneStages(tableau, self.n)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from twoloop.generate.elimination import Solution
+from twoloop.generate.elimination import FactorAndSolvePrograms
 from twoloop.generate.llvm_code import FUNCTIONS, INTRINSICS, Emitter, Quantities, lower_program, sine_and_cosine
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Builder, Value, integer, undefined, vector_of
 from twoloop.generate.program import Coefficient, Coefficients, Terms
@@ -202,7 +202,9 @@ class LaneSeries:
     order; a row of zeros; and one row of factors for each order from 0 on.
     """
 
-    def __init__(self, program: SeriesProgram, solution: Solution, numbers: Coefficients, n: int, n_rows: int):
+    def __init__(
+        self, program: SeriesProgram, solution: FactorAndSolvePrograms, numbers: Coefficients, n: int, n_rows: int
+    ):
         self.solution, self.numbers, self.n, self.n_rows = solution, numbers, n, n_rows
         self.factor_indices: dict[Any, int] = {}
         self._divisor_indices: dict[int, int] = {}

@@ -375,7 +375,7 @@ class Lowering(Algebra[Value]):
                 self._quantities.mark_stored(i)
         return None
 
-    def outputs(self, program: Program) -> list[list[Value]]:
+    def run_program(self, program: Program) -> list[list[Value]]:
         """Write code that computes the arrays of a program, and the quantities in its conditions; return the arrays.
 
         In a divided function each number is computed just before its use, so that few numbers are in registers between

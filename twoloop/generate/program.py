@@ -71,8 +71,11 @@ class Algebra(Generic[T]):
             assert operation is not None
             self.define(i, self.operation(*operation))
 
-    def outputs(self, program: "Program") -> list[list[T]]:
-        """Return the arrays of a program with defined inputs; compute the quantities of its conditions, too."""
+    def run_program(self, program: "Program") -> list[list[T]]:
+        """Execute a program, and return its arrays; its inputs must have been set with `define`.
+
+        The quantities in its conditions are computed, too.
+        """
         self.run(program.graph, program.quantities())
         return [[self.affine(expr) for expr in exprs] for exprs in program.arrays.values()]
 
@@ -93,7 +96,7 @@ class Program:
         """Return the arrays of the program in an algebra; `inputs`: values of its inputs that are not defined yet."""
         for quantity, value in enumerate(inputs):
             algebra.define(quantity, value)
-        return algebra.outputs(self)
+        return algebra.run_program(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
         """Return the indices of the quantities needed for arrays and conditions, see `Graph.quantities_for`."""
@@ -153,10 +156,10 @@ class ArrayAlgebra(Algebra[Any]):
         """Return the product of a and b."""
         return a * b
 
-    def outputs(self, program: Program) -> list[list[Any]]:
-        """Return the arrays of a program; values outside the domain of a function are NaN or infinite."""
+    def run_program(self, program: Program) -> list[list[Any]]:
+        """Execute a program, and return its arrays; values outside the domain of a function are NaN or infinite."""
         with np.errstate(all="ignore"):
-            return super().outputs(program)
+            return super().run_program(program)
 
 
 class OperationTable(NamedTuple):

@@ -107,7 +107,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
         short_forces = ShortForces(
             _has_time_pulses(graph, needed(TIME_CALLBACKS)), _has_state_pulses(graph, by_state, system.n_q)
         )
-        is_steep = _is_steep(graph, sorted({*by_state, *needed(TIME_CALLBACKS)}))
+        is_steep = _may_be_steep(graph, sorted({*by_state, *needed(TIME_CALLBACKS)}))
         return Dependence(short_forces, is_steep, frozenset(graph.traced))
 
     return make
@@ -182,17 +182,17 @@ class DerivativeBounds(DegreeAlgebra):
         )
 
 
-def _has_time_pulses(graph: Graph, needed: list[int]) -> bool:
-    """Return whether a quantity in `needed` may have short pulses as a function of time."""
-    dependent = [i for i in needed if graph.input_masks[i] & TIME_MASK]
+def _has_time_pulses(graph: Graph, quantities: list[int]) -> bool:
+    """Return whether one of the `quantities` may have short pulses as a function of time."""
+    dependent = [i for i in quantities if graph.input_masks[i] & TIME_MASK]
     degrees = DegreeAlgebra([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
     degrees.run(graph, dependent)
     return any(graph.kind(i) not in SMOOTH_OPERATIONS or degrees.values[i] > MAX_DEGREE for i in dependent)
 
 
-def _has_state_pulses(graph: Graph, needed: list[int], n_q: int) -> bool:
-    """Return whether a quantity in `needed` may have short pulses as a function of q or v."""
-    dependent = [i for i in needed if graph.input_masks[i] & ~TIME_MASK]
+def _has_state_pulses(graph: Graph, quantities: list[int], n_q: int) -> bool:
+    """Return whether one of the `quantities` may have short pulses as a function of q or v."""
+    dependent = [i for i in quantities if graph.input_masks[i] & ~TIME_MASK]
     inputs = range(1, 2 * n_q + 1)
     degrees, vibrations, growth = DegreeAlgebra(inputs), TrigonometricDegrees(), GrowthExponents(inputs)
     divisors = DivisorDegrees(degrees)
@@ -208,11 +208,15 @@ def _has_state_pulses(graph: Graph, needed: list[int], n_q: int) -> bool:
     )
 
 
-def _is_steep(graph: Graph, needed: list[int]) -> bool:
-    """Return whether a quantity in `needed` is a quotient, a root, a sine of time, or a fast sine of the state."""
-    if any(graph.kind(i) not in SMOOTH_OPERATIONS for i in needed):
+def _may_be_steep(graph: Graph, quantities: list[int]) -> bool:
+    """Return whether one of the `quantities` may vary much over a distance shorter than a step.
+
+    All operations except sums, products, sines and cosines count. So does a sine or cosine of time, or of an argument
+    whose derivative by a coordinate or velocity exceeds MAX_RATE.
+    """
+    if any(graph.kind(i) not in SMOOTH_OPERATIONS for i in quantities):
         return True
     rates = DerivativeBounds()
-    rates.run(graph, needed)
-    vibrations = [i for i in needed if graph.kind(i) in (SINE, COSINE)]
+    rates.run(graph, quantities)
+    vibrations = [i for i in quantities if graph.kind(i) in (SINE, COSINE)]
     return any(rates.values[i] > MAX_RATE or graph.input_masks[i] & TIME_MASK for i in vibrations)

@@ -60,8 +60,8 @@ from twoloop.run.record import (
 )
 from twoloop.run.rerun import (
     FIRST_FORCE,
+    check_callbacks_along_run,
     checked_region_of,
-    compare_callbacks,
     find_nondeterminism,
     first_force,
 )
@@ -97,10 +97,13 @@ class RepeatRequest:
 
 
 class CachedIntegrator:
-    """Integrator that reuses one plan and the same arrays for many starts, one after another.
+    """Integrator that is prepared once, and then used for many initial states, one after another.
 
-    `run` is at its start, and no other object uses it. Its plan calls `code`. Its system is `system`, or a copy with
-    derived callbacks. `definite`: whether M is definite. `shared`: setup that systems with other parameters share.
+    run : a run that has not begun, and that nothing else uses. The system of the run is `system`, or a copy of it in
+        which programs derived from traces replace missing callbacks.
+    code : the generated code that the steps of the run call.
+    definite : whether M is positive definite.
+    shared : setup that systems share if they differ only in their parameters.
     """
 
     def __init__(
@@ -210,7 +213,7 @@ class CachedIntegrator:
         fields["later"] = partial(
             _deferred_field, data, timed_states, self.run_fields, self.cpu_time, system, t1, self.options
         )
-        region.count_run()  # runs that `IntegrationLoop` has continued are counted by `compare_callbacks`
+        region.count_run()  # runs that `IntegrationLoop` has continued are counted by `check_callbacks_along_run`
         return fields
 
     def _has_same_choice(self, t0: float, q0: Array) -> bool:
@@ -235,7 +238,7 @@ class CachedIntegrator:
 
         If the run is unusual, return the result of `integrate`, or None if the start needs more checks. Otherwise
         return a tuple of one element: (output times, states), or None for output at all steps; store a requested `sol`
-        in `fields`. `is_due`: see `compare_callbacks`.
+        in `fields`. `is_due`: see `check_callbacks_along_run`.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -262,7 +265,7 @@ class CachedIntegrator:
             began = time.process_time()
             self.interpolation.interpolate(output.interpolated_times, t, rows, kinds, self.evaluation.pattern)
             self.cpu_time += time.process_time() - began
-        if not self._compare_callbacks(t, rows, t1, bool(report[loops.IN_CHECKED_REGION]), is_due):
+        if not self._callbacks_are_correct(t, rows, t1, bool(report[loops.IN_CHECKED_REGION]), is_due):
             arrays.last_start[loops.N_EQUAL] = loops.NEVER
             return None
         if output.dense:
@@ -304,8 +307,8 @@ class CachedIntegrator:
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
-    def _compare_callbacks(self, t: Array, rows: Array, t1: float, is_inside: bool, is_due: bool) -> bool:
-        """Return whether callbacks are correct at states of the run, see `compare_callbacks`."""
+    def _callbacks_are_correct(self, t: Array, rows: Array, t1: float, is_inside: bool, is_due: bool) -> bool:
+        """Return whether callbacks are correct at states of the run, see `check_callbacks_along_run`."""
         n = 2 * self.run.system.n_q
 
         def states(all_states: bool) -> Array:
@@ -315,7 +318,7 @@ class CachedIntegrator:
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
         checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
-        return compare_callbacks(self.run, states, *checks)[0] == REACHED_END
+        return check_callbacks_along_run(self.run, states, *checks)[0] == REACHED_END
 
 
 def fields_of(

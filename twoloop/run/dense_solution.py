@@ -21,7 +21,7 @@ from twoloop.kernels.steps.stages import load_step
 from twoloop.methods.plan import INNER_TOL, Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.signals import signals_of
-from twoloop.run.workspace import kit_of, prepare_workspace, static_form, workspace
+from twoloop.run.workspace import make_kit, prepare_workspace, static_form, workspace
 
 if TYPE_CHECKING:
     from twoloop.run.run import Run
@@ -49,7 +49,7 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
     """Return the rank of C_q and the rank of [C_q; A] at a state, for the argument `ranks` of `workspace`."""
     from twoloop.kernels import advance
 
-    kit = kit_of(system, t, q)
+    kit = make_kit(system, t, q)
     work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
     state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
     if advance.start(kit, work, t, state) != indices.RANK_DIFFERS:
@@ -101,8 +101,8 @@ class Interpolator:
         q0, static = row[: system.n_q], self.static_form
         for plan in self.plans.values():
             load_step(plan.second)  # load the step now: `result.sol` may need it at any time
-        self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
-        self.kit = kit_of(system, t0, q0, None, static)
+        self.kits = {kind: make_kit(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
+        self.kit = make_kit(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
         self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static, self.matrices)
         self._initialize_workspace()
@@ -118,7 +118,10 @@ class Interpolator:
         self.repair_plans: dict[bool, tuple[Plan, Any]] = {}
 
     def reset(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
-        """Reset the interpolator for another run with the same kits; `pattern`: 1 at entries of [C_q; A], else 0."""
+        """Reset the interpolator for another run with the same compiled functions (kits).
+
+        `pattern`: 1 where [C_q; A] may be nonzero, else 0.
+        """
         self.arguments = (system, t0, row.copy(), *self.arguments[3:])
         self.system, self.may_divide = system, True
         self.interior_states, self.crossing_memories, self.accurate_intervals = {}, {}, set()
@@ -309,7 +312,7 @@ class Interpolator:
                 if self.static_form is not None:
                     self.static_form = static_form(self.system, self.arguments[1], q0, *self.plans.values(), plan)
                 self._create_workspace()
-            self.repair_plans[is_stiff] = plan, kit_of(self.system, self.arguments[1], q0, plan, self.static_form)
+            self.repair_plans[is_stiff] = plan, make_kit(self.system, self.arguments[1], q0, plan, self.static_form)
         return self.repair_plans[is_stiff]
 
     def _split_divided(self, table: StateTable, groups: Groups) -> tuple[StateTable, Groups, Groups]:

@@ -17,7 +17,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import warn_user
 from twoloop.run.run import Run
 from twoloop.run.singular_positions import TimedState, least_singular_value
-from twoloop.run.workspace import kit_for_plan, kit_of
+from twoloop.run.workspace import kit_for_plan, make_kit
 
 # limits of the duration of the shortest change of forces or drives, relative to the longest time between evaluations.
 # Below REPEAT_BELOW, the run may have missed shorter changes, and is repeated. Below WARN_BELOW, it may have missed
@@ -153,7 +153,7 @@ def renew_kit(run: Run) -> None:
     if run.static_form is None:
         run.kit = kit_for_plan(run.system, run.kit.flags, run.plan)
     else:
-        run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static_form)
+        run.kit = make_kit(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static_form)
 
 
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:

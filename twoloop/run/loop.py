@@ -69,7 +69,7 @@ from twoloop.run.record import (
     statistics,
     step_fields,
 )
-from twoloop.run.rerun import checked_region_of, compare_callbacks
+from twoloop.run.rerun import check_callbacks_along_run, checked_region_of
 from twoloop.run.run import SMALL_SYSTEM, Buffers, Run
 from twoloop.run.signals import SignalHandlers, is_in_user_function, raised_by_handler
 from twoloop.run.singular_positions import TimedState, has_velocity_jump_at_end
@@ -437,7 +437,7 @@ class IntegrationLoop:
                 is_due = region.is_comparison_due() or run.system.called_in_python
                 region.count_run()
                 states = self.sample.states()
-                status, message = compare_callbacks(
+                status, message = check_callbacks_along_run(
                     run, lambda all_states: states, end, check_derivatives, status, message, is_due
                 )
             if self.is_final_attempt and status >= 0:

@@ -25,7 +25,7 @@ from twoloop.kernels.data import indices
 from twoloop.kernels.evaluation import tasks
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.signals import signals_of
-from twoloop.run.workspace import kit_of, static_form, workspace
+from twoloop.run.workspace import make_kit, static_form, workspace
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class _SparseProjection:
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, form: Any, rank: int | None = None):
         self.system, self.t, self.rank = system, t, rank
         self.form = form._replace(static=form.static._replace(dense_mass=False), mass_pattern=np.zeros((0, 0)))
-        self.kit = kit_of(system, t, q, None, self.form)
+        self.kit = make_kit(system, t, q, None, self.form)
         self.kit.flags[indices.CONSTANT_MASS], self.kit.flags[indices.MASS_VALUES_GIVEN] = 1, 0
         self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, (rank, rank), self.form)
         rows, columns = form.mass
@@ -156,13 +156,17 @@ def project_sparsely(
     if not is_at_rounding(rows @ projected[1] + rate, rows, projected[1], rate):
         return None
     change = projected[0] - q
-    if check_assembly and np.abs(change).max() > 0.0 and not _other_guesses_agree(projection, projected[0], change):
+    if check_assembly and np.abs(change).max() > 0.0 and not _nearby_guesses_match(projection, projected[0], change):
         return None
     return projected
 
 
-def _other_guesses_agree(projection: _SparseProjection, position: Array, change: Array) -> bool:
-    """Return whether three guesses about max|change| from `position` are projected near the predictions by C_q."""
+def _nearby_guesses_match(projection: _SparseProjection, position: Array, change: Array) -> bool:
+    """Return whether three guesses near `position` are projected to where the linearized constraints predict.
+
+    The guesses are displaced from `position` by -2 `change`, and by two random vectors of at most max|change|. If one
+    of them is projected to another place, another assembly may be as near as the user's guess.
+    """
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     at_rest = np.zeros(len(position))

@@ -39,7 +39,7 @@ def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
     return run.system.remembered(("territory", key), CheckedRegion)  # type: ignore[no-any-return]
 
 
-def compare_callbacks(
+def check_callbacks_along_run(
     run: Run,
     states: Callable[[bool], Array],
     end: float,
@@ -49,10 +49,12 @@ def compare_callbacks(
     is_due: bool,
     is_inside: bool = False,
 ) -> tuple[Status, str]:
-    """Return status and message of a run that ended at `end`, changed if callbacks are wrong at states of the run.
+    """Compare callbacks with their traces at states of a run that ended at `end`; return a status and a message.
 
-    Unless a comparison is due (`is_due`), states in the region of earlier comparisons (`CheckedRegion`) are omitted;
-    `is_inside`: the whole run is in this region. `states(all_states)` returns states [t, q, v], latest first.
+    These are `status` and `message`, unless a callback is wrong: the message then begins with the difference. If
+    `check_derivatives`, derivatives are compared with exact ones, or with differences. Python forces are called twice,
+    and must return the same. `states(all_states)` returns states [t, q, v], latest first. States in the region that
+    earlier comparisons covered (`CheckedRegion`) are skipped, unless `is_due`. `is_inside`: the whole run lies in it.
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
@@ -83,9 +85,10 @@ def compare_callbacks(
 
 
 def _check_derivatives(run: Run, states: Array, first_state: Array, status: Status, message: str) -> tuple[Status, str]:
-    """Return status and message, changed if a derivative, or a mass said to be constant, is wrong at states of the run.
+    """Compare derivatives with exact ones, or with differences, at states of a run; return a status and a message.
 
-    `first_state`: the first state [t, q, v] of the run.
+    M, `kinematics` and values of entries are checked, too. `first_state`: the first state [t, q, v] of the run. The
+    result is `status` and `message`, unless something is wrong: WRONG_DERIVATIVE and a message that begins with it.
     """
     n = run.system.n_q
     chosen_states = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]

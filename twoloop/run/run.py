@@ -35,7 +35,7 @@ from twoloop.run.singular_positions import (
     describe_singular_start,
     singular_threshold,
 )
-from twoloop.run.workspace import add_newton_program, kit_for_plan, kit_of, static_form, workspace
+from twoloop.run.workspace import add_newton_program, kit_for_plan, make_kit, static_form, workspace
 
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
@@ -78,7 +78,7 @@ class Run:
         plans = plan, *plan.substitutes
         self.static_form = static_form(system, t0, q0, *plans)
         self.matrices = max(each.matrices for each in plans)
-        self.kit = kit_of(system, t0, q0, plan, self.static_form)
+        self.kit = make_kit(system, t0, q0, plan, self.static_form)
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
         # ranks are computed at every start; the ranks of the last start are a guess that often saves a second workspace
@@ -268,7 +268,7 @@ class Run:
             self.static_form = add_newton_program(self.system, t, q, static)
         if self.static_form is not None and self.plan.first is not None:
             self.plan = with_matrix_cost(self.plan, self.static_form.matrix_cost())
-        self.kit = kit_of(self.system, t, q, self.plan, self.static_form)
+        self.kit = make_kit(self.system, t, q, self.plan, self.static_form)
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = old_work.counters
         notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.LAST_JUMP, indices.NEXT_JUMP]
@@ -299,7 +299,7 @@ class Run:
             if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
                 self.system.derived["static form"] = None
             self.static_form = None
-            self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
+            self.kit = make_kit(self.system, self.t0, self.state[: self.system.n_q], self.plan)
             self.control[self.a.MAY_CROSS] = 1.0
             self.work = self._workspace()
             code = start(self.kit, self.work, self.t0, self.state)

@@ -125,8 +125,10 @@ class StaticForm(NamedTuple):
     program: NDArray[np.int32]
     static: Static  # sizes of arrays in a workspace
     mass: Entries  # row and column indices of the nonzero entries of M
-    pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else (0, n_q)
-    mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else (0, 0)
+    # (n_c, n_q), 1 where C_q may be nonzero, else 0; (0, n_q) if a callback computes only the entries of C_q
+    pattern: Array
+    # (n_q, n_q), 1 where M may be nonzero, else 0; (0, 0) if M is constant, or if a callback computes only its entries
+    mass_pattern: Array
     newton_arguments: tuple[Any, ...]  # arguments of `newton_form` that follow t0 and q0
     newton_program: NDArray[np.int32] | None = None  # factorizes Newton's matrix; None until a plan needs it
     n_groups: int = 0  # number of column groups of Newton's matrix; one difference of forces yields a group
@@ -287,7 +289,7 @@ GAMMA_ACCURACY = 1e-11  # smallest relative error that may be required of a gamm
 MAX_KITS = 16  # largest number of kits in the cache of a system
 
 
-def kit_of(
+def make_kit(
     system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
 ) -> Kit:
     """Return a kit of a system: callbacks, flags that choose the linear algebra, and the step functions of `plan`."""
@@ -400,7 +402,7 @@ def workspace(
 ) -> common.Work:
     """Return a new workspace for a run from q0; `ranks`: ranks of C_q and of [C_q; A], None for full ranks.
 
-    `pattern`: 1 at the entries of [C_q; A], else 0. `matrices`: number of dense matrices that the plan needs.
+    `pattern`: 1 where [C_q; A] may be nonzero, else 0. `matrices`: number of dense matrices that the plan needs.
     """
     flags = kit.flags
     uses_null_space, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED

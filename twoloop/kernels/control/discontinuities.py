@@ -436,7 +436,10 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return `size`, or the size (s) of a step from t to the next sudden change if smaller; `new_state` is scratch."""
+    """Return `size` (s), or less if a force or drive changes suddenly within it: the step from t ends at the change.
+
+    Forces, C_t and b are sampled ahead of t, at most until `last`. `new_state` is scratch.
+    """
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]

@@ -5,13 +5,13 @@ The next step size follows from the error of the last step. In methods with a tr
 
 Errors that the embedded formula does not show are measured in two ways:
 
-- `departure` compares the dependent positions that the formula predicts with positions that satisfy the constraints. In
-  the same assembly of the mechanism, the difference is of the order of the step's error. If the step has ended in
-  another assembly, the difference is larger, however smooth the independent coordinates are. If all coordinates are
-  prescribed, this is the only error estimate. Where two assemblies come close to one another, a large step may end in
-  the wrong assembly with a small difference. But then det C_qd changes its sign, which along a motion happens only at a
-  singular position. So if the sign changes in a step, the prediction must be nearly exact, as in short steps through a
-  singular position.
+- `prediction_error` compares the dependent positions that the formula predicts with positions that satisfy the
+  constraints. In the same assembly of the mechanism, the difference is of the order of the step's error. If the step
+  has ended in another assembly, the difference is larger, however smooth the independent coordinates are. If all
+  coordinates are prescribed, this is the only error estimate. Where two assemblies come close to one another, a large
+  step may end in the wrong assembly with a small difference. But then det C_qd changes its sign, which along a motion
+  happens only at a singular position. So if the sign changes in a step, the prediction must be nearly exact, as in
+  short steps through a singular position.
 - `defect_ratio` is the defect of a Taylor step: the difference between the accelerations by the series and by the
   equations at the same states. A series contains the forces at the beginning of the step, but no later sudden change.
   So the equations are evaluated at the end of the step, and within it at times at most tolerances[DEFECT_GAP] apart.
@@ -158,11 +158,12 @@ def store_prediction(w, q1):
 
 
 @merged
-def departure(w, tolerances, h, q, v, q1):
-    """Return the largest difference of w.predicted from the dependent positions in q1, relative to the allowed one.
+def prediction_error(w, tolerances, h, q, v, q1):
+    """Return the largest error of the dependent positions that the formula predicts, divided by the allowed error.
 
-    The allowed difference is the smaller of two: the tolerance, and about FRACTION_OF_MOTION times the motion.
-    The factors of C_qd in `w` must belong to q1. With steps of fixed size the result is 0.
+    The error is the difference of w.predicted from the positions in q1, which satisfy the constraints. The allowed
+    error is the smaller of two: the tolerance, and about FRACTION_OF_MOTION times the motion of the step. The factors
+    of C_qd in `w` must belong to q1. With steps of fixed size the result is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -183,10 +184,10 @@ def departure(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Project (q1, v1), predicted by a step of size h from (q, v), onto the constraints; return code and departure."""
+    """Project (q1, v1), predicted by a step of size h from (q, v); return a code, and `prediction_error`."""
     store_prediction(w, q1)
     code = restore_constraints(f, w, t, q1, v1, inner_tol)
-    return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0
+    return code, prediction_error(w, tolerances, h, q, v, q1) if code == DONE else 0.0
 
 
 ROUNDING = 1e-13  # defect that counts as a rounding error, relative to the largest acceleration

@@ -58,8 +58,8 @@ N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, 
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if step size times eigenvalue is smaller than this
 ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
 STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limit the step of the explicit method
-# smallest cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
-# is computed by finite differences, which take about eight evaluations per coordinate
+# if the Jacobian is computed by finite differences (about eight evaluations per coordinate), a trial that may not pay
+# begins only when the run has cost more than this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
 # a trial that may not pay begins only if the run so far has cost at least as much as this number of trials

@@ -15,9 +15,8 @@ PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGE
 # columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of its result among
 # the nodes, or among the results for RESULT. FIRST to SECOND - 1 and SECOND to END - 1: terms of its two arguments
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# indices of the sizes with which a program, a vector of integers, begins; N_SIZES is the number of sizes. After the
-# sizes, the program contains the rows of the table, the node of each term, and the index of each result in its array.
-# The last nodes are the results
+# A program is a vector of integers: N_SIZES sizes (at the indices below), the rows of the table, the node of each term,
+# and the index of each result in its array. Results are numbered after all other nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 

@@ -123,14 +123,14 @@ def end_steps(code, settings, control, work, predicted_v):
     project_lanes(code, order, control, work)
     if settings[at.CHECKS_REDUNDANT] == 1:
         code.check_redundant_rows(order, control, work)
-    code.compute_departure(order, control, work)
+    code.compute_prediction_error(order, control, work)
     for i in range(n * LANES):
         work[predicted_v * LANES + i] -= work[(new + n) * LANES + i]
     for j in range(n):
         atol = control[at.ATOL + j]
         raise_to_ratio(work, at.ERROR, predicted_v + j, at.RUNNING, state + n + j, new + n + j, atol, control[at.RTOL])
     for k in range(LANES):
-        work[at.ERROR * LANES + k] = max(work[at.ERROR * LANES + k], work[at.DEPARTURE * LANES + k])
+        work[at.ERROR * LANES + k] = max(work[at.ERROR * LANES + k], work[at.PREDICTION_ERROR * LANES + k])
 
 
 @merged
@@ -230,6 +230,6 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
     project_lanes(code, order, control, work)
     if settings[at.CHECKS_REDUNDANT] == 1:
         code.check_redundant_rows(order, control, work)
-    code.compute_departure(order, control, work)
+    code.compute_prediction_error(order, control, work)
     code.evaluate_defect(order, control, work)
     code.accept_or_reject(order, control, work)

@@ -32,7 +32,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     X,  # time from the beginning of the step to the state to be computed, s
     ACTIVE,  # 1 in lanes in which the next task has to run; the task sets it to 0 where it fails
     DEFECT,  # defect at the end of the step, relative to the allowed defect
-    DEPARTURE,  # difference of predicted and projected positions, relative to its limit, see step_size.py
+    PREDICTION_ERROR,  # difference of predicted and projected positions, over the allowed one, see step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
     LONGEST,  # largest allowed step size, s
     REQUESTED,  # 1 in lanes that begin a run, or in which a state within the step is to be computed
@@ -59,7 +59,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
 ) = range(31)
 # names of tasks: functions (order, control, work) that are generated for a mechanism. The methods of the same names in
 # generate/lane_code.py describe them
-TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_departure", "commit")
+TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_prediction_error", "commit")
 TASKS_OF_STARTS, TASKS_OF_STAGES, TASKS_OF_EXPLICIT = ("compute_rows",), ("compute_accelerations",), ("compute_stages",)
 TASKS_OF_SERIES = (
     *("compute_series", "choose_sizes", "check_defect_within"),

@@ -29,24 +29,32 @@ GOLDEN_SECTION = 0.6180339887498949
 
 
 @merged
-def _subtract_four(work, target, x, dx, y, dy, count):
-    """Apply `subtract_products` to four adjacent lanes; target, x, y are indices in `work`, dx, dy strides of x, y."""
+def _subtract_products_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
+    """Subtract from work[target] `count` products, of work[x + i * x_stride] and work[y + i * y_stride].
+
+    The same is done in the next three lanes, whose numbers follow those of the first.
+    """
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
         t1 -= work[x + 1] * work[y + 1]
         t2 -= work[x + 2] * work[y + 2]
         t3 -= work[x + 3] * work[y + 3]
-        x += dx
-        y += dy
+        x += x_stride
+        y += y_stride
     work[target], work[target + 1], work[target + 2], work[target + 3] = t0, t1, t2, t3
 
 
 @compiled
-def subtract_products(work, target, x, dx, y, dy, count):
-    """Subtract from the vector `target` the products of the vectors x + i * dx and y + i * dy for i < `count`."""
+def subtract_products(work, target, x, x_stride, y, y_stride, count):
+    """Subtract from vector `target` the products of the vectors x + i * x_stride and y + i * y_stride, i < `count`.
+
+    Vectors are given by their index in `work`; each has one number for each lane.
+    """
     for k in range(0, LANES, 4):
-        _subtract_four(work, target * LANES + k, x * LANES + k, dx * LANES, y * LANES + k, dy * LANES, count)
+        _subtract_products_in_four_lanes(
+            work, target * LANES + k, x * LANES + k, x_stride * LANES, y * LANES + k, y_stride * LANES, count
+        )
 
 
 @merged

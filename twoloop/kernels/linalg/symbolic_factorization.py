@@ -85,7 +85,10 @@ class _PartSupports:
         self._merge_parts([hub, *supported_bodies], False, frozenset())
 
     def _merge_parts(self, bodies: Iterable[int], is_grounded: bool, hubs: AbstractSet[int]) -> None:
-        """Merge the parts that contain `bodies`; `is_grounded` and `hubs`: further supports of the merged part."""
+        """Merge the parts (bodies connected by eliminated joints) that contain `bodies`.
+
+        The merged part is also supported by `hubs`, and by the ground if `is_grounded`.
+        """
         first, *others = bodies
         part = self.parts.find(first)
         for body in others:

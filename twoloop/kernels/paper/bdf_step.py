@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.control.step_size import departure
+from twoloop.kernels.control.step_size import prediction_error
 from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate_state, rounding_floor
@@ -306,10 +306,10 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[NEXT_ORDER] = min(memory[ORDER] + 1.0, options[HIGHEST])
     else:
         error, factor = _choose_order(options, memory, tolerances, trial, y, y1, d)
-        departure_error = departure(w, tolerances, h, y[:n], y[n:], y1[:n])
-        if departure_error > 0.0:
-            factor = min(factor, max(SAFETY / departure_error, MIN_STEP_FACTOR))
-        error = max(error, departure_error)
+        position_error = prediction_error(w, tolerances, h, y[:n], y[n:], y1[:n])
+        if position_error > 0.0:
+            factor = min(factor, max(SAFETY / position_error, MIN_STEP_FACTOR))
+        error = max(error, position_error)
     memory[HAS_TRIAL] = 1.0
     _update_differences(memory, trial, y1, d)
     return Attempt(DONE, error, factor)

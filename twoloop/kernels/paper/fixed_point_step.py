@@ -67,7 +67,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])
-    code, departure = iterate_accelerations(
+    code, prediction_error = iterate_accelerations(
         f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rounding
     )
     if code != DONE:
@@ -79,19 +79,21 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         for j in range(s):
             interpolate(c, 0.5 * c[j], trial, weights, half[j])
         h_half = 0.5 * h
-        code, departure_mid = iterate_accelerations(
+        code, prediction_error_mid = iterate_accelerations(
             f, w, options, tolerances, t, h_half, q, v, half, Q_stage, V_stage, q_mid, v_mid, rounding
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
-        code, departure = iterate_accelerations(
+        code, prediction_error = iterate_accelerations(
             f, w, options, tolerances, t + h_half, h_half, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rounding
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        departure = max(departure, departure_mid)  # the next step starts from the end of the half steps
+        prediction_error = max(
+            prediction_error, prediction_error_mid
+        )  # the next step starts from the end of the half steps
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
         )
@@ -102,7 +104,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[at.H_TRIAL] = h
     if code == DONE and tolerances[ESTIMATE] == 1.0:
         error = max(error, END_ERROR_WEIGHT * estimate_end_error(tolerances, options, h, state, new_state, trial))
-    return Attempt(code, max(error, departure), 0.0)
+    return Attempt(code, max(error, prediction_error), 0.0)
 
 
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)

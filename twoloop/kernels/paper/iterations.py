@@ -120,12 +120,12 @@ def _clear_rounding_errors(coordinates, rounding):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
-    """Compute a step of size h from (q, v) by iteration on the stage accelerations; return a code and the departure.
+    """Compute a step of size h from (q, v) by iteration on the stage accelerations; return a code and an error.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
     the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
     then satisfy (17). For undamped systems, an iteration reduces errors as much as two first-order
-    iterations. Sums are compensated if `rounding` has rows. For the departure, see `departure` in step_size.py.
+    iterations. Sums are compensated if `rounding` has rows. The error is `prediction_error` (step_size.py).
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twoloop.kernels.control.step_size import commit_nothing, departure
+from twoloop.kernels.control.step_size import commit_nothing, prediction_error
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
@@ -96,11 +96,11 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
                 error = _estimated_error(options, tolerances, rate, h, q, v, a, a1)
-                if options[ERROR_TOL] == 0.0:  # the paper does not have the estimate `departure`
+                if options[ERROR_TOL] == 0.0:  # the paper does not have the estimate `prediction_error`
                     for k in range(w.dependent.size):
                         m = w.dependent[k]
                         w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
-                    error = max(error, departure(w, tolerances, h, q, v, q1))
+                    error = max(error, prediction_error(w, tolerances, h, q, v, q1))
             return Attempt(DONE, error, 0.0)
         if not change <= last_change:
             break

@@ -15,7 +15,7 @@ integrals are positive.
 
 import numpy as np
 
-from twoloop.kernels.control.step_size import departure, store_prediction
+from twoloop.kernels.control.step_size import prediction_error, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, inlined, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
@@ -319,7 +319,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(code, np.inf, 0.0)
     for m in range(n):
         d[m] = a1[m] - new[0, m]
-    distance = departure(w, tolerances, h, q, v, q1)
+    distance = prediction_error(w, tolerances, h, q, v, q1)
     if distance > 0.0:
         factor = min(factor, max(SAFETY / distance, LEAST_FACTOR))
     return Attempt(DONE, max(error, distance), factor)

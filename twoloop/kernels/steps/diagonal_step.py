@@ -22,7 +22,7 @@ to the tolerance times the number of steps.
 
 import numpy as np
 
-from twoloop.kernels.control.step_size import departure, store_prediction
+from twoloop.kernels.control.step_size import prediction_error, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import DONE, ESTIMATE, OUTER_DIVERGED, SINGULAR, STATIC
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
@@ -93,7 +93,8 @@ def factor_newton_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        # L D L^T fails if the matrix is indefinite, as for a compressed beam: use L U instead
+        # L D L^T fails if the matrix is indefinite, as for a compressed beam. The failed attempt has overwritten the
+        # matrix: fill it again, and use L U
         _fill_newton_matrix(w, memory, n, m, z, storage)
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
@@ -537,7 +538,9 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)
-    for m in w.dependent:  # positions by the formula: `departure` compares them with positions on the constraints
+    for (
+        m
+    ) in w.dependent:  # positions by the formula: `prediction_error` compares them with positions on the constraints
         q1[m] = q_bar[m] + h * A[s - 1, s - 1] * V[m]
     for m in w.independent:
         q1[m] = Q[m]
@@ -560,7 +563,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     store_prediction(w, q1)
     code = evaluate_state(f, w, t + h, q1, v1, options[at.INNER_TOL], a1, lam1)
     if code == DONE:
-        error = max(error, departure(w, tolerances, h, q, v, q1))
+        error = max(error, prediction_error(w, tolerances, h, q, v, q1))
     return Attempt(code, error, 0.0)
 
 

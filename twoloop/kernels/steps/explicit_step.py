@@ -9,7 +9,7 @@ the formula, and only the end of the step is projected.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.control.step_size import commit_nothing, departure, store_prediction
+from twoloop.kernels.control.step_size import commit_nothing, prediction_error, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, gap_ratio, inlined, kernel
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
@@ -175,7 +175,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     else:
         code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     if code == DONE:
-        error = max(error, departure(w, tolerances, h, q, v, q1))
+        error = max(error, prediction_error(w, tolerances, h, q, v, q1))
     return Attempt(code, error, 0.0)
 
 

@@ -18,7 +18,7 @@ import math
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.control.singular_positions import COLLAPSED_STEP, SHORT_STEP, SINGULAR_PIVOT
-from twoloop.kernels.control.step_size import count_step, departure, size_off_grid, store_prediction
+from twoloop.kernels.control.step_size import count_step, prediction_error, size_off_grid, store_prediction
 from twoloop.kernels.data import collocation as field
 from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REJECTED, array_offsets
 from twoloop.kernels.data.common import (
@@ -214,7 +214,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code == DONE:
-        error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
+        error = max(error, prediction_error(w, tolerances, h, state[:n], state[n : 2 * n], q1))
     if code == DONE and error <= 1.0 and w.nearly_singular == 1.0 and tolerances[ESTIMATE] == 1.0:
         w.near_now = 2.0  # after the step, `check_partition` renews the partition and checks its pivots
         if _passes_singular_position(f, w, t, h, state, new_state):

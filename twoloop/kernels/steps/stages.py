@@ -155,8 +155,11 @@ PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 # indices of the vectors (n_q) after the blocks: accelerations, displaced positions and velocities, estimated errors of
 # positions and velocities, state and accelerations at the middle stage
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# indices of the parts of w.matrices, each with n_q^2 entries: derivatives by q, derivatives by v, factors of the real
-# filter matrix, and from SYSTEMS on, two parts for each eigenvalue: the factors of a complex matrix
+# indices of the parts of w.matrices, n_q^2 entries each, in dense and banded storage; for J_q, K, T etc. see
+# newton_systems.py. DERIVATIVE_Q: in dense storage J_q, or T^T K T if diagonal_step.py factors its own matrices; in
+# banded storage the band of K, followed by the independent rows of C_q and by w.D. DERIVATIVE_V: J_v, or T^T D T, or
+# the band of D. FILTER: factors of the real matrix that filters errors. From SYSTEMS on, two parts for each eigenvalue
+# of A: the factors of its complex matrix (in diagonal_step.py T^T M T)
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
@@ -248,7 +251,7 @@ def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
 
 @merged
 def newton_options_index(s):
-    """Return the index in `options` of the first entry of newton_options, N_REAL, for s stages."""
+    """Return where the entries made by `newton_options` begin in `options`: the index of N_REAL, for s stages."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 

@@ -19,7 +19,7 @@ If there is no generated code, the program of the series is interpreted, order b
 
 import numpy as np
 
-from twoloop.kernels.control.step_size import defect_ratio, departure, store_prediction
+from twoloop.kernels.control.step_size import defect_ratio, prediction_error, store_prediction
 from twoloop.kernels.data.common import (
     ATTEMPT,
     COMMIT,
@@ -65,7 +65,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     TRIED,  # 1: the last attempt has computed the series about its end, the current series if the attempt is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
     TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
-    # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_DEPARTURE; 0: not known yet
+    # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown yet
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts, which determines the times within a step at which the defect is evaluated
     SUSPECTED,  # 1: the run has not passed the time SUSPECT yet, at which the defect of a rejected step was too large
@@ -353,7 +353,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
 
 
 # step sizes are chosen for this distance from the constraints before projection, relative to the allowed distance
-TARGET_DEPARTURE = 0.3
+TARGET_PREDICTION_ERROR = 0.3
 # a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
 # times the defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
@@ -543,11 +543,11 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if options[KEEP] == 1.0:
         memory[PASSED] += h
         return Attempt(DONE, 0.0, 0.0)
-    distance = departure(w, tolerances, h, q, v, q1)
+    distance = prediction_error(w, tolerances, h, q, v, q1)
     memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
     if distance > 0.0:
         # if MAX_GROWTH or a force ahead shortened the step, x / ALLOWED_SIZE counts as at least 1 / MAX_GROWTH
-        allowed_factor = (TARGET_DEPARTURE / distance) ** (1.0 / order)
+        allowed_factor = (TARGET_PREDICTION_ERROR / distance) ** (1.0 / order)
         memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / MAX_GROWTH) * allowed_factor)
     if distance > 1.0:
         return Attempt(DONE, distance, allowed_factor)
