@@ -6,7 +6,7 @@ from twoloop.run import workspace
 
 @pytest.fixture
 def large(monkeypatch):
-    """What sets from how many coordinates on the static form is taken: here by all."""
+    """What sets from how many coordinates on the fixed-order form is taken: here by all."""
 
     def set_to(n):
         monkeypatch.setattr(workspace, "LARGE", n)
@@ -18,7 +18,7 @@ def large(monkeypatch):
 
 @pytest.fixture
 def both(large):
-    """What makes the same twice: by the dense forms, and by the static form."""
+    """What makes the same twice: by the dense forms, and by the fixed-order form."""
 
     def made(make):
         found = []

@@ -37,13 +37,13 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
 from twoloop.kernels.data.indices import (
     DONE,
+    FIXED_ORDER,
     GAP,
     INNER_DIVERGED,
     NEEDS_DENSE,
     NOT_FINITE,
     NOT_LOADED,
     SINGULAR,
-    STATIC,
     UNSUITED,
 )
 from twoloop.kernels.evaluation.inner_loop import (
@@ -167,7 +167,7 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
         clock[at.LIMIT_AGE] = 0.0
         clock[at.H_NEXT] = 0.5 * size
     if needs_partition and renew_partition(f, w, t, state[:n]) != DONE:
-        return at.NEEDS_DENSE if f.form == STATIC else at.RANK_LOST
+        return at.NEEDS_DENSE if f.form == FIXED_ORDER else at.RANK_LOST
     return at.CONTINUE
 
 

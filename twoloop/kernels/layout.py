@@ -19,8 +19,8 @@ MAX_UNUSED, MAX_UNUSED_SIZE = 32, 100_000
 WORD, LINE = 8, 8  # WORD: bytes in a number; LINE: numbers in a cache line, at the start of which each array begins
 
 
-class Static(NamedTuple):
-    """Sizes of arrays that only the static form uses."""
+class FixedOrderSizes(NamedTuple):
+    """Sizes of arrays that only the fixed-order form uses."""
 
     n_factors: int
     n_mass_values: int
@@ -30,8 +30,8 @@ class Static(NamedTuple):
 
 
 # arguments of _create_layout: n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T and the augmented matrix are
-# used, number of nodes of the traced programs, sizes of the static form (None: another form), length of `matrices`
-Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
+# used, number of nodes of the traced programs, sizes of the fixed-order form (None: another form), length of `matrices`
+Sizes = tuple[int, int, int, int, int, bool, bool, int, FixedOrderSizes | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
 
@@ -126,31 +126,31 @@ def cached_run() -> Any:
     return cached_run
 
 
-def _static_shapes(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return the shapes, by name, of the arrays of floats and of integers that differ in the static form.
+def _fixed_order_shapes(n_q: int, n_c: int, rank: int, form: FixedOrderSizes) -> tuple[dict[str, tuple[int, ...]], ...]:
+    """Return the shapes, by name, of the arrays of floats and of integers that differ in the fixed-order form.
 
-    The static form has no partition: all coordinates count as independent, and also as dependent, because all predicted
-    positions are compared with the positions on the constraints.
+    The fixed-order form has no partition: all coordinates count as independent, and also as dependent, because all
+    predicted positions are compared with the positions on the constraints.
     """
     n, n_redundant = n_q + n_c, n_c - rank
-    n_rows = n_c if static.dense_jacobian else 0
-    mass_side = n_q if static.dense_mass else 0
+    n_rows = n_c if form.dense_jacobian else 0
+    mass_side = n_q if form.dense_mass else 0
     matrices = dict.fromkeys(("L", "S", "W", "A", "MT", "Gx", "G_of_S"), (0, 0))
     empty_vectors = dict.fromkeys(("values", "values_v", "values_a", "right"), (0,))
     numbers: dict[str, tuple[int, ...]] = {
-        "augmented": ((n_rows + 1) * n_q * static.dense_jacobian + mass_side * mass_side,),
+        "augmented": ((n_rows + 1) * n_q * form.dense_jacobian + mass_side * mass_side,),
         **matrices,
         **empty_vectors,
         "D": (n_q + 1, 0),
         "pattern": (n_rows, n_q),
         "mass_pattern": (mass_side, mass_side),
         "z": (n_c,),
-        "minimum": ((static.n_factors + n + n_q) * (n_redundant > 0),),
+        "minimum": ((form.n_factors + n + n_q) * (n_redundant > 0),),
         "predicted": (n_q,),
-        "mass_values": (static.n_mass_values,),
-        "jacobian_values": (static.n_jacobian_values,),
+        "mass_values": (form.n_mass_values,),
+        "jacobian_values": (form.n_jacobian_values,),
         "is_independent": (n_c,),
-        "factors": (static.n_factors,),
+        "factors": (form.n_factors,),
         "pivot_sizes": (n,),
         "unknowns": (n,),
         "solutions": (3 * n + n_c,),
@@ -174,7 +174,7 @@ def _create_layout(
     reduced: bool,
     augmented: bool,
     n_nodes: int,
-    static: Static | None,
+    fixed_order: FixedOrderSizes | None,
     n_matrices: int,
 ) -> Layout:
     """Return the Layout for `Sizes`, whose numbers are the arguments."""
@@ -226,11 +226,11 @@ def _create_layout(
         "index": (index_size(r),),  # must be the last array, as its end keeps no data from one step to the next
     }
     rows_of_G, mass_side = n_rows + 1, n_q
-    if static is not None:
-        static_shapes = _static_shapes(n_q, n_c, r, static)
-        numbers |= static_shapes[0]
-        integers |= static_shapes[1]
-        rows_of_G, mass_side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
+    if fixed_order is not None:
+        fixed_order_shapes = _fixed_order_shapes(n_q, n_c, r, fixed_order)
+        numbers |= fixed_order_shapes[0]
+        integers |= fixed_order_shapes[1]
+        rows_of_G, mass_side = (n_rows + 1) * fixed_order.dense_jacobian, n_q * fixed_order.dense_mass
         n_entries = rows_of_G * n_q
     # names of arrays for positions that also serve for velocities if there are no non-holonomic constraints
     of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
@@ -243,7 +243,7 @@ def _create_layout(
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + mass_side * mass_side, (mass_side, mass_side)
     # number of integers at the end of `index` that are used only to choose the order of elimination
-    n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
+    n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if fixed_order is None else 0
     n_lasting = of_numbers["matrices"][0], of_integers["index"][1] - n_ordering
     if n_a == 0:
         of_numbers["values_v"] = of_numbers["values"]

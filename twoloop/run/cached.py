@@ -553,7 +553,7 @@ def _new_entry(run: Run, code: GeneratedCode | None, t1: float, options: Options
     )
     definite = has_definite_mass(system, t0, q0)
     for_other_starts = (
-        run.static_form is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
+        run.fixed_order is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
     )
     start = t0, q0.tobytes(), v0.tobytes()
     can_start = for_other_starts and not run.start_warning and not system.called_in_python  # in compiled code
@@ -611,12 +611,12 @@ def _new_run(
 
     system, derived = derive_callbacks(system, check)
     run, code = _create_run(system, t0, q0, v0, options, derived, check)
-    if run.static_form is None:
+    if run.fixed_order is None:
         branch = branch_at(system, t0, run.state, run.rank, options.atol + options.rtol * np.abs(v0).max())
         run.starts_singular = branch is not None
         if isinstance(branch, Branch) and not has_fixed_step:
             beside, other = _create_run(system, t0, branch.q, branch.v, options, derived, check)
-            if beside.rank == branch.rank and beside.static_form is None:
+            if beside.rank == branch.rank and beside.fixed_order is None:
                 run, code = beside, other
                 run.move_to_singular_start(t0, q0, v0, branch.a, branch.first_size)
     if new:

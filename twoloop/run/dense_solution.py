@@ -21,7 +21,7 @@ from twoloop.kernels.steps.stages import load_step
 from twoloop.methods.plan import INNER_TOL, Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.signals import signals_of
-from twoloop.run.workspace import make_kit, prepare_workspace, static_form, workspace
+from twoloop.run.workspace import fixed_order_form, make_kit, prepare_workspace, workspace
 
 if TYPE_CHECKING:
     from twoloop.run.run import Run
@@ -83,7 +83,7 @@ class Interpolator:
         self.tolerances = np.concatenate([np.zeros(ATOL), atol])
         self.tolerances[RTOL] = rtol
         self.parts = max([N_REPAIR_STEPS, *(plan.parts for plan in self.plans.values())])
-        self.static_form = static_form(system, t0, row[: system.n_q], *self.plans.values())
+        self.fixed_order = fixed_order_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()
         self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of it
@@ -96,15 +96,15 @@ class Interpolator:
         self._allocate_scratch()
 
     def _create_workspace(self) -> None:
-        """Create the workspace and the kits for the current form of linear algebra, `self.static_form`."""
+        """Create the workspace and the kits for the current form of linear algebra, `self.fixed_order`."""
         system, t0, row = self.arguments[:3]
-        q0, static = row[: system.n_q], self.static_form
+        q0, form = row[: system.n_q], self.fixed_order
         for plan in self.plans.values():
             load_step(plan.second)  # load the step now: `result.sol` may need it at any time
-        self.kits = {kind: make_kit(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
-        self.kit = make_kit(system, t0, q0, None, static)
-        pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
-        self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static, self.matrices)
+        self.kits = {kind: make_kit(system, t0, q0, plan, form) for kind, plan in self.plans.items()}
+        self.kit = make_kit(system, t0, q0, None, form)
+        pattern = pattern_of(system, t0, q0) if form is None else np.zeros((0, 0))
+        self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, form, self.matrices)
         self._initialize_workspace()
 
     def _initialize_workspace(self) -> None:
@@ -130,8 +130,8 @@ class Interpolator:
         self.nodes[:], self.scratch[:], self.rows[:] = 0.0, 0.0, 0.0
 
     def _switch_to_dense_form(self) -> None:
-        """Replace the static form of linear algebra, after a failure, by the dense form."""
-        self.static_form = None
+        """Replace the fixed-order form of linear algebra, after a failure, by the dense form."""
+        self.fixed_order = None
         self._create_workspace()
 
     def _allocate_scratch(self) -> None:
@@ -199,7 +199,7 @@ class Interpolator:
         inputs = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.scratch, out)
         failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
-        if failures > 0 and self.static_form is not None:
+        if failures > 0 and self.fixed_order is not None:
             self._switch_to_dense_form()
             failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
         return failures
@@ -271,7 +271,7 @@ class Interpolator:
         """Return times and states in interval i, computed by a crossing step, see crossing_step.py; None on failure."""
         from twoloop.kernels.steps import crossing_step as kernels
 
-        if self.static_form is not None:
+        if self.fixed_order is not None:
             return None
         plan, (begin, end), n = crossing_plan(self.system.n_q), table.t[i : i + 2].tolist(), self.system.n_q
         kernels.begin_polynomial(plan.memory, 0.0, begin)
@@ -309,10 +309,10 @@ class Interpolator:
             q0 = self.arguments[2][: self.system.n_q]
             if plan.matrices > self.matrices:
                 self.matrices = plan.matrices
-                if self.static_form is not None:
-                    self.static_form = static_form(self.system, self.arguments[1], q0, *self.plans.values(), plan)
+                if self.fixed_order is not None:
+                    self.fixed_order = fixed_order_form(self.system, self.arguments[1], q0, *self.plans.values(), plan)
                 self._create_workspace()
-            self.repair_plans[is_stiff] = plan, make_kit(self.system, self.arguments[1], q0, plan, self.static_form)
+            self.repair_plans[is_stiff] = plan, make_kit(self.system, self.arguments[1], q0, plan, self.fixed_order)
         return self.repair_plans[is_stiff]
 
     def _split_divided(self, table: StateTable, groups: Groups) -> tuple[StateTable, Groups, Groups]:
@@ -380,7 +380,7 @@ class Interpolator:
         """Store [a, lam] in `out` for states on the constraints, given `times` and rows [q, v]; NaN on failure."""
         fill, times, states = entry_point(self.kernels.fill_accelerations), *map(np.ascontiguousarray, (times, states))
         failures = fill(self.kit, self.work, times, states, out)
-        if failures > 0 and self.static_form is not None:
+        if failures > 0 and self.fixed_order is not None:
             self._switch_to_dense_form()
             failures = fill(self.kit, self.work, times, states, out)
         self.failures, n = failures, self.system.n_q
@@ -455,7 +455,7 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.fill_accelerations(times, rows, a_and_lam)
-        if interpolator.static_form is not None or interpolator.repair_plans:  # its workspace may not suit another run
+        if interpolator.fixed_order is not None or interpolator.repair_plans:  # its workspace may not suit another run
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 

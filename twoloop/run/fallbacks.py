@@ -150,10 +150,10 @@ def switch_method(run: Run) -> None:
 
 def renew_kit(run: Run) -> None:
     """Replace the kit of a run by one that calls the steps of the run's current plan."""
-    if run.static_form is None:
+    if run.fixed_order is None:
         run.kit = kit_for_plan(run.system, run.kit.flags, run.plan)
     else:
-        run.kit = make_kit(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static_form)
+        run.kit = make_kit(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.fixed_order)
 
 
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:

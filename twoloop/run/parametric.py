@@ -45,7 +45,7 @@ class SharedSetup:
         system, t, q = run.system, run.t0, run.state[: run.system.n_q]
         self.trace_cache, self._regions = trace_cache_of(system), dict[bool, CheckedRegion]()
         form, banded = run.kit.flags[FORM], run.kit.flags[BANDWIDTH] >= 0
-        if run.static_form is not None or form == AUGMENTED or banded or system.entries:
+        if run.fixed_order is not None or form == AUGMENTED or banded or system.entries:
             raise ValueError("for large systems, more choices depend on the numbers")
         symbolic = copy.copy(system)  # a system whose numbers are expressions in the parameters
         cache = self.trace_cache

@@ -25,7 +25,7 @@ from twoloop.kernels.data import indices
 from twoloop.kernels.evaluation import tasks
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.signals import signals_of
-from twoloop.run.workspace import make_kit, static_form, workspace
+from twoloop.run.workspace import fixed_order_form, make_kit, workspace
 
 Array = NDArray[np.float64]
 
@@ -37,11 +37,11 @@ MAX_NONLINEARITY = 0.5
 
 
 class _SparseProjection:
-    """Projection onto the constraints by the least change, by the static form with the unit matrix in place of M."""
+    """Projection onto the constraints by the least change, in the fixed-order form with a unit matrix in place of M."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, form: Any, rank: int | None = None):
         self.system, self.t, self.rank = system, t, rank
-        self.form = form._replace(static=form.static._replace(dense_mass=False), mass_pattern=np.zeros((0, 0)))
+        self.form = form._replace(sizes=form.sizes._replace(dense_mass=False), mass_pattern=np.zeros((0, 0)))
         self.kit = make_kit(system, t, q, None, self.form)
         self.kit.flags[indices.CONSTANT_MASS], self.kit.flags[indices.MASS_VALUES_GIVEN] = 1, 0
         self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, (rank, rank), self.form)
@@ -104,7 +104,7 @@ class Dependence(NamedTuple):
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
     """Return the Dependence of the rows of C_q of a large system at q; None if sparse factors are not reliable."""
-    form, all_rows = static_form(system, t, q), system.sparse_rows(t, q)
+    form, all_rows = fixed_order_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
     projection, at_rest = _SparseProjection(system, t, q, form), np.zeros_like(q)
@@ -133,7 +133,7 @@ def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
     """Return (q, v) projected by sparse factors; None if the result or its assembly is in doubt."""
-    form = static_form(system, t, q)
+    form = fixed_order_form(system, t, q)
     if form is None:
         return None
     with np.errstate(all="ignore"):

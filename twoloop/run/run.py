@@ -35,7 +35,7 @@ from twoloop.run.singular_positions import (
     describe_singular_start,
     singular_threshold,
 )
-from twoloop.run.workspace import add_newton_program, kit_for_plan, make_kit, static_form, workspace
+from twoloop.run.workspace import add_newton_program, fixed_order_form, kit_for_plan, make_kit, workspace
 
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
@@ -45,7 +45,7 @@ FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of attempts in the first chunk if callbacks are slow Python functions
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
 TRIAL_STEPS = 10  # number of first steps; if one of them is short, a method that needs long steps is replaced
-NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
+NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the fixed-order form
 CONTRADICTION = 1e-6  # smallest residual of a row of C_q a = gamma, relative to its terms, that contradicts other rows
 
 
@@ -76,13 +76,13 @@ class Run:
         self.rtol, self.reuse, self.interior_plans, self.traced = rtol, plan.reuse, interiors, plan.traced
         self.least_atol = float(atol.min())
         plans = plan, *plan.substitutes
-        self.static_form = static_form(system, t0, q0, *plans)
+        self.fixed_order = fixed_order_form(system, t0, q0, *plans)
         self.matrices = max(each.matrices for each in plans)
-        self.kit = make_kit(system, t0, q0, plan, self.static_form)
+        self.kit = make_kit(system, t0, q0, plan, self.fixed_order)
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
         # ranks are computed at every start; the ranks of the last start are a guess that often saves a second workspace
-        self.work = self._workspace(*(system.derived.get("ranks", ()) if self.static_form is None else ()))
+        self.work = self._workspace(*(system.derived.get("ranks", ()) if self.fixed_order is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
         self.tolerances[indices.RTOL] = rtol
@@ -93,7 +93,7 @@ class Run:
         self.control[loop_state.MAX_STEP], self.control[loop_state.MAX_EVALUATION_GAP] = np.inf, 1.0
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
-        self.control[loop_state.MAY_CROSS], self.control[loop_state.SAMPLE_MOTION] = self.static_form is None, 1.0
+        self.control[loop_state.MAY_CROSS], self.control[loop_state.SAMPLE_MOTION] = self.fixed_order is None, 1.0
         rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # C_t of kinematics alone is zero
         self.control[loop_state.MAY_JUMP] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
@@ -142,7 +142,7 @@ class Run:
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
         """Return a copy of this run at another start; None if ranks differ there, or accelerations cannot be computed.
 
-        The run must not use the static form of linear algebra.
+        The run must not use the fixed-order form of linear algebra.
         """
         new_run = self._copy_without_workspace()
         new_run.t0, new_run.compared_until, new_run.state[: len(q0)] = t0, [-np.inf], q0
@@ -213,7 +213,7 @@ class Run:
             jumps=[],
         )
         new_run.crossing_tolerances = new_run.tolerances
-        if self.static_form is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # its flags may change
+        if self.fixed_order is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # its flags may change
             new_run.kit = kit_for_plan(self.system, self.kit.flags, new_run.plan)
         return new_run
 
@@ -237,19 +237,19 @@ class Run:
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Return a new workspace for the rank of C_q and the rank of all rows; None: full rank."""
         q0 = self.state[: self.system.n_q]
-        pattern = pattern_of(self.system, self.t0, q0) if self.static_form is None else NO_PATTERN
+        pattern = pattern_of(self.system, self.t0, q0) if self.fixed_order is None else NO_PATTERN
         ranks = rank, rank_v
         work = workspace(
-            self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static_form, self.matrices
+            self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.fixed_order, self.matrices
         )
         work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.checks_within else 1.0
         return work
 
     def may_succeed_in_other_form(self, code: int) -> bool:
-        """Return whether steps failed in the static form of linear algebra, but may succeed in another form."""
+        """Return whether steps failed in the fixed-order form, see sparse_inner_loop.py, but may succeed in another."""
         failure_codes = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
-            self.static_form is not None
+            self.fixed_order is not None
             and code in (self.a.STEP_TOO_SMALL, self.a.FIXED_STEP_FAILED, self.a.RANK_LOST)
             and int(self.clock[self.a.FAILURE_CODE]) in failure_codes
         )
@@ -257,23 +257,23 @@ class Run:
     def change_form(self) -> None:
         """Change the form of linear algebra at the current state, and replace the run's kit and workspace.
 
-        The new form is the static form with Newton's matrices, if these are missing, else a form of saddle_point.py.
+        The fixed-order form gets Newton's matrices, if they are missing. Otherwise a form of saddle_point.py replaces it.
         """
         n = self.system.n_q
         old_work, largest_pivot = self.work, float(self.clock[self.a.LARGEST_PIVOT])
         rank = len(old_work.rows_v)
         t, q = float(self.clock[self.a.T]), self.state[:n].copy()
-        static, self.static_form = self.static_form, None
-        if static is not None and static.newton_program is None and self.matrices > 0:
-            self.static_form = add_newton_program(self.system, t, q, static)
-        if self.static_form is not None and self.plan.first is not None:
-            self.plan = with_matrix_cost(self.plan, self.static_form.matrix_cost())
-        self.kit = make_kit(self.system, t, q, self.plan, self.static_form)
+        form, self.fixed_order = self.fixed_order, None
+        if form is not None and form.newton_program is None and self.matrices > 0:
+            self.fixed_order = add_newton_program(self.system, t, q, form)
+        if self.fixed_order is not None and self.plan.first is not None:
+            self.plan = with_matrix_cost(self.plan, self.fixed_order.matrix_cost())
+        self.kit = make_kit(self.system, t, q, self.plan, self.fixed_order)
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = old_work.counters
         notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.LAST_JUMP, indices.NEXT_JUMP]
         self.work.notes[notes] = old_work.notes[notes]
-        self.control[self.a.MAY_CROSS] = self.static_form is None
+        self.control[self.a.MAY_CROSS] = self.fixed_order is None
         clock, a = self.clock, self.a
         if clock[a.FAILURE_CODE] != indices.DONE:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
@@ -291,14 +291,14 @@ class Run:
         """Compute the accelerations at the start, if necessary with other ranks or another form of linear algebra."""
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
-        if self.static_form is not None and code == indices.RANK_DIFFERS:
+        if self.fixed_order is not None and code == indices.RANK_DIFFERS:
             rank = int(self.work.notes[indices.RANK])
             self.work = self._workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
-        if self.static_form is not None and code not in (indices.DONE, indices.NOT_FINITE):
+        if self.fixed_order is not None and code not in (indices.DONE, indices.NOT_FINITE):
             if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
-                self.system.derived["static form"] = None
-            self.static_form = None
+                self.system.derived["fixed-order form"] = None
+            self.fixed_order = None
             self.kit = make_kit(self.system, self.t0, self.state[: self.system.n_q], self.plan)
             self.control[self.a.MAY_CROSS] = 1.0
             self.work = self._workspace()
@@ -360,7 +360,7 @@ class Run:
 
     def _start_warning(self) -> str:
         """Return the warning for a start at or near a singular position, else ""."""
-        if self.work.notes[indices.PIVOT] > (PIVOT_FACTOR * WEAK_RATIO if self.static_form is None else SMALL_PIVOT):
+        if self.work.notes[indices.PIVOT] > (PIVOT_FACTOR * WEAK_RATIO if self.fixed_order is None else SMALL_PIVOT):
             return ""
         atol, q = self.tolerances[indices.ATOL :], self.state[: self.system.n_q]
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
@@ -379,7 +379,7 @@ class Run:
         if not isinstance(all_rows, SparseRows):
             return describe_dependence(all_rows, rows)
         q, independent_rows = self.state[: self.system.n_q], self.work.rows_v.tolist()
-        if self.static_form is None or set(rows) & set(independent_rows):
+        if self.fixed_order is None or set(rows) & set(independent_rows):
             return describe_dependence(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
         for row, factor in zip(rows, factors, strict=False):  # row = factor @ independent rows
@@ -418,7 +418,7 @@ class Run:
 
     def passed_near_singular(self) -> bool:
         """Return whether a step ended so near a singular position that rounding may have changed its velocities."""
-        threshold = self.near_threshold if self.static_form is None else SMALL_PIVOT  # pivots of static factors vary
+        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT  # pivots in a fixed order vary
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 
     def n_attempts(self) -> int:

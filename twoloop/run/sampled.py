@@ -115,7 +115,7 @@ class SampledRun:
         """Return a run that starts at a state; raise ValueError if the position is singular."""
         run = Run(self._derived_system, self._plan.fresh(), t, q, v, *self._tolerances, None)
         allowed = self._tolerances[1] + self._tolerances[0] * np.abs(v).max()
-        if run.static_form is None and branch_at(self._derived_system, t, run.state, run.rank, allowed) is not None:
+        if run.fixed_order is None and branch_at(self._derived_system, t, run.state, run.rank, allowed) is not None:
             raise ValueError(
                 f"start of {self.system.name!r} must not be a singular position, as at t = {t:g}: the constraints "
                 f"have lost rank there ({dependent_rows(self._derived_system, t, q)}), but not beside it. Start a "

@@ -1,4 +1,4 @@
-"""Create kits (callbacks, flags and steps), workspaces (arrays for all kernels), and static forms of large systems."""
+"""Make kits (callbacks, flags and steps), workspaces (arrays for all kernels), and the fixed-order forms of systems."""
 
 from typing import Any, NamedTuple
 
@@ -14,14 +14,14 @@ from twoloop.kernels.data.indices import (
     BANDWIDTH,
     DENSE_FORM,
     DIAGONAL_MASS,
+    FIXED_ORDER,
     FORM,
     IS_GENERATED,
     MULTIPLIERS,
     NULL_SPACE,
-    STATIC,
 )
 from twoloop.kernels.evaluation.operations import N_NODES
-from twoloop.kernels.layout import Static, cached_run, empty_workspace, lasting_arrays
+from twoloop.kernels.layout import FixedOrderSizes, cached_run, empty_workspace, lasting_arrays
 from twoloop.kernels.linalg.band import banded_pays, lapack_addresses
 from twoloop.kernels.linalg.saddle_point import sparse_pays
 from twoloop.kernels.linalg.sparse_lu import column_groups, grouped_entries, newton_program
@@ -116,14 +116,14 @@ MASSLESS_RATIO = 1e-10
 MIN_MASSLESS_FRACTION = 1e-3
 # number of coordinates, relative to LARGE, from which on Newton's matrix has sparse factors
 MIN_SIZE_NEWTON = 1.6
-MAX_STATIC_SHARE = 0.05  # the static form has at most this share of the entries, and operations, of dense factors
+MAX_SHARE = 0.05  # the fixed-order form has at most this share of the entries, and operations, of dense factors
 
 
-class StaticForm(NamedTuple):
-    """Static form of a large system: the program of its sparse factorization, and data for workspaces."""
+class FixedOrderForm(NamedTuple):
+    """Sparse factorization of a large system, in an order of elimination chosen once, and data for its workspaces."""
 
     program: NDArray[np.int32]
-    static: Static  # sizes of arrays in a workspace
+    sizes: FixedOrderSizes  # sizes of arrays in a workspace
     mass: Entries  # row and column indices of the nonzero entries of M
     # (n_c, n_q), 1 where C_q may be nonzero, else 0; (0, n_q) if a callback computes only the entries of C_q
     pattern: Array
@@ -145,24 +145,26 @@ class StaticForm(NamedTuple):
 
         if self.newton_program is None or matrices == 0:
             return 0
-        n_values = self.static.n_mass_values, self.static.n_jacobian_values
+        n_values = self.sizes.n_mass_values, self.sizes.n_jacobian_values
         return matrices_size(self.newton_program, *n_values, (matrices - SYSTEMS) // 2)
 
 
-def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
-    """Return the static form of a system for runs with `plans`; None if a plan cannot use it, or it does not pay."""
+def fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> FixedOrderForm | None:
+    """Return the fixed-order form of a system for runs with `plans`; None if a plan cannot use it, or it is slower."""
     if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
         return None
     has_gamma = "gamma" in system.given or system.functions.gamma_program.size > 0
     if not has_gamma or not all(plan.projects and plan.inner is None and not plan.own for plan in plans):
         return None
-    form: StaticForm | None = system.remembered("static form", lambda: _create_static_form(system, t0, q0))
+    form: FixedOrderForm | None = system.remembered(
+        "fixed-order form", lambda: _create_fixed_order_form(system, t0, q0)
+    )
     if form is not None and any(plan.matrices and plan.first is None for plan in plans):
         return add_newton_program(system, t0, q0, form)
     return form
 
 
-def add_newton_program(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
+def add_newton_program(system: ConstrainedSystem, t0: float, q0: Array, form: FixedOrderForm) -> FixedOrderForm | None:
     """Return a copy of `form` with the program of Newton's matrix; None if sparse factors of this matrix do not pay."""
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
@@ -170,8 +172,8 @@ def add_newton_program(system: ConstrainedSystem, t0: float, q0: Array, form: St
     return None if cached is None else form._replace(newton_program=cached[0], n_groups=cached[1])
 
 
-def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
-    """Return the static form of a sparse system, or None if dense factorizations are expected to be faster."""
+def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) -> FixedOrderForm | None:
+    """Return the fixed-order form of a sparse system, or None if dense factorizations are expected to be faster."""
     pattern, mass_pattern = np.zeros((0, system.n_q)), np.zeros((0, 0))
     dense_mass = False
     if "jacobian" in system.entries:
@@ -192,11 +194,11 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
     program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff_rows)
     # number of multiplications that one evaluation by a dense Schur complement takes, about
     dense_cost = 0.5 * system.n_c * system.n_c * (system.n_q + system.n_c / 3.0)
-    if program is None or program[N_UPDATES] > MAX_STATIC_SHARE * dense_cost:
+    if program is None or program[N_UPDATES] > MAX_SHARE * dense_cost:
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF_DIAGONAL] + 1)
-    static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
-    return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, bodies, stiff_rows))
+    sizes = FixedOrderSizes(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
+    return FixedOrderForm(program, sizes, mass, pattern, mass_pattern, (mass, jacobian, bodies, stiff_rows))
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
@@ -263,7 +265,7 @@ def _massless_directions(block: Array) -> Array:
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
     """Return whether a matrix has so few entries that it pays to search for an order of elimination."""
-    return n_entries <= MAX_STATIC_SHARE * n_q * n_q + 24 * n_q
+    return n_entries <= MAX_SHARE * n_q * n_q + 24 * n_q
 
 
 def _nonzero_entries(pattern: Array) -> Entries:
@@ -290,21 +292,21 @@ MAX_KITS = 16  # largest number of kits in the cache of a system
 
 
 def make_kit(
-    system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
+    system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, form: FixedOrderForm | None = None
 ) -> Kit:
     """Return a kit of a system: callbacks, flags that choose the linear algebra, and the step functions of `plan`."""
-    if static is not None:
-        return _static_kit(system, plan, static)
+    if form is not None:
+        return _make_fixed_order_kit(system, plan, form)
     return kit_for_plan(system, _flags_for_start(system, t0, q0), plan)
 
 
-def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
-    """Return a new kit of a system for the static form."""
+def _make_fixed_order_kit(system: ConstrainedSystem, plan: Plan | None, form: FixedOrderForm) -> Kit:
+    """Return a new kit of a system for the fixed-order form."""
     from twoloop.kernels.evaluation.sparse_inner_loop import sparse_inner_loop
 
     flags = system.functions.flags.copy()
-    flags[FORM] = STATIC
-    functions = system.functions._replace(flags=flags, static_program=form.program)
+    flags[FORM] = FIXED_ORDER
+    functions = system.functions._replace(flags=flags, ldl_program=form.program)
     if form.newton_program is not None:
         functions = functions._replace(newton_program=form.newton_program)
     if plan is None:
@@ -397,7 +399,7 @@ def workspace(
     rtol: float,
     reuse: float,
     ranks: tuple[int | None, int | None] = (None, None),
-    static: StaticForm | None = None,
+    form: FixedOrderForm | None = None,
     matrices: int = 0,
 ) -> common.Work:
     """Return a new workspace for a run from q0; `ranks`: ranks of C_q and of [C_q; A], None for full ranks.
@@ -412,9 +414,9 @@ def workspace(
     full_ranks = min(n_c, n_q), min(n_c + n_a, n_q)
     rank, rank_v = (rank if rank is not None else highest for rank, highest in zip(ranks, full_ranks, strict=True))
     sizes = n_q, n_c, n_a, rank, rank_v, bool(uses_null_space and n_q > rank_v), bool(augmented), n_nodes
-    n_floats = matrices * n_q**2 if static is None else static.newton_matrices_size(matrices)
-    work = empty_workspace((*sizes, None if static is None else static.static, n_floats))
-    return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, static)
+    n_floats = matrices * n_q**2 if form is None else form.newton_matrices_size(matrices)
+    work = empty_workspace((*sizes, None if form is None else form.sizes, n_floats))
+    return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, form)
 
 
 def prepare_workspace(
@@ -425,17 +427,17 @@ def prepare_workspace(
     q0: Array,
     rtol: float,
     reuse: float,
-    static: StaticForm | None = None,
+    form: FixedOrderForm | None = None,
 ) -> common.Work:
     """Reset a workspace, which another run may have used, for a run from q0; return the workspace."""
     arrays = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting_arrays(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
-    if static is not None:  # arrays that are constant during a run
-        work.pattern[:], work.mass_pattern[:] = static.pattern, static.mass_pattern
+    if form is not None:  # arrays that are constant during a run
+        work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
         work.dependent[:] = work.independent[:] = np.arange(system.n_q)
         work.is_independent[:] = 1.0
         if system.constant_mass and "mass" not in system.entries:
-            work.mass_values[:] = system.mass(0.0, q0)[static.mass]
+            work.mass_values[:] = system.mass(0.0, q0)[form.mass]
     elif flags[BANDWIDTH] >= 0:
         work.lapack[:] = lapack_addresses()
     return work

@@ -26,7 +26,7 @@ import numpy as np
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.control.step_size import project_and_evaluate
 from twoloop.kernels.data.common import allowed_error, compiled, finite_vector
-from twoloop.kernels.data.indices import ATOL, DONE, GAP, RTOL, STATIC
+from twoloop.kernels.data.indices import ATOL, DONE, FIXED_ORDER, GAP, RTOL
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
 from twoloop.kernels.linalg.dense import largest_of
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
@@ -79,8 +79,8 @@ def _slope_and_size(w, row, length):
 def _allowed_error(f, w, tolerances, x, row):
     """Return the error of (G x)[row] that the tolerances of x (n_q coordinates or velocities) allow."""
     largest = 0.0
-    if f.form == STATIC:
-        rows, columns, _ = jacobian_entries_of(f.static_program)
+    if f.form == FIXED_ORDER:
+        rows, columns, _ = jacobian_entries_of(f.ldl_program)
         for k in range(rows.size):
             if rows[k] == row:
                 tolerance = tolerances[ATOL + columns[k]] + tolerances[RTOL] * abs(x[columns[k]])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
     NEAR_SINGULAR,  # a singular position is near: the caller crosses it
     SWITCH_METHOD,  # the method is unsuited: the caller continues with another one
     AT_DISCONTINUITY,  # C_t or b jumps here: the caller writes the state after the jump to new_state
-    NEEDS_DENSE,  # the static form cannot decide whether rows are independent: the caller continues with a dense one
+    NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller takes a dense form
     NEEDS_COMPILATION,  # the step is not compiled: the caller compiles it and repeats the call
 ) = range(12)
 SUSPENDED = 0.5  # value of MAY_CROSS after all crossing steps across a singular position have failed
@@ -85,7 +85,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,  # time at which this interval ends, s
     APPLIES_JUMP,  # 1: the next step goes from JUMP_FROM to JUMP_TO; new_state is the state after the jump
     JUMP_END,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
-    PIVOT_HERE,  # static form: value of PIVOT in Work.notes at the end of the last step
+    PIVOT_HERE,  # fixed-order form: value of PIVOT in Work.notes at the end of the last step
     # samples in time alone (at a fixed state) and samples along the motion: see discontinuities.py
     SAMPLED_TO,  # time of the last sample in time alone, s
     SAMPLED_EVERY,  # spacing of the last samples in time alone, s

@@ -2,7 +2,7 @@
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.data.indices import AUGMENTED, DONE, LEAST, NULL_SPACE, STATIC
+from twoloop.kernels.data.indices import AUGMENTED, DONE, FIXED_ORDER, LEAST, NULL_SPACE
 from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_ratio, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
@@ -13,8 +13,9 @@ SHORT_STEP = 0.5
 COLLAPSED_STEP = 0.2
 # smallest pivot of C_q, relative to its largest value so far, below which a singular position is near
 SINGULAR_PIVOT = 0.2
-STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
-# pivot, relative to the largest so far, below which the static form repeats rejected steps with projected stages
+# replaces SINGULAR_PIVOT in the fixed-order form, whose pivots are sines of angles between rows
+FIXED_ORDER_SINGULAR = 0.01
+# pivot, relative to the largest so far, below which the fixed-order form repeats rejected steps with projected stages
 REPEAT_PIVOT = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
 MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, relative to the longest recent step
@@ -32,7 +33,7 @@ PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: smallest and largest result of near_pivot_ratio; MAX_ROUNDING_ERROR: allowed rounding
 # error, in tolerances; EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-MIN_END_RATIO = 0.25  # static form: ratio of the pivots at both ends of a step below which the step is halved
+MIN_END_RATIO = 0.25  # fixed-order form: ratio of the pivots at both ends of a step below which the step is halved
 
 
 @merged
@@ -52,31 +53,31 @@ def is_near_singular(f, w, control, clock, t, q):
 
 @merged
 def ends_near_singular(f, w, control, clock):
-    """Return whether a step of the static form ends so near a singular position that no step should begin there.
+    """Return whether a step of the fixed-order form ends so near a singular position that no step should begin there.
 
     A singular position within a step, far enough from both ends, does no harm.
     """
-    if f.form != STATIC or control[at.FIXED_STEP] > 0.0:
+    if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0:
         return False
-    return w.pivot < min(STATIC_SINGULAR * clock[at.LARGEST_PIVOT], MIN_END_RATIO * clock[at.PIVOT_HERE])
+    return w.pivot < min(FIXED_ORDER_SINGULAR * clock[at.LARGEST_PIVOT], MIN_END_RATIO * clock[at.PIVOT_HERE])
 
 
 @merged
 def is_too_short_near_singular(f, clock, size):
-    """Return whether a failed step of the static form, near a singular position, is too short to be repeated."""
-    is_near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
-    return f.form == STATIC and is_near and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG]
+    """Return whether a failed step of the fixed-order form, near a singular position, is too short to be repeated."""
+    is_near = clock[at.PIVOT_HERE] < FIXED_ORDER_SINGULAR * clock[at.LARGEST_PIVOT]
+    return f.form == FIXED_ORDER and is_near and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG]
 
 
 @merged
 def prepare_projected_repetition(f, w, control, clock, size):
-    """Return whether a rejected step of the static form is repeated with projected stages; if so, set clock[H_NEXT].
+    """Return whether to repeat a rejected step of the fixed-order form with projected stages; if so, set clock[H_NEXT].
 
     Near a singular position, accelerations of stages off the constraints have large errors. A long step that ends well
     beyond the position may succeed where shorter steps fail: the first repetition has at least the size H_LONG.
     """
     is_near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
-    if f.form != STATIC or control[at.FIXED_STEP] > 0.0 or w.nearly_singular == 1.0 or not is_near:
+    if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0 or w.nearly_singular == 1.0 or not is_near:
         return False
     clock[at.H_NEXT] = SHRINKAGE * size
     if w.nearly_singular == 0.0:
@@ -120,7 +121,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
     bridge = control[at.MAY_CROSS]
     if bridge == 0.0 or control[at.CHECKS_WITHIN] == 0.0 or w.nearly_singular != 1.0 or control[at.FIXED_STEP] > 0.0:
         return False
-    if f.form == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
+    if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return False
     n, largest = w.Q.size, clock[at.LARGEST_PIVOT]
     before = smallest_pivot(f, w, t, state[:n])
@@ -144,9 +145,9 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
 def record_pivot_at_output(f, w, clock, state):
     """Update clock[PIVOT_AT_OUTPUT], the smallest pivot at output times and grid times, by the pivot at `state`."""
     pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
-    if f.form == STATIC and pivot > 0.0:
-        # pivots of the static form are sines of angles, all of them small in large mechanisms: only the ratio to the
-        # largest pivot so far shows a singular position
+    if f.form == FIXED_ORDER and pivot > 0.0:
+        # pivots of the fixed-order form are sines of angles, all of them small in large mechanisms: only the ratio to
+        # the largest pivot so far shows a singular position
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 
@@ -159,7 +160,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
     all coordinates, so that it need not be converted for a new partition.
     """
     short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
-    if f.form == STATIC:
+    if f.form == FIXED_ORDER:
         clock[at.PIVOT_HERE] = w.pivot
         clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)
         if w.nearly_singular == PROJECT_STAGES and w.pivot >= REPEAT_PIVOT * clock[at.LARGEST_PIVOT]:

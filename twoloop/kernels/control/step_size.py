@@ -31,7 +31,7 @@ from twoloop.kernels.control.loop_state import (
     SAFETY,
 )
 from twoloop.kernels.data.common import COMMIT, allowed_error, compiled, is_beyond_gap, kernel, merged
-from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, RTOL, STATIC
+from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, FIXED_ORDER, RTOL
 from twoloop.kernels.evaluation.constraints import representable_step
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
@@ -67,8 +67,8 @@ def record_accepted_step(rule, past, h, error):
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project (Q, V), a state near the constraints, in place, and store its accelerations in A; return a code."""
-    # PROJECT is the cheapest task of generated code, and in the static form the task EVALUATE does not project
-    if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == STATIC:
+    # PROJECT is the cheapest task of generated code, and in the fixed-order form the task EVALUATE does not project
+    if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
 

@@ -47,7 +47,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import DONE, ESTIMATE, GAP, MAX_GAP_RATIO, NOT_LOADED, OUTER_DIVERGED, STATIC
+from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, GAP, MAX_GAP_RATIO, NOT_LOADED, OUTER_DIVERGED
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
@@ -393,7 +393,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
         # a step of fixed size that does not converge cannot be shortened: use the implicit method from now on
-        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != STATIC:
+        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0
             w.explicit_step = 0.0

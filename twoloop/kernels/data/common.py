@@ -30,7 +30,7 @@ INTEGERS_32 = types.int32[::1]  # for long programs, which fit in the processor'
 
 # names of the programs in `Functions`: programs that replace missing callbacks (evaluation/operations.py), and programs
 # for sparse factors of large systems (linalg/symbolic_factorization.py, sparse_lu.py). A missing program has size 0
-PROGRAMS = "jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "static_program", "newton_program"
+PROGRAMS = "jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "ldl_program", "newton_program"
 # the callbacks of a mechanism, its parameters, its flags and its programs
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # type: ignore[misc]
 
@@ -91,7 +91,7 @@ class Work(NamedTuple):
     notes: Any  # (N_NOTES) values that one kernel stores for another, see indices.py
     nodes: Any  # results of the operations of a traced program
     matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
-    # the fields from here to `solutions` belong to the static form, and are empty in other forms; N is n_q + n_c
+    # the fields from here to `solutions` belong to the fixed-order form, and are empty in other forms; N is n_q + n_c
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
     is_independent: Any  # (n_c) 1 for independent rows, else 0

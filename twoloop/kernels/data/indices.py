@@ -18,7 +18,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     GAMMA_INACCURATE,
     RANK_DIFFERS,
     ROWS_CONTRADICT,
-    NEEDS_DENSE,  # the static form cannot decide whether rows are independent: the caller continues with a dense form
+    NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller takes a dense form
     NOT_LOADED,  # the caller has to load the machine code of the step
     UNSUITED,  # the method does not suit the motion: the caller continues with another method
     STOPPED,  # the time limit of the run has passed, see TIME_IS_UP
@@ -29,7 +29,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
 # accelerations, see linalg/saddle_point.py. DENSE_FORM: value of FORM to use if sparse factors have too many entries.
 # IS_GENERATED: 1 if the inner loop is code generated for the mechanism. FIRST_GIVEN: first index of the flags in GIVEN
 CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, IS_GENERATED, FIRST_GIVEN = range(7)
-MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; for STATIC see sparse_inner_loop.py
+MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM; for FIXED_ORDER see sparse_inner_loop.py
 # indices of the flags of optional callbacks: 1 if the callback is given
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
@@ -83,7 +83,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     LAST_JUMP,  # time of the last known jump of C_t or b, s
     NEXT_JUMP,  # time of the next known jump of C_t or b, s
     MAX_COEFFICIENT,  # largest coefficient of an independent row in a redundant row, when the partition was chosen
-    SMALLEST,  # static form: smallest squared sine of the angle of a row to previous rows, see linalg/sparse_ldl.py
+    SMALLEST,  # fixed-order form: smallest squared sine of the angle of a row to previous rows, see sparse_ldl.py
     TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
     N_NOTES,
 ) = range(33)

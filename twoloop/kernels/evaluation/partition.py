@@ -9,12 +9,12 @@ import numpy as np
 from twoloop.kernels.data.common import CONSTRAINT, JACOBIAN, compiled, finite, merged, not_finite
 from twoloop.kernels.data.indices import (
     DONE,
+    FIXED_ORDER,
     INNER_DIVERGED,
     NULL_SPACE,
     RANK_DIFFERS,
     ROWS_CONTRADICT,
     SINGULAR,
-    STATIC,
 )
 from twoloop.kernels.evaluation.constraints import (
     clear_rows,
@@ -108,11 +108,11 @@ def full_pivoting(A, order, row_order, row_maxima, first, last, max_rank):
 def min_pivot_ratio(f, w, t, q):
     """Return the ratio of the smallest to the largest pivot of C_q and A at (t, q), without changing the partition.
 
-    Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the static
-    form, or with more than MAX_ROWS_ELIMINATED rows, the result is the smallest pivot of the last choice of a
-    partition, w.pivot.
+    Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the
+    fixed-order form, or with more than MAX_ROWS_ELIMINATED rows, the result is the smallest pivot of the last choice of
+    a partition, w.pivot.
     """
-    if f.form == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
+    if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.pivot
     if w.rows_v.size == 0:
         return 1.0
@@ -350,7 +350,7 @@ def partition_is_poor(w):
         w.sensitivity = max(largest, 1.0)
     if not largest <= SENSITIVITY_GROWTH * w.sensitivity:
         return True
-    # the static form chooses its independent rows at every state
+    # the fixed-order form chooses its independent rows at every state
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     coefficient = _largest_coefficient(w)

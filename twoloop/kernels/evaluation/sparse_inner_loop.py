@@ -82,7 +82,7 @@ def fill_mass_values(f, w, t, q):
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
     elif w.M.size > 0:
-        rows, columns, _ = mass_entries_of(f.static_program)
+        rows, columns, _ = mass_entries_of(f.ldl_program)
         for k in range(rows.size):
             w.M[rows[k], columns[k]] = 0.0
         f.mass(t, q, f.p, w.M)
@@ -97,7 +97,7 @@ def fill_jacobian_values(f, w, t, q):
         w.jacobian_values[:] = 0.0
         f.jacobian_values(t, q, f.p, w.jacobian_values)
         return
-    rows, columns, _ = jacobian_entries_of(f.static_program)
+    rows, columns, _ = jacobian_entries_of(f.ldl_program)
     for k in range(rows.size):
         w.G[rows[k], columns[k]] = 0.0
     if not jacobian_by_program(f, w, t, q, w.G):
@@ -110,9 +110,9 @@ def fill_jacobian_values(f, w, t, q):
 def _factor_entries(f, w, min_sine_square):
     """Factor [M G^T; G 0] from the entries in w; return the smallest squared sine, see `factor` of sparse_ldl.py."""
     w.n_factorizations += 1
-    stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
-    load_matrix(f.static_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
-    smallest = factor(f.static_program, w.is_independent, w.factors, w.pivot_sizes, min_sine_square)
+    stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
+    load_matrix(f.ldl_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
+    smallest = factor(f.ldl_program, w.is_independent, w.factors, w.pivot_sizes, min_sine_square)
     w.smallest = smallest
     w.pivot = np.sqrt(max(smallest, 0.0))
     return smallest
@@ -147,10 +147,10 @@ def factor_equations_at(f, w, t, q):
 @compiled
 def solve_unknowns(f, w, n_corrections):
     """Replace the right-hand side in w.unknowns by the solution, corrected `n_corrections` times by refinement."""
-    n = f.static_program[N_PIVOTS]
+    n = f.ldl_program[N_PIVOTS]
     scratch = w.solutions
     return solve_refined(
-        f.static_program,
+        f.ldl_program,
         w.mass_values,
         w.jacobian_values,
         w.is_independent,
@@ -179,12 +179,12 @@ def _sine_to_independent_rows(f, w, row, square):
     """
     x, part = w.unknowns, 0.0
     x[:] = 0.0
-    rows, columns, _ = jacobian_entries_of(f.static_program)
+    rows, columns, _ = jacobian_entries_of(f.ldl_program)
     for k in range(rows.size):  # set x to [g, 0]
         if rows[k] == row:
             x[columns[k]] += w.jacobian_values[k]
     solve_unknowns(f, w, 2)
-    rows, columns, _ = mass_entries_of(f.static_program)
+    rows, columns, _ = mass_entries_of(f.ldl_program)
     for k in range(rows.size):  # add up x^T M x
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
@@ -207,7 +207,7 @@ def _choose_rows(f, w, t, q):
     w.is_independent[:] = 1.0
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
         return _failure_of_factorization(w, t, q)
-    order, n_q = pivot_order_of(f.static_program), w.Q.size
+    order, n_q = pivot_order_of(f.ldl_program), w.Q.size
     copy(w.is_independent, w.z)  # w.z is 0 for rows that must be checked
     for k in range(order.size):
         row = order[k] - n_q
@@ -301,7 +301,7 @@ def _fill_residual(program, jacobian, force, x, r):
 @compiled
 def least_norm(f, w, lam):
     """Replace lam by the multipliers of least norm with the same G^T lam; return DONE, or NEEDS_DENSE if this fails."""
-    program, n_q = f.static_program, w.Q.size
+    program, n_q = f.ldl_program, w.Q.size
     n = program[N_PIVOTS]
     n_factors = n + program[N_OFF_DIAGONAL] + 1
     values, is_independent, no_stiffness = w.minimum[:n_factors], w.z, w.g
@@ -340,7 +340,7 @@ def least_norm(f, w, lam):
 @compiled
 def _add_jacobian_times(f, w, x, out):
     """Add G x to `out` in place."""
-    rows, columns, _ = jacobian_entries_of(f.static_program)
+    rows, columns, _ = jacobian_entries_of(f.ldl_program)
     for k in range(rows.size):
         out[rows[k]] += w.jacobian_values[k] * x[columns[k]]
 
@@ -409,7 +409,7 @@ def _add_least_correction(f, w, x):
 @compiled
 def _is_on_constraints(f, w, q):
     """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
-    rows, columns, _ = jacobian_entries_of(f.static_program)
+    rows, columns, _ = jacobian_entries_of(f.ldl_program)
     largest_terms = w.solutions[: w.g.size]
     largest_terms[:] = 0.0
     for k in range(rows.size):
@@ -474,7 +474,7 @@ def _check_redundant_rows(f, w, t, q, v):
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
     copy(w.Rate, w.g)
     _add_jacobian_times(f, w, v, w.g)
-    rows, _, _ = jacobian_entries_of(f.static_program)
+    rows, _, _ = jacobian_entries_of(f.ldl_program)
     row_maxima = w.solutions[: w.g.size]
     row_maxima[:] = 0.0
     for k in range(rows.size):

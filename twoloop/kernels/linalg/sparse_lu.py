@@ -1,4 +1,4 @@
-"""Factor the unsymmetric Newton matrix of a large system by a static program, and group the columns of K and D.
+"""Factor the unsymmetric Newton matrix of a large system in a fixed order of pivots, and group the columns of K and D.
 
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U

@@ -24,7 +24,7 @@ import numpy as np
 
 from twoloop.kernels.control.step_size import prediction_error, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
-from twoloop.kernels.data.indices import DONE, ESTIMATE, OUTER_DIVERGED, SINGULAR, STATIC
+from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, OUTER_DIVERGED, SINGULAR
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
 from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.steps import stages as at
@@ -210,7 +210,7 @@ def _set_stage_state(z, q_bar, v_bar, a, Q, V):
 @merged
 def has_dense_tangents(f, w):
     """Return whether every iteration of Newton's method factors a new dense matrix T^T (M - z^2 K - z D) T."""
-    return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != STATIC
+    return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != FIXED_ORDER
 
 
 @merged
@@ -264,7 +264,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         for m in w.independent:
             scale_q = max(scale_q, abs(Q[m]))
             scale_v = max(scale_v, abs(V[m]))
-        if f.form != STATIC:  # in the static form no coordinate is dependent
+        if f.form != FIXED_ORDER:  # in the fixed-order form no coordinate is dependent
             for m in w.dependent:
                 a[m] = F[m]
         code = _update_derivatives(f, w, options, memory, t, h, Q, V, F)

@@ -15,7 +15,7 @@ import numpy as np
 
 from twoloop.kernels.control.step_size import project_prediction
 from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, kernel
-from twoloop.kernels.data.indices import DONE, ESTIMATE, LEAST, OUTER_DIVERGED, STATIC
+from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, LEAST, OUTER_DIVERGED
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import stages as at
@@ -81,7 +81,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return code
             for m in range(n):
                 residual[j, m] = a_new[m] - A_stage[j, m]
-            if f.form != STATIC:  # in the static form no coordinate is dependent
+            if f.form != FIXED_ORDER:  # in the fixed-order form no coordinate is dependent
                 for m in w.dependent:
                     A_stage[j, m] = a_new[m]
         scale_q, scale_v = 1.0, 1.0

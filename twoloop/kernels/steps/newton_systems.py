@@ -31,7 +31,7 @@ There are three kinds of storage:
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, finite_vector, inlined
-from twoloop.kernels.data.indices import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR, STATIC
+from twoloop.kernels.data.indices import DONE, FIXED_ORDER, NEEDS_DENSE, NOT_FINITE, SINGULAR
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
 from twoloop.kernels.evaluation.sparse_inner_loop import fill_jacobian_values
@@ -728,7 +728,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
     """Store J_q and J_v (dense storage) or K and D (else) at the last evaluated state in w.matrices; return a code."""
-    if f.form == STATIC:
+    if f.form == FIXED_ORDER:
         return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.bandwidth >= 0:
         return _fill_banded_tangents(f, w, memory, s, t, q, v)
@@ -748,7 +748,7 @@ def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
 def factor_filter(f, w, options, memory, s, h):
     """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, with z = h gamma0; return a code."""
     z = h * options[newton_options_index(s) + at.GAMMA0]
-    if f.form == STATIC:
+    if f.form == FIXED_ORDER:
         return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 0))
     return _factor_system(f, w, memory, s, 0, z, matrix_storage(w, w.Q.size, at.FILTER), DGBTRF, DGBTRS)
 
@@ -764,7 +764,7 @@ def factor_systems(f, w, options, memory, s, h):
         # if the first eigenvalue is real, it is gamma0, for which `factor_filter` has computed the factors
         if code == DONE and (k > 0 or n_real == 0):
             z = h * complex(options[offset], options[offset + 1])
-            if f.form == STATIC:
+            if f.form == FIXED_ORDER:
                 code = _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 1 + k).view(np.complex128))
             else:
                 code = _factor_system(f, w, memory, s, 1 + k, z, system_storage(w, w.Q.size, k), ZGBTRF, ZGBTRS)
@@ -799,7 +799,7 @@ def solve_system(f, w, options, memory, s, k, x):
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
-        if f.form == STATIC:
+        if f.form == FIXED_ORDER:
             _, _, _, _, right, y = _sparse_scratch(f, w)
             size, real_right, real_y = y.size, right.view(np.float64), y.view(np.float64)
             _solve_sparse_system(f, w, _sparse_factor_view(f, w, 0), real_right[:size], real_y[:size], real_part)
@@ -807,7 +807,7 @@ def solve_system(f, w, options, memory, s, k, x):
             _solve_system(f, w, memory, s, 0, matrix_storage(w, n, at.FILTER), DGBTRS, X, real_part)
         for i in range(x.size):
             x[i] = real_part[i]
-    elif f.form == STATIC:
+    elif f.form == FIXED_ORDER:
         _, _, _, _, right, y = _sparse_scratch(f, w)
         _solve_sparse_system(f, w, _sparse_factor_view(f, w, 1 + k).view(np.complex128), right, y, x)
     else:
@@ -822,7 +822,7 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
     """
     m = w.independent.size
-    if f.form == STATIC:
+    if f.form == FIXED_ORDER:
         _filter_error_sparse(f, w, options, s, h, e_q, e_v)
     elif f.bandwidth >= 0:
         _filter_error_banded(f, w, options, memory, s, h, e_q, e_v)

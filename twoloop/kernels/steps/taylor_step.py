@@ -32,7 +32,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, NOT_FINITE, RTOL, STATIC
+from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, FIXED_ORDER, NOT_FINITE, RTOL
 from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
@@ -342,7 +342,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
         a, lam = N[k, A : A + n], N[k, LAM : LAM + n_rows]
         if w.rows_v.size < n_rows:
             lam[:] = 0.0
-        if f.form == STATIC:
+        if f.form == FIXED_ORDER:
             f.inner(f, w, SOLVE, t, r, c, 0.0, a, lam)
         else:
             solve_with_multipliers(f, w, r, c, a, lam)

@@ -1,11 +1,11 @@
-"""Test large systems by sparse factors with a static program, against dense algebra in NumPy and the dense forms."""
+"""Test large systems by sparse factors in the fixed-order form, against dense algebra in NumPy and the dense forms."""
 
 import tracemalloc
 
 import numpy as np
 import pytest
 
-import twoloop.run.workspace as static_module
+import twoloop.run.workspace as workspace_module
 from studies.bench.large import LEVEL, PLANAR, closed_chain, grid, ladder
 from tests.kernels.random_assemblies import PlanarAssembly, SpatialAssembly, dense_solution, drawn
 from tests.large_systems import spatial_chain, started_run
@@ -16,15 +16,15 @@ from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.checks.callbacks import MAX_ENTRIES
 from twoloop.kernels import advance
 from twoloop.kernels.data import indices
-from twoloop.kernels.linalg import symbolic_factorization as static_program
-from twoloop.run.workspace import make_kit, static_form, workspace
+from twoloop.kernels.linalg import symbolic_factorization
+from twoloop.run.workspace import fixed_order_form, make_kit, workspace
 
 
 class Started:
-    """The static form of a system with its factors at a state; None of `code` but DONE."""
+    """The fixed-order form of a system with its factors at a state; None of `code` but DONE."""
 
     def __init__(self, system, q, v):
-        form, n = static_form(system, 0.0, q), system.n_q
+        form, n = fixed_order_form(system, 0.0, q), system.n_q
         assert form is not None
         self.kit = make_kit(system, 0.0, q, None, form)
         ranks = (None, None)
@@ -51,8 +51,8 @@ def compare(assembly):
 
 @pytest.fixture
 def any_size(large, monkeypatch):
-    """The static form also for what is too small for it to pay."""
-    monkeypatch.setattr(static_module, "MAX_STATIC_SHARE", 1e9)
+    """The fixed-order form also for what is too small for it to pay."""
+    monkeypatch.setattr(workspace_module, "MAX_SHARE", 1e9)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_a_ladder_whose_parallelograms_pass_their_flat_position(end, partitions,
     made, left = ladder(99), 66
     result = solve_dae(made.system, (0.0, end), made.q, 0.0 * made.q, "DOP853", 1e-6, 1e-6, compiled=False)
     assert result.success and result.stats.n_evaluations < 5000
-    assert result.stats.n_partitions < partitions  # the static form all along
+    assert result.stats.n_partitions < partitions  # the fixed-order form all along
     angles = result.q[2::3]
     assert worst(angles[left:], LEVEL) < 1e-8 and worst(angles[:left:2], angles[1:left:2]) < 1e-8
     crossing = result.q.T[(result.t > 0.07) & (result.t < 0.08)]
@@ -116,9 +116,9 @@ def test_programs_grow_with_the_bodies_and_no_faster(large):
         updates = {}
         for n in (99, 499):
             system, q, _ = make(n)
-            updates[n] = int(static_form(system, 0.0, q).program[static_program.N_UPDATES])
+            updates[n] = int(fixed_order_form(system, 0.0, q).program[symbolic_factorization.N_UPDATES])
             run = started_run(system, q)
-            assert run.static_form is not None
+            assert run.fixed_order is not None
             assert run.work.notes.base.size + run.work.counters.base.size < 120 * system.n_q  # nothing n_c x n_q
         assert updates[499] <= (18.0 if make is grid else 5.3) * updates[99]  # of a grid like n^1.5, at best
         assert updates[499] <= (800 if make is grid else 150) * 499
@@ -167,14 +167,14 @@ def test_bodies_whose_mass_matrix_is_singular(any_size, both):
     one, other = both(run)
     system, q = other.system, other.q[:, 0]
     assert one.success and other.success
-    assert (static_form(system, 0.0, q) is not None) and started_run(system, q).static_form is not None
+    assert (fixed_order_form(system, 0.0, q) is not None) and started_run(system, q).fixed_order is not None
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-11
     assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e-9 * np.abs(one.lam[:, -1]).max()
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_a_hub_whose_stiffening_row_other_rows_imply(any_size, both, monkeypatch):
-    monkeypatch.setattr(static_program, "MAX_JOINTS", 2)
+    monkeypatch.setattr(symbolic_factorization, "MAX_JOINTS", 2)
     model, axis = SpatialModel(gravity=(0.0, 0.0, -9.81)), (0.0, 1.0, 0.0)
     model.body("hub", mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.0))
     model.revolute("ground", "hub", at=(0.0, 0.0, 0.0), axis=axis)
@@ -187,11 +187,11 @@ def test_a_hub_whose_stiffening_row_other_rows_imply(any_size, both, monkeypatch
         model.revolute(f"rocker {k}", "ground", at=(x + 1.2, k, 0.0), axis=axis)
     problem = model.problem((0.0, 0.1))
     one, other = both(lambda: solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", 1e-9, 1e-9))
-    assert one.success and started_run(problem.system, problem.q0).static_form is not None
+    assert one.success and started_run(problem.system, problem.q0).fixed_order is not None
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-11
 
 
-def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(both):
+def test_an_entry_that_comes_up_on_the_way_ends_the_fixed_order_form(both):
     """Coordinates that are held, the first of which comes to lean on another where the second is beyond 0.5."""
     n = 12
 

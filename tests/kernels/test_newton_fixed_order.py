@@ -1,9 +1,9 @@
-"""Test Newton's method of large systems, by sparse factors with a static program, against the dense forms."""
+"""Test Newton's method of large systems, by sparse factors in the fixed-order form, against the dense forms."""
 
 import numpy as np
 import pytest
 
-import twoloop.run.workspace as static_module
+import twoloop.run.workspace as workspace_module
 from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
 from tests.kernels.random_assemblies import PlanarAssembly
 from tests.large_systems import spatial_chain
@@ -17,7 +17,7 @@ from twoloop.run.run import Run
 
 @pytest.fixture
 def form(monkeypatch):
-    """Sets whether the static form is taken, and counts how often a run leaves the form that it has."""
+    """Sets whether the fixed-order form is taken, and counts how often a run leaves the form that it has."""
     left = []
     change = Run.change_form
 
@@ -26,11 +26,11 @@ def form(monkeypatch):
         change(run)
 
     monkeypatch.setattr(Run, "change_form", noted)
-    monkeypatch.setattr(static_module, "MAX_STATIC_SHARE", 1e9)
-    monkeypatch.setattr(static_module, "MAX_NEWTON_SHARE", 1e9)
+    monkeypatch.setattr(workspace_module, "MAX_SHARE", 1e9)
+    monkeypatch.setattr(workspace_module, "MAX_NEWTON_SHARE", 1e9)
 
-    def choose(static):
-        monkeypatch.setattr(static_module, "LARGE", 0 if static else 10**9)
+    def choose(fixed_order):
+        monkeypatch.setattr(workspace_module, "LARGE", 0 if fixed_order else 10**9)
         left.clear()
         return left
 
@@ -103,8 +103,8 @@ SLOW_RUNS += [("closed chain", "RadauIIA13", 1e-10, 1e-9), ("closed chain", "BDF
 @pytest.mark.parametrize(("case", "method", "tolerance", "allowed"), [slow(*case) for case in SLOW_RUNS])
 def test_runs_are_those_of_the_dense_forms(form, case, method, tolerance, allowed):
     ends = []
-    for static in (False, True):
-        left = form(static)
+    for fixed_order in (False, True):
+        left = form(fixed_order)
         system, q = CASES[case]()
         ends.append(solve_dae(system, (0.0, 0.03), q, 0.0 * q, method, tolerance, tolerance))
         assert ends[-1].success and left == []
@@ -126,8 +126,8 @@ def test_a_force_that_comes_up_between_others_is_found_missing(form):
         return Q
 
     ends = []
-    for static in (False, True):
-        left = form(static)
+    for fixed_order in (False, True):
+        left = form(fixed_order)
         system = sprung(made.bodies, made.q, [(k, k - 1) for k in range(1, n)], stop)
         result = solve_dae(system, (0.0, 0.11), made.q, 0.0 * made.q, "RadauIIA9", 1e-2, 1e-2)
         assert result.success
@@ -137,8 +137,8 @@ def test_a_force_that_comes_up_between_others_is_found_missing(form):
 
 def test_bodies_whose_mass_matrix_is_singular(form):
     ends = []
-    for static in (False, True):
-        left = form(static)
+    for fixed_order in (False, True):
+        left = form(fixed_order)
         system, q, v = spatial_chain(5)
         result = solve_dae(system, (0.0, 0.1), q, v, "RadauIIA9", 1e-9, 1e-9, compiled=False)
         assert result.success and left == []
@@ -155,8 +155,8 @@ def test_programs_grow_with_the_bodies_and_no_faster():
             made = make(n)
             pairs = [(k, k - 1) for k in range(1, n)] if make is not tree else [(k, (k - 1) // 2) for k in range(1, n)]
             system = sprung(made.bodies, made.q, pairs[: 1 if make.__name__ in ("ladder", "star") else None])
-            form = static_module.static_form(system, 0.0, made.q)
-            form = static_module.add_newton_program(system, 0.0, made.q, form)
+            form = workspace_module.fixed_order_form(system, 0.0, made.q)
+            form = workspace_module.add_newton_program(system, 0.0, made.q, form)
             updates.append(int(form.newton_program[N_UPDATES]))
             assert form.matrix_cost() < 3.0 + system.n_q / 8.0  # what a dense one is taken to cost
         assert updates[1] <= (5.2 if make is grid else 3.6) * updates[0]  # of a grid like n^1.5, at best
