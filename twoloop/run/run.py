@@ -257,7 +257,7 @@ class Run:
     def change_form(self) -> None:
         """Change the form of linear algebra at the current state, and replace the run's kit and workspace.
 
-        The fixed-order form gets Newton's matrices if they are missing; otherwise a form of saddle_point.py replaces it.
+        The fixed-order form gets Newton's matrices, if missing; otherwise a form of saddle_point.py replaces it.
         """
         n = self.system.n_q
         old_work, largest_pivot = self.work, float(self.clock[self.a.LARGEST_PIVOT])
