@@ -19,11 +19,14 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# rounding error of q over the duration of an interval, in tolerances of v, above which v has a polynomial of its own
+# v has a polynomial of its own if the rounding error of q over the duration of an interval exceeds this number of
+# tolerances of v
 MAX_VELOCITY_ROUNDING = 10.0
-# pivot, relative to the larger one at the ends of an interval, below which a position in the interval is singular
+# a position in an interval is singular if its pivot is below this fraction of the larger pivot at the ends of the
+# interval
 SINGULAR_PIVOT_RATIO = 0.01
-SINGULAR_PIVOT = 1e-5  # pivot below which any position is singular; for pivots see min_pivot_ratio in partition.py
+# any position is singular if its pivot is below this; for pivots see min_pivot_ratio in partition.py
+SINGULAR_PIVOT = 1e-5
 # a position with a pivot below WEAK_PIVOT is singular, too, if velocities of the polynomials violate the constraints by
 # at most MAX_VIOLATION tolerances; the violation is about the pivot times the change by the projection
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05

@@ -80,8 +80,9 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # number of calls that do not use an integrator after a callback raised an exception in it
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # below this CPU time, s, elapsed time is recorded instead, because reading CPU time takes long
-HARMLESS = 0.01  # largest correction of v0, relative to the tolerances, that is always accepted
+# if the last run took less than this CPU time, s, elapsed time is recorded, because reading CPU time takes long
+SHORT_RUN = 1e-3
+HARMLESS = 0.01  # a correction of v0 is always accepted if it is at most this fraction of the tolerances
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
 
@@ -360,7 +361,8 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # smallest pivot of a start, relative to that of the first start, that `set_up` need not check
+# `set_up` need not check a start whose smallest pivot is at least this fraction of that of the first start
+RECHECK_PIVOT = 0.1
 
 
 def arrays_of(

@@ -117,10 +117,10 @@ class Origin(NamedTuple):
 # largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times a step from the
 # current state to its mirror image beyond the singular position (see _find_base)
 MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
-# ratio of the distances of an earlier state and the base, below which another singular position is between them
+# another singular position is between an earlier state and the base if the ratio of their distances is below this
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
-FAR_BEYOND = 0.3  # smallest distance beyond a singular position at which the run continues with its own method
+FAR_BEYOND = 0.3  # the run continues with its own method only at this distance beyond a singular position, or farther
 
 
 def requires_crossing(run: Run, code: int) -> bool:

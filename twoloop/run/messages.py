@@ -81,8 +81,8 @@ INITIAL_FACTOR = 0.1  # `initial_direction` times this is added to the last eige
 # the dominant eigenvalue is negative if the cosine between a direction and its image is below -MIN_ALIGNMENT
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# median of h * rate / limit over the samples from which on a problem counts as stiff. `rate`: fastest rate of vibration
-# or decay; `limit`: largest stable h * rate. In smooth motion the median is 0.4
+# a problem counts as stiff if the median of h * rate / limit over the samples is at least this. `rate`: fastest rate of
+# vibration or decay; `limit`: largest stable h * rate. In smooth motion the median is 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -197,14 +197,14 @@ def _dominant_eigenvalue(
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not to be trusted if rounding errors of velocities (or accelerations) exceed this number of tolerances
 MAX_LASTING_ERROR = 100.0
-# ratio of singular values up to which constraints do not determine the velocities at the end of a run
+# constraints do not determine the velocities at the end of a run if the ratio of singular values is at most this
 MAX_RATIO_AT_END = 1e-6
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
 CROSSINGS_MARK = "\0"  # stands in a message for the description of the singular positions that were crossed
-# time left, relative to the duration of the run, up to which a message mentions that the end is near
+# a message mentions that the end is near if the time left is at most this fraction of the duration of the run
 NEAR_END = 1e-3
 
 _FAILURE_REASONS = {

@@ -29,10 +29,11 @@ from twoloop.run.workspace import fixed_order_form, make_kit, workspace
 
 Array = NDArray[np.float64]
 
-MIN_SINE = 1e-5  # smallest sine of the angle between a row of C_q and the other rows away from dead centres
+MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle between a row of C_q and the other rows is below this
 # MAX_CORRECTIONS: largest number of Newton iterations; ROUNDING: correction that ends them, relative to max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# largest distance of a projection on the same assembly from its prediction by C_q, relative to the guess's displacement
+# a guess is on the same assembly if its projection differs from the prediction by C_q by at most this fraction of the
+# displacement of the guess
 MAX_NONLINEARITY = 0.5
 
 
@@ -182,12 +183,12 @@ def _nearby_guesses_match(projection: _SparseProjection, position: Array, change
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
 CONVERGED_VIOLATION = 1e-2  # violation that ends the iteration, relative to the violation allowed at a start
-# singular values, relative to the largest, below which they count as zero: RANK_CUTOFF for ranks, LSTSQ_CUTOFF for
-# least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
+# singular values count as zero if they are below this fraction of the largest one: RANK_CUTOFF for ranks, LSTSQ_CUTOFF
+# for least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 # a dead centre is near if the ratio of the smallest to the largest singular value is at most this
 DEAD_CENTRE_RATIO = 0.01
-# distance up to which two positions count as equal, relative to the largest change by the projection
+# two positions count as equal if their distance is at most this fraction of the largest change by the projection
 MAX_EQUAL_DISTANCE = 0.1
 MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in units of `Scales.columns`
 

@@ -46,7 +46,7 @@ FIRST_CHUNK_IN_PYTHON = 64  # largest number of attempts in the first chunk if c
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
 TRIAL_STEPS = 10  # number of first steps; if one of them is short, a method that needs long steps is replaced
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the fixed-order form
-CONTRADICTION = 1e-6  # smallest residual of a row of C_q a = gamma, relative to its terms, that contradicts other rows
+CONTRADICTION = 1e-6  # a row of C_q a = gamma contradicts other rows if its residual exceeds this fraction of its terms
 
 
 class Run:

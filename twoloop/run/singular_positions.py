@@ -25,7 +25,9 @@ N_POSITIONS = 33  # number of positions between two states at which a ratio of s
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DISPLACEMENT = 1e-6
-MIN_ROW_NORM = 0.1  # smallest divisor of a row, relative to the norm expected from the derivative of the row
+# rows are divided by their norm, or by this fraction of the norm expected from the derivative of the row if that is
+# larger
+MIN_ROW_NORM = 0.1
 # velocities have jumped if their change exceeds both JUMP_RATIO times the change that accelerations explain and
 # MIN_JUMP times the tolerances
 JUMP_RATIO, MIN_JUMP = 3.0, 10.0
@@ -193,7 +195,8 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-# singular value, relative to the largest, up to which rounding errors are estimated along its singular vector
+# rounding errors are estimated along the singular vectors whose singular value is at most this fraction of the largest
+# one
 WEAK_RATIO = 1e-2
 # SMALL_PIVOT: with smaller ratios of pivots, rounding errors are always estimated; PIVOT_FACTOR: typical ratio of
 # pivots, divided by the ratio of singular values

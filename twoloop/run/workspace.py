@@ -109,12 +109,11 @@ def _derivative_entries(
     return entries
 
 
-# eigenvalue of M, relative to the largest one, up to which a direction of a body has no mass
+# a direction of a body has no mass if its eigenvalue of M is at most this fraction of the largest one
 MASSLESS_RATIO = 1e-10
-# smallest norm of a row's component along massless directions, relative to the norm of the row, with which the row can
-# give a body a mass in these directions
+# a row can give a body a mass in massless directions if its component along them is at least this fraction of the row
 MIN_MASSLESS_FRACTION = 1e-3
-# number of coordinates, relative to LARGE, from which on Newton's matrix has sparse factors
+# Newton's matrix has sparse factors if the number of coordinates is at least this multiple of LARGE
 MIN_SIZE_NEWTON = 1.6
 MAX_SHARE = 0.05  # the fixed-order form has at most this share of the entries, and operations, of dense factors
 

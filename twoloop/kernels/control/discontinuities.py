@@ -37,9 +37,9 @@ BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
 TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, relative to the slope times np.spacing(t)
-STEEPNESS = 4.0  # slope of C_t or b in a part of a step, relative to the mean slope, above which the part is a ramp
-MAX_RAMP_SHARE = 0.125  # longest ramp, relative to the step size, at which a step has to end
-MIN_SPACINGS = 8.0  # duration of an interval, in spacings of floating-point numbers, at which its bisection ends
+STEEPNESS = 4.0  # a part of a step is a ramp if the slope of C_t or b exceeds this multiple of the mean slope
+MAX_RAMP_SHARE = 0.125  # a step has to end at a ramp that is at most this fraction of the step size long
+MIN_SPACINGS = 8.0  # bisection ends if an interval is at most this number of spacings of floating-point numbers long
 SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in an interval
 
 
@@ -159,27 +159,31 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-# second difference, relative to the range of the samples, above which a change is sudden (pulses 4 spacings wide)
+# a change is sudden if the second difference exceeds this fraction of the range of the samples (pulses 4 spacings wide)
 SUDDEN_RATIO = 0.1
-LEAST_RANGE = 0.1  # smallest range of samples that is examined, relative to rtol times the largest value so far
-# smallest range of samples that is examined, in any unit: squares of smaller values underflow, and subnormal numbers
-# are too coarsely spaced to look smooth
+# samples are examined only if their range exceeds this fraction of rtol times the largest value so far
+LEAST_RANGE = 0.1
+# samples are examined only if their range exceeds this, in any unit: squares of smaller values underflow, and subnormal
+# numbers are too coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
 # smallest number of samples in a step, because all stages may miss a force that acts for a quarter of the step
 MIN_SAMPLES_IN_STEP = 8.0
-RESAMPLE_BELOW = 0.25  # required spacing, relative to the last one, below which samples ahead are taken again
+# samples ahead are taken again if the required spacing is less than this fraction of the last one
+RESAMPLE_BELOW = 0.25
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
-EQUAL_CHANGES = 1e-5  # largest time between two changes that count as one, relative to the widest spacing of samples
+# two changes count as one if the time between them is at most this fraction of the widest spacing of samples
+EQUAL_CHANGES = 1e-5
 # time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
 # at zero, such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
-# smallest ratio of a sudden change to the changes next to it; a smooth slope has a smaller ratio
+# a change is sudden only if it exceeds this multiple of the changes next to it: a smooth slope does not
 MIN_STEEPNESS_RATIO = 2.0
-SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
+# a discontinuity is suspected if a step is shorter than this fraction of the longest of the last steps
+SHORT_STEP = 0.5
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
-# change of an acceleration, relative to the largest acceleration, while a velocity changes by its tolerance, above
-# which the acceleration decays, see _acceleration_lasts
+# an acceleration decays if it changes by more than this fraction of the largest acceleration while a velocity changes
+# by its tolerance, see _acceleration_lasts
 MAX_LASTING_CHANGE = 0.5
 CHANGE_MARGIN = 0.01  # a change up to this time after a step's beginning, in spacings of samples, counts as passed
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes, after the samples, that stores the largest |value| of each column

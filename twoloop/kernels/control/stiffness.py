@@ -55,9 +55,9 @@ from twoloop.kernels.linalg.dense import copy
 # estimates, which take about eight evaluations each. For the explicit method, both are multiplied by COST_RATIO
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
-NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if step size times eigenvalue is smaller than this
+NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if the step size times the eigenvalue is smaller than this
 ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
-STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability must limit the step of the explicit method
+STABILITY_LIMIT = 3.0  # if h rho exceeds this multiple of LIMIT, stability must limit the step of the explicit method
 # if the Jacobian is computed by finite differences (about eight evaluations per coordinate), a trial that may not pay
 # begins only when the run has cost more than this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
@@ -65,21 +65,23 @@ TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in eva
 # a trial that may not pay begins only if the run so far has cost at least as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
-# cost of the run, in units of MIN_COST_IN_TRIALS trials, at which a trial begins whatever the rates are. After k
-# trials, the next one begins at k + 1 times this cost
+# a trial begins whatever the rates are if the run has cost more than this multiple of MIN_COST_IN_TRIALS trials. After
+# k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # ratio of rho to the rate of the motion above which rho is a hidden rate
-QUIET_FACTOR = 10.0  # largest velocity, in tolerances, of oscillations that steps at the stability limit excite
-# ratio of h rho to LIMIT above which an implicit method may allow longer steps because a hidden rate is damped
+MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds this multiple of the rate of the motion
+# oscillations that steps at the stability limit excite have velocities of at most this number of tolerances
+QUIET_FACTOR = 10.0
+# an implicit method may allow longer steps, because a hidden rate is damped, if h rho exceeds this multiple of LIMIT
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
-RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
+RETURN_BELOW = 0.4  # the explicit method is tried again if h rho is below this multiple of LIMIT
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method
 TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # ratio of the cost per second before a trial to that on trial above which the trial has succeeded
+# a trial has succeeded if the cost per second before it is at least this multiple of the cost per second in it
+MIN_GAIN = 1.2
 N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial

@@ -36,7 +36,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
-RANK_TOLERANCE = 1e-11  # largest pivot that counts as zero, for rows scaled to 1
+RANK_TOLERANCE = 1e-11  # a pivot counts as zero if it is at most this, for rows scaled to 1
 PARTITION_CHANGED = -1  # code returned instead of DONE if a new partition has been adopted
 # largest number of rows of G that min_pivot_ratio eliminates: with more rows, the elimination takes too long
 MAX_ROWS_ELIMINATED = 200
@@ -360,7 +360,7 @@ def partition_is_poor(w):
 
 
 MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
-CONTRACTION = 0.5  # largest ratio of a correction to the previous one at which an iteration counts as convergent
+CONTRACTION = 0.5  # an iteration counts as convergent if each correction is at most this fraction of the previous one
 ROUNDING_OF_CORRECTIONS = 1e-12  # largest correction due to rounding alone, relative to the largest coordinate
 # factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding, because small parts amplify errors:
 # the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more

@@ -65,9 +65,10 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-# pivot, relative to the size of its row, below which the row is checked, because the pivot may be a rounding error
+# a row is checked if its pivot is below this fraction of its size: the pivot may be a rounding error
 SUSPECT_PIVOT = 1e-6
-MIN_PIVOT = 1e-10  # smallest pivot, relative to the size of its row, with which factors by 1-by-1 pivots are accurate
+# factors by 1-by-1 pivots are accurate if each pivot is at least this fraction of the size of its row
+MIN_PIVOT = 1e-10
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular near a singular position, where stages must be projected
 # solutions are refined once if the smallest pivot, relative to the size of its row, is at most REFINE_ONCE_BELOW, and
@@ -255,7 +256,7 @@ def choose_rows(f, w, t, q):
 
 
 REGULARIZATION = 1e-11  # diagonal entries of W (module docstring), relative to the sums of squares of the columns of G
-CONVERGED_RESIDUAL = 1e-14  # residual of G^T lam = b, relative to max|b|, at which the refinement ends
+CONVERGED_RESIDUAL = 1e-14  # the refinement ends if the residual of G^T lam = b is at most this fraction of max|b|
 MAX_RESIDUAL = 1e-9  # largest residual of G^T lam = b, relative to max|b|, that is accepted if it no longer decreases
 MAX_SOLUTIONS = 30  # largest number of linear solutions in the refinement of multipliers of least norm
 

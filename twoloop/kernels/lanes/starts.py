@@ -21,7 +21,7 @@ from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, 
 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
-MAX_REDUNDANT_EIGENVALUE = 1e-4  # largest eigenvalue of G G^T whose combination of rows counts as redundant
+MAX_REDUNDANT_EIGENVALUE = 1e-4  # a combination of rows counts as redundant if its eigenvalue of G G^T is at most this
 # number of inverse iterations for each row of Z: few, because redundant combinations have much smaller eigenvalues
 N_REDUNDANT_ITERATIONS = 5
 # multiples of this number, modulo 1, are irregular start values of inverse iterations
@@ -211,10 +211,10 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# largest difference between the projection of displaced positions and its linear prediction by C_q, relative to the
-# displacement, with which no other assembly can be as near
+# no other assembly can be as near if the projection of displaced positions differs from its linear prediction by C_q by
+# at most this fraction of the displacement
 MAX_CURVATURE = 0.25
-MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
+MIN_EIGENVALUE = 1e-12  # rows of norm 1 count as independent if all eigenvalues of G G^T are at least this
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
 # displacements of other guesses from the projected positions, as two factors: on the change from the first guess to the

@@ -9,7 +9,7 @@ from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ld
 
 # rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# squared norm of the orthogonal part of a row, relative to the whole row, below which it is orthogonalised again
+# a row is orthogonalised again if the squared norm of its orthogonal part is below this fraction of that of the row
 REORTHOGONALISE_BELOW = 0.5
 
 
@@ -152,13 +152,13 @@ TINY = 1e-300  # divisor that replaces zero
 # is orthogonal to the rows before it is at least 3e-9 of the row; for a dependent row, this part must be at most
 # DEPENDENT
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
-# coefficient of an independent row in a redundant row, both scaled to norm 1, above which the two rows are exchanged.
-# If a coefficient passes through zero during the motion, the independent rows become dependent, as at each dead centre
-# of the slider-crank with two rods: rows with large coefficients should be independent. The limit exceeds 1, because
-# equal coefficients of magnitude 1 are common, and must not lead to exchanges
+# an independent row and a redundant row, both scaled to norm 1, are exchanged if the coefficient of the first in the
+# second exceeds this. If a coefficient passes through zero during the motion, the independent rows become dependent, as
+# at each dead centre of the slider-crank with two rods: rows with large coefficients should be independent. The limit
+# exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
 MAX_COEFFICIENT = 1.5
-# ratio up to which two coefficients count as equal, and the first row is chosen: in symmetrical mechanisms, rounding
-# would choose among many equal coefficients, differently at each start
+# if the ratio of two coefficients is at most this, they count as equal, and the first row is chosen: in symmetrical
+# mechanisms, rounding would choose among many equal coefficients, differently at each start
 TIE_RATIO = 1.01
 # largest entry of a row, relative to its largest entry, that counts as zero: rounding of a start leaves such entries
 ZERO_ENTRY = 1e-12

@@ -241,10 +241,9 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-# smallest number of rows, and of degrees of freedom, with which the augmented form is fastest (measured: 7)
-MIN_ROWS = 8
-# smallest number of coordinates with which the augmented form is fastest with any number of degrees of freedom, unless
-# M is diagonal (measured: about 30)
+MIN_ROWS = 8  # the augmented form is fastest if there are at least this many rows and degrees of freedom (measured: 7)
+# with at least this many coordinates, the augmented form is fastest with any number of degrees of freedom, unless M is
+# diagonal (measured: about 30)
 MIN_COORDINATES = 32
 
 

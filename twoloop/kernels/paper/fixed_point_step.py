@@ -110,7 +110,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-# largest END_ERROR_WEIGHT * estimate_end_error with which paper_step accepts a step; the paper has no such limit
+# a step is accepted only if END_ERROR_WEIGHT * estimate_end_error is at most this; the paper has no such limit
 SUDDEN_ERROR = 10.0
 
 

@@ -52,8 +52,8 @@ ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error in the step size
 PROJECTION_WEIGHT = 0.5
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning
-# smallest allowed pivot at the end of a step, relative to the limit below which nodes are left out; a smaller pivot is
-# allowed, too, if it is at least that at the beginning of the step
+# the pivot at the end of a step must be at least this multiple of the limit below which nodes are left out, or at least
+# the pivot at the beginning of the step
 END_MARGIN = 4.0
 # error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
 REPEAT_FACTOR = 2.0

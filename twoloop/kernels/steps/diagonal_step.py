@@ -175,9 +175,10 @@ def filter_dense_error(w, memory, z, e_q, e_v):
 
 
 MAX_ITERATIONS = 8  # largest number of Newton iterations of a stage: if they do not converge, the step fails
-DIVERGENCE_RATIO = 2.0  # ratio of successive corrections above which Newton's method has diverged
+DIVERGENCE_RATIO = 2.0  # Newton's method has diverged if a correction exceeds this multiple of the previous one
 LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences, with which convergence is linear
-MAX_CONTRACTION = 0.1  # ratio of successive corrections above which derivatives by differences are computed anew
+# derivatives by differences are computed anew if a correction exceeds this fraction of the previous one
+MAX_CONTRACTION = 0.1
 VELOCITY_WEIGHT = 0.1  # weight in the convergence test of the position error caused by a correction of velocities
 
 

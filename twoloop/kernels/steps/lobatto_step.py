@@ -48,13 +48,15 @@ START_CONTRACTION = 0.12  # contraction rho for which the first step size is cho
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
-MAX_LIMITED = 24.0  # value of LIMITED at which the motion counts as stiff, and another method takes over
-MIN_CURVATURE = 0.1  # value of CURVATURE below which accelerations hardly vary within a step
+MAX_LIMITED = 24.0  # the motion counts as stiff, and another method takes over, if LIMITED reaches this value
+MIN_CURVATURE = 0.1  # accelerations hardly vary within a step if CURVATURE is below this value
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
-MIN_PIVOT_RATIO = 0.4  # pivot, relative to that at the beginning of a step, below which a singular position is near
-# tolerance below which another method takes over after a singular position: otherwise five more runs of A02 are wrong
+# a singular position is near if a pivot falls below this fraction of the pivot at the beginning of the step
+MIN_PIVOT_RATIO = 0.4
+# with a tolerance below this, another method takes over after a singular position: otherwise five more runs of A02 are
+# wrong
 TIGHT_TOLERANCE = 1e-8
-# value of FAILURES, to which a step without convergence adds 2, at which another method takes over
+# another method takes over if FAILURES, to which a step without convergence adds 2, reaches this value
 MAX_FAILURES = 12.0
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps

@@ -72,7 +72,7 @@ from twoloop.kernels.steps.stages import (
 )
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
-# relative difference up to which step sizes count as equal, because rounding errors of times change them
+# step sizes count as equal up to this relative difference, because rounding errors of times change them
 EQUAL_STEP_TOLERANCE = 1e-9
 # largest Newton correction, relative to the smallest tolerance, that counts as a rounding error if it does not decrease
 MAX_ROUNDING_CORRECTION = 0.1
@@ -511,8 +511,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# largest difference between the predicted and the actual change of a residual, relative to the sum of the absolute
-# terms of the prediction, for a complete sparsity pattern
+# the sparsity pattern is complete if the change of the residual differs from the predicted change by at most this
+# fraction of the sum of the absolute terms of the prediction
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
