@@ -254,18 +254,19 @@ CONFIRM_RATIO, N_WIDER, N_NARROWER = 4.0, 8, 24
 BESIDE = (0.55, 1.8, 3.1)  # half-widths that confirm an estimate first, relative to its own
 RIPPLES = 3  # number of narrower intervals after which a smooth function shows only rounding
 LEAST_SPACINGS = 256.0  # smallest half-width, in spacings of floating-point numbers at the point
-# difference, relative to an entry and including its estimated error, below which no other half-width is tried
+# no other half-width is tried if the difference, with its estimated error, is below this fraction of the entry
 SETTLED = 2e-7
-AGREEMENT = 3e-7  # difference, relative to an entry, below which the entry is not wrong
-DECAYED = 0.01  # largest ratio of the last coefficients to the first, for a function that the points resolve
-# ratio of the last two coefficients to those before, if not all are rounding, above which the function has a ripple
+AGREEMENT = 3e-7  # an entry is not wrong if the difference is below this fraction of it
+DECAYED = 0.01  # the points resolve a function if its last coefficients are at most this fraction of the first
+# a function has a ripple if the ratio of its last two coefficients to those before, if not all are rounding, exceeds
+# this
 RIPPLE = 0.2
-CONSTANT = 100.0  # variation of a function, in rounding errors, below which it counts as constant
+CONSTANT = 100.0  # a function counts as constant if it varies by less than this number of rounding errors
 SAFETY = 5.0  # ratio of the allowed difference to the estimated error of the difference
 # largest ratio, in rounding errors of the result, by which terms within a function may exceed its result
 FROZEN = 1e4
 FLAT = 3  # number of intervals of different widths on which a function must be constant for the derivative 0
-TINY = 1e-12  # magnitude, relative to the largest entry, below which an entry counts as zero
+TINY = 1e-12  # an entry counts as zero if it is below this fraction of the largest entry
 
 
 @dataclass(frozen=True)

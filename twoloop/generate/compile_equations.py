@@ -36,9 +36,10 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# largest relative error of accelerations at a start with which generated code is used: in runs it grew up to 200 times
+# generated code is used only if the relative error of accelerations at the start is at most this: in runs it grew up to
+# 200 times
 LARGEST_LOSS = 1e-8
-# number of positions, and their distance, at which a measurement of this error is tried until pivots are large enough
+# this error is measured at up to this number of positions, at this distance, until pivots are large enough
 MAX_POSITIONS, DISTANCE = 4, 0.02
 
 
@@ -171,7 +172,7 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# number of operations above which equations are split into functions, which halves the time to compile. SPLIT_ALL: the
+# equations with more operations than this are split into functions, which halves the time to compile. SPLIT_ALL: the
 # number if there is no reduced program for the accelerations, which are then split, too, and run 50 % longer
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 

@@ -44,26 +44,28 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # ratio of the smallest to the largest eigenvalue of M below which rows of G are added to M
+SINGULAR_MASS = 1e-10  # rows of G are added to M if the ratio of its smallest to its largest eigenvalue is below this
 RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
-PIVOT_FRACTION = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
+PIVOT_FRACTION = 0.01  # the pivot of a row of G must be at least this fraction of the smallest pivot at the start
 # possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to its pivot without
 # the other rows; with pivots below the last value, rounding errors would dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
-# smallest pivots at a start for which MIN_PIVOTS[i] is chosen: i is the first index with START_LIMITS[i] at or below
-# the smallest pivot; without such an index, MIN_PIVOTS[-1] is chosen
+# MIN_PIVOTS[i] is chosen for the first i for which the smallest pivot at the start is at least START_LIMITS[i]; if
+# there is none, MIN_PIVOTS[-1] is chosen
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-N_FEW_COORDINATES = 24  # largest number of coordinates for which MIN_INDEX_FEW, not MIN_INDEX_MANY, applies
-# smallest index in MIN_PIVOTS, that is, largest pivots, at which all rows of G may be added to M. MIN_INDEX_FEW: with
-# up to N_FEW_COORDINATES coordinates. MIN_INDEX_FEW_SINGULAR: if M is singular as well, because Euler parameters lose
-# two digits even in sound models. MIN_INDEX_MANY: with more coordinates, because the code gets longer
+N_FEW_COORDINATES = 24  # with more coordinates, MIN_INDEX_MANY replaces MIN_INDEX_FEW
+# all rows of G may be added to M if the index of the chosen entry of MIN_PIVOTS is at least this, that is, if pivots
+# are small. MIN_INDEX_FEW: with up to N_FEW_COORDINATES coordinates. MIN_INDEX_FEW_SINGULAR: if M is singular as well,
+# because Euler parameters lose two digits even in sound models. MIN_INDEX_MANY: with more coordinates, because the code
+# gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
-MAX_PIVOT_RATIO = 1e5  # largest ratio of an entry of M, with added rows, to its pivot that needs no refinement
+# no refinement is needed if entries of M, with added rows, are at most this multiple of their pivots
+MAX_PIVOT_RATIO = 1e5
 SCALE_STEP = 1024.0  # scales of added rows differ by powers of this factor, which rarely change from start to start
 DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
 MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number
-# smallest number of rows of G per coordinate with which dependent coordinates are eliminated; with fewer rows, the
+# dependent coordinates are eliminated if there are at least this many rows of G per coordinate; with fewer rows, the
 # linear system for the multipliers is the smaller one
 MIN_ROW_RATIO = 2.0 / 3.0
 
@@ -278,8 +280,8 @@ def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
 
 
 MAX_OPERATIONS = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
-# largest cost of `reduced_program`, relative to `mass_first_program`, at which the reduced program is compiled, too:
-# where pivots become small, only the other is valid. At a relative cost of 0.68 (four-bar) it saves 5 % of a run
+# the `reduced_program` is compiled, too, if it costs at most this fraction of `mass_first_program`: where pivots become
+# small, only the other is valid. At a relative cost of 0.68 (four-bar) it saves 5 % of a run
 MAX_COST_RATIO = 0.75
 
 

@@ -19,9 +19,8 @@ import numpy as np
 
 from twoloop.generate.graph import Affine, is_zero
 
-# largest change of accelerations by a step of refinement, relative to their size, after which they are valid. Their
-# error is then mostly the square of this change, but as large as the change if a part of little inertia loses all
-# digits
+# accelerations are valid if a step of refinement changes them by at most this fraction. Their error is then mostly the
+# square of this change, but as large as the change if a part of little inertia loses all digits
 LARGEST_CHANGE = 1e-7
 
 
@@ -186,7 +185,7 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
 PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
 Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
-# smallest allowed square of a pivot over the norm of the entries that it divides, of a pivot over the norm of its
+# lower limit of three squares: of a pivot over the norm of the entries that it divides, of a pivot over the norm of its
 # column, and of the sine of the angle between the two columns of a block. A ratio of 10^-k costs up to 3 k digits of
 # accelerations. The choice at a start has stricter limits, see linalg/dependent_columns.py
 MIN_PIVOT_SQUARE = 0.03**2

@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a traced function of the user is compared with calls of the function
 TIME_SPACING = 0.37  # time between successive compared states, s: unlikely to be a period of a force
-MAX_TRACE_DIFFERENCE = 1e-10  # largest relative difference between trace and call that counts as a rounding error
+MAX_TRACE_DIFFERENCE = 1e-10  # up to this relative difference between trace and call, a rounding error may be the cause
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
@@ -227,7 +227,7 @@ class OperationTable(NamedTuple):
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
 LITERALS = (0.0, 1.0, -1.0)  # values of coefficients that are literals in the code, as they need no multiplication
-LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference from 1 or -1 at which a coefficient counts as this literal
+LITERAL_TOLERANCE = 8.0 * 2.0**-52  # a coefficient counts as the literal 1 or -1 if it differs from it by at most this
 
 
 class Coefficient(float):

@@ -23,7 +23,8 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-# largest number of entries of M and [C_q; A] for which series are traced, unless the user chooses the Taylor method
+# series are traced only if M and [C_q; A] have at most this number of entries, unless the user chooses the Taylor
+# method
 MAX_ENTRIES = 200_000
 
 # callbacks from which a series is derived

@@ -27,15 +27,16 @@ TIME_CALLBACKS = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks 
 # callbacks whose dependence on the state is analysed
 STATE_CALLBACKS = ("force", "mass", "constraint", "jacobian", "nonholonomic")
 SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # operations without short pulses if degrees are at most MAX_DEGREE
-# largest degree of polynomials in time, or in sines and cosines, without short pulses; cos(t)**100 has pulses
+# polynomials in time, or in sines and cosines, have no short pulses up to this degree; cos(t)**100 has pulses
 MAX_DEGREE = 8
-MAX_DEGREE_OF_STATE = 32  # largest degree of polynomials in q and v, and of their roots, without short pulses
-MAX_DEGREE_OF_DIVISOR = 4  # largest total degree, in q and v, of the divisors of a quotient without short pulses
-# exponent of the fastest decay, for large x, of quotients without short pulses, such as 1 / (1 + (x / w)**2)
+MAX_DEGREE_OF_STATE = 32  # polynomials in q and v, and their roots, have no short pulses up to this degree
+# a quotient has no short pulses if the total degree of its divisors, in q and v, is at most this
+MAX_DEGREE_OF_DIVISOR = 4
+# a quotient has no short pulses if it decays, for large x, at most with this exponent, as 1 / (1 + (x / w)**2) does
 FASTEST_DECAY = -2.0
-# largest derivative of the argument of a sine, rad per unit of a coordinate or velocity, that long steps resolve
+# long steps resolve a sine if its argument changes by at most this, rad, per unit of a coordinate or velocity
 MAX_RATE = 4.0
-# largest number of coordinates for which callbacks are traced for this analysis: with more, tracing may take seconds,
+# callbacks are traced for this analysis only with at most this many coordinates: otherwise tracing may take seconds,
 # ten times as long as sampling the forces during a run
 MAX_COORDINATES = 300
 TIME_MASK = 1  # bit mask of t, the first input of a graph

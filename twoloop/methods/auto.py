@@ -14,30 +14,31 @@ from twoloop.methods.plan import Method, Plan, cached_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
-MANY_COORDINATES = 16  # number of coordinates from which on evaluations may cost more than the algebra of Adams' method
-# largest number of constraints per coordinate at which Adams replaces DOP853 from MANY_COORDINATES on: with more
-# constraints, projections cost more than evaluations
+MANY_COORDINATES = 16  # from this number of coordinates on, evaluations may cost more than the algebra of Adams' method
+# from MANY_COORDINATES on, Adams replaces DOP853 if there are at most this many constraints per coordinate: with more,
+# projections cost more than evaluations
 MAX_CONSTRAINT_RATIO = 0.25
-ADAMS_TOLERANCE = 1e-10  # tolerance below which Adams replaces DOP853 from MANY_COORDINATES on
-VERY_MANY_COORDINATES = 64  # number of coordinates from which on Adams replaces DOP853, except with sparse matrices
-MAX_NEWTON_COORDINATES = 1000  # largest number of coordinates for which Newton's method, with full matrices, is tried
+ADAMS_TOLERANCE = 1e-10  # Adams replaces DOP853 from MANY_COORDINATES on if the tolerance is below this
+VERY_MANY_COORDINATES = 64  # Adams replaces DOP853 from this number of coordinates on, except with sparse matrices
+MAX_NEWTON_COORDINATES = 1000  # Newton's method, with full matrices, is tried up to this number of coordinates
 # tolerance whose rule for the choice of a series also applies at looser ones if the other methods need short steps
 SHORT_STEP_TOLERANCE = 1e-9
-SERIES_TOLERANCE = 1e-6  # tolerance below which a Taylor series may cost less than DOP853
-MAX_OPERATIONS = 12  # largest number of operations per coordinate at which a Taylor series costs less than DOP853
+SERIES_TOLERANCE = 1e-6  # a Taylor series may cost less than DOP853 if the tolerance is below this
+MAX_OPERATIONS = 12  # a Taylor series costs less than DOP853 if it takes at most this many operations per coordinate
 # replaces MAX_OPERATIONS below FEW_COORDINATES, and for at least MANY_COORDINATES at looser tolerances
 MAX_OPERATIONS_FEW = 8
-FEW_COORDINATES = 5  # number of coordinates below which MAX_OPERATIONS_FEW replaces MAX_OPERATIONS
+FEW_COORDINATES = 5  # with fewer coordinates, MAX_OPERATIONS_FEW replaces MAX_OPERATIONS
 SERIES_TOLERANCE_MANY = 1e-8  # replaces SERIES_TOLERANCE from MANY_COORDINATES on with generated code
-LOOSE = 3e-5  # tolerance from which on stiff motion is integrated by the method for few digits
-TIGHTEST = 9e-7  # tolerance below which stiff motion is integrated by the method for many digits
-# h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams. h: step size, rho: largest rate of motion
+LOOSE = 3e-5  # from this tolerance on, the method for few digits integrates stiff motion
+TIGHTEST = 9e-7  # below this tolerance, the method for many digits integrates stiff motion
+# if h rho is at least this, stiffness may limit DOP853 (stable to 5.9) and Adams. h: step size, rho: largest rate of
+# motion
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25
 LIMIT_FEW_OF_MANY = 2.0  # replaces LIMIT_FEW from MANY_COORDINATES on, where evaluations cost more than a trial
 # number of successive estimates of h rho above the limit before a trial, as accuracy may allow a few long steps; for
 # Adams, and with LIMIT_FEW_OF_MANY, one estimate is enough
 ESTIMATES_FEW = 2
-# h rho / order from which on stiffness may limit a series, which is stable to 0.42 (decay) or 0.6 (vibration)
+# if h rho / order is at least this, stiffness may limit a series, which is stable to 0.42 (decay) or 0.6 (vibration)
 LIMIT_SERIES = 0.3
 COST_RATIO = 4.0  # estimated cost of an evaluation without generated code, in evaluations with generated code
 # COST_RATIO_HEAVY replaces COST_RATIO if callbacks take at least MANY_OPERATIONS per coordinate: these operations cost

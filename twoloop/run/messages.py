@@ -237,7 +237,9 @@ def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, 
 def reject_velocity_jumps(
     run: "Run", last_step: list[TimedState], output_states: list[TimedState], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Return `status` and `message`, or RANK_LOST and a reason if rounding or a change of branch changed velocities.
+    """Check whether rounding, or a change of branch, has changed velocities near a singular position.
+
+    If so, return RANK_LOST and a reason, else `status` and `message`.
 
     `last_step`: [state before the last step] if velocities jumped in that step. `output_states`: those at output times.
     """
