@@ -191,7 +191,7 @@ def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
 
 
 @merged
-def _can_take_many(control, clock):
+def _can_take_many_steps(control, clock):
     """Return whether the method may take many steps in one call, without any checks by the loop between these steps."""
     if control[at.TAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
@@ -235,7 +235,7 @@ def advance(
             return at.PAUSED
         if w.n_accepted >= control[at.MAX_STEPS]:
             return at.MAX_STEPS_REACHED
-        if _can_take_many(control, clock):
+        if _can_take_many_steps(control, clock):
             first, target = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
             goal = min(target, clock[at.JUMP_FROM])
             if min(out_t.size - first, out_steps.shape[0] - filled[1]) < LANES and first + filled[1] > 0:

@@ -197,7 +197,7 @@ OF_PYTHON = 100
 
 
 @merged
-def _has_same_choices(b):
+def _has_choices_of_code(b):
     """Choose rows and dependent coordinates at a start; return whether the generated code has the same choices."""
     b.scratch[0] = 0.0
     first_bound = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
@@ -272,7 +272,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, checks):
     if b.expected.size > 0 and checks < CHOICES_CHECKED:
         if b.expected[BOUND] == OF_PYTHON:
             return UNCHOSEN
-        if not _has_same_choices(b):
+        if not _has_choices_of_code(b):
             return REFUSED
     copy(b.start_numbers, b.numbers)
     for j in range(b.state.size):
@@ -319,7 +319,7 @@ NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started yet; the dat
 
 
 @exact
-def _is_last_start(last_start, t, t1, q, v):
+def _equals_last_start(last_start, t, t1, q, v):
     """Return whether the start (t, t1, q, v) equals `last_start` bit for bit, and store it in `last_start`."""
     n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
@@ -385,7 +385,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, checks):
     and later runs restore these data without a check. For the arguments see _start_run and _write_report.
     """
     f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
-    is_repeated, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
+    is_repeated, n_equal = _equals_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
     if is_repeated and n_equal == IS_SAVED:
         _restore_start(b)
     else:

@@ -207,7 +207,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 
 @merged
-def _max_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
+def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
     """Return the largest entry of scale_q |q - q_other| and scale_v |v - v_other|, in tolerances at state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
@@ -276,7 +276,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
                 _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
                 shorter_size = size_v - 2 if kind == kinds.SEPARATE else 0
                 _evaluate_polynomials(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter_size, q_1, v_1)
-                out[g] = max(out[g], _max_difference(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
+                out[g] = max(out[g], _state_difference(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
             if out[g] <= 1.0 or kind == kinds.VELOCITIES:
                 continue
         out[g] = 0.0
@@ -295,13 +295,13 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
                 if code == DONE:
                     code = restore_constraints(f, w, time, rows[2, :n], rows[2, n:], tolerance)
             if code == DONE:
-                out[g] = max(out[g], _max_difference(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
+                out[g] = max(out[g], _state_difference(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
                 code = accelerations(f, w, time, rows[2, :n], rows[2, n:], q_1, w.lam)
             if code != DONE:
                 out[g] = np.inf
                 break
             dt = h / size
-            out[g] = max(out[g], _max_difference(tolerances, dt * dt, dt, states, i, v_1, v_1, q_1, q_1))
+            out[g] = max(out[g], _state_difference(tolerances, dt * dt, dt, states, i, v_1, v_1, q_1, q_1))
         if not np.isfinite(out[g]):
             out[g] = np.inf
     return DONE

@@ -185,7 +185,7 @@ class CachedIntegrator:
             n = self._start_and_advance(*start, loops.NOTHING_CHECKED)
             if n == loops.IN_DOUBT and is_consistent(self.evaluation.system, t0, q0, v0):
                 n = self._start_and_advance(*start, loops.STATE_CHECKED)
-            if n == loops.UNCHOSEN and self._has_same_choice(t0, q0):
+            if n == loops.UNCHOSEN and self._pivots_suit_start(t0, q0):
                 n = self._start_and_advance(*start, loops.CHOICES_CHECKED)
         except Exception as error:  # raised by a callback: `IntegrationLoop` will handle it
             if raised_by_handler(error):
@@ -217,7 +217,7 @@ class CachedIntegrator:
         region.count_run()  # runs that `IntegrationLoop` has continued are counted by `check_callbacks_along_run`
         return fields
 
-    def _has_same_choice(self, t0: float, q0: Array) -> bool:
+    def _pivots_suit_start(self, t0: float, q0: Array) -> bool:
         """Return whether the pivots of the code suit the start (T0, Q0), whose M and G are in the arrays."""
         system, arrays = self.evaluation.system, self.arrays
         system.remember_at("mass and rows", (t0, q0.tobytes()), (arrays.mass.copy(), arrays.rows.copy()))
@@ -536,14 +536,14 @@ def set_up(
         if run.system is system:
             _share_setup(system, run, code, t1, options)
     new, added = not entries or last_code == id(code) if entry is None else last_start == start != entry.start, None
-    if new and (added := _new_entry(run, code, t1, options)) is not None:
+    if new and (added := _make_cache_entry(run, code, t1, options)) is not None:
         runs = {} if len(runs) == MAX_OPTIONS else dict(runs)  # a copy, because another thread may read the dict
         runs[key] = added, *[each for each in entries if each is not entry][: MAX_ENTRIES - 1]
     system.derived["runs"] = start, runs, id(code) if entry is None else None
     return run, added
 
 
-def _new_entry(run: Run, code: GeneratedCode | None, t1: float, options: Options) -> CacheEntry | None:
+def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: Options) -> CacheEntry | None:
     """Return the cache entry of a run at its start, or None if the run cannot be cached."""
     system, n = run.system, run.system.n_q
     is_trusted = identity(options.method) is not None and all(traced.is_trusted for traced in run.traced)
@@ -575,7 +575,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
     if key not in cached:
         system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {key: functions}
     elif type(cached[key]) is type(functions) and cached[key] is not functions:
-        entry = _new_entry(run, code, t1, options)
+        entry = _make_cache_entry(run, code, t1, options)
         if entry is not None and entry.idle is not None:
             has_fixed_step = options.step_size is not None
             with suppress(ValueError):

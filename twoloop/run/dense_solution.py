@@ -164,11 +164,11 @@ class Interpolator:
         failures = 0
         undivided = []
         for block in _blocks_of_groups(groups):
-            self._divide_where_needed(table, block)
-            divided, divided_groups, other_groups = self._split_divided(table, block)
-            failures += self._interpolate(divided, divided_groups, times, out)
+            self._divide_inaccurate_intervals(table, block)
+            divided, divided_groups, other_groups = self._separate_divided_intervals(table, block)
+            failures += self._interpolate_groups(divided, divided_groups, times, out)
             undivided.append(other_groups)
-        failures += self._interpolate(table, np.concatenate(undivided), times, out)
+        failures += self._interpolate_groups(table, np.concatenate(undivided), times, out)
         self._record_failures(failures, len(times))
         return out
 
@@ -176,14 +176,14 @@ class Interpolator:
         """Return a function that returns the row [q, v] at any time in that interval of `table` which contains t."""
         groups = _interval_groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, indices.END_TIME] = 1
-        self._divide_where_needed(table, groups)
-        divided, divided_groups, other_groups = self._split_divided(table, groups)
+        self._divide_inaccurate_intervals(table, groups)
+        divided, divided_groups, other_groups = self._separate_divided_intervals(table, groups)
         source, group = (divided, divided_groups) if len(divided_groups) else (table, other_groups)
         time, out = np.empty(1), np.empty((1, 2 * self.system.n_q))
 
         def row_at(t: float) -> Array:
             time[0] = t
-            self._record_failures(self._interpolate(source, group, time, out), 1)
+            self._record_failures(self._interpolate_groups(source, group, time, out), 1)
             return out[0].copy()
 
         return row_at
@@ -194,7 +194,7 @@ class Interpolator:
         if failures > 0 and self.warns:
             _warn_of_lost_rank(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
-    def _interpolate(self, table: StateTable, groups: Groups, times: Array, out: Array) -> int:
+    def _interpolate_groups(self, table: StateTable, groups: Groups, times: Array, out: Array) -> int:
         """Store rows [q, v] at the times of the groups in `out` (n, 2 n_q); return the number of failed projections."""
         inputs = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.scratch, out)
@@ -204,7 +204,7 @@ class Interpolator:
             failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
         return failures
 
-    def _divide_where_needed(self, table: StateTable, groups: Groups) -> None:
+    def _divide_inaccurate_intervals(self, table: StateTable, groups: Groups) -> None:
         """Compute and cache interior states of each interval whose polynomial is not accurate without them."""
         start_times = table.t[groups[:, indices.FIRST_OWN]].tolist()
         is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in start_times])
@@ -218,16 +218,19 @@ class Interpolator:
         groups = groups[is_new & (groups[:, indices.KIND] != indices.JUMP)]
         for kind, plan in self.plans.items():
             has_kind = groups[:, indices.KIND] == kind
-            self.interior_states.update(self._divide(table, plan, self.kits[kind], groups[has_kind, indices.FIRST_OWN]))
+            self.interior_states.update(
+                self._divide_intervals(table, plan, self.kits[kind], groups[has_kind, indices.FIRST_OWN])
+            )
         for i in groups[:, indices.FIRST_OWN].tolist():
             if (memory := self.crossing_memories.get(float(table.t[i]))) is not None:
                 self.interior_states[float(table.t[i])] = self._states_in_crossing_step(table, i, memory)
         is_divided = np.array(
             [t in self.interior_states for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool
         )
-        divided, own_groups, undivided = self._split_divided(table, groups)
+        divided, own_groups, undivided = self._separate_divided_intervals(table, groups)
         errors = np.zeros(len(groups))
-        errors[is_divided], errors[~is_divided] = self._errors(divided, own_groups), self._errors(table, undivided)
+        errors[is_divided] = self._estimate_residuals(divided, own_groups)
+        errors[~is_divided] = self._estimate_residuals(table, undivided)
         # if the plan for this kind of interval failed to divide it, the interval is too long for a polynomial
         errors[~is_divided & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
         is_accurate = errors <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
@@ -235,7 +238,7 @@ class Interpolator:
         for k in (~is_accurate).nonzero()[0]:
             self._repair_interval(table, groups[k], float(errors[k]))
 
-    def _errors(self, table: StateTable, groups: Groups) -> Array:
+    def _estimate_residuals(self, table: StateTable, groups: Groups) -> Array:
         """Return estimated residuals (one per group) of the polynomials of intervals, relative to the tolerances."""
         out, groups = np.zeros(len(groups)), np.ascontiguousarray(groups)
         arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.scratch, self.rows, out
@@ -251,7 +254,7 @@ class Interpolator:
         begin = float(table.t[i])
         candidates = (
             lambda: self._cross_interval(table, i),
-            lambda: self._divide(table, *self._repair_plan(kind), np.array([i])).get(begin),
+            lambda: self._divide_intervals(table, *self._plan_for_repair(kind), np.array([i])).get(begin),
             lambda: (table.t[i : i + 2], table.states[i : i + 2]),
         )
         for candidate in candidates:
@@ -260,7 +263,7 @@ class Interpolator:
             new_table = StateTable(np.ascontiguousarray(interior[0]), np.ascontiguousarray(interior[1]), table.kinds)
             new_group, last = group[None, :].copy(), len(new_table.t) - 1
             new_group[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = 0, last, 0, last
-            error = float(self._errors(new_table, new_group)[0])
+            error = float(self._estimate_residuals(new_table, new_group)[0])
             if error < smallest or not np.isfinite(smallest):
                 smallest = error
                 self.interior_states[begin] = new_table.t, new_table.states
@@ -295,7 +298,7 @@ class Interpolator:
         states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]
         return times, states
 
-    def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
+    def _plan_for_repair(self, kind: int) -> tuple[Plan, Any]:
         """Return the plan and the kit of N_REPAIR_STEPS steps for an interval of this kind with a poor polynomial."""
         is_stiff = kind == indices.VELOCITIES
         if is_stiff not in self.repair_plans:
@@ -315,7 +318,7 @@ class Interpolator:
             self.repair_plans[is_stiff] = plan, make_kit(self.system, self.arguments[1], q0, plan, self.fixed_order)
         return self.repair_plans[is_stiff]
 
-    def _split_divided(self, table: StateTable, groups: Groups) -> tuple[StateTable, Groups, Groups]:
+    def _separate_divided_intervals(self, table: StateTable, groups: Groups) -> tuple[StateTable, Groups, Groups]:
         """Return a StateTable of cached interior states, the groups of its intervals, and the groups without states."""
         start_times = table.t[groups[:, indices.FIRST_OWN]].tolist()
         is_divided = np.array([t in self.interior_states for t in start_times], dtype=bool)
@@ -329,7 +332,9 @@ class Interpolator:
         own_groups[:, indices.FIRST_OWN] = own_groups[:, indices.LOW] = own_groups[:, indices.LAST_OWN] - sizes + 1
         return StateTable(np.concatenate(t), np.concatenate(states), table.kinds), own_groups, groups[~is_divided]
 
-    def _divide(self, table: StateTable, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
+    def _divide_intervals(
+        self, table: StateTable, plan: Plan, kit: Any, intervals: Groups
+    ) -> dict[float, tuple[Array, Array]]:
         """Divide intervals into `plan.parts` steps, or fewer if steps fail; return {first time: (times, states)}."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
@@ -358,7 +363,7 @@ class Interpolator:
         """
         groups = _interval_groups(table, np.arange(len(table.t) - 1))
         for block in _blocks_of_groups(groups):
-            self._divide_where_needed(table, block)
+            self._divide_inaccurate_intervals(table, block)
             start_times = table.t[block[:, indices.FIRST_OWN]].tolist()
             pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
             shape = (len(pairs), self.parts + 1)

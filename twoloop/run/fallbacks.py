@@ -115,7 +115,7 @@ class Origin(NamedTuple):
 
 
 # largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times a step from the
-# current state to its mirror image beyond the singular position (see _find_base)
+# current state to its mirror image beyond the singular position (see _find_base_state)
 MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
 # another singular position is between an earlier state and the base if the ratio of their distances is below this
 MIN_DISTANCE_RATIO = 0.5
@@ -168,7 +168,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     earliest, has_fixed_step = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
     base, run.mirrored_size = None, 0.0
     if not has_fixed_step:
-        base, run.mirrored_size = _find_base(run, [place for place in past if place[0] >= earliest])
+        base, run.mirrored_size = _find_base_state(run, [place for place in past if place[0] >= earliest])
     # try several origins: earlier nodes may be before a jump of a force; near the start or the end of the run there may
     # be too few nodes; the polynomial from an old base may be too long
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
@@ -221,7 +221,7 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     run.crossing_size = float(clock[a.H_NEXT])
 
 
-def _find_base(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
+def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
     """Return the base of the polynomial, and the mirrored step size, s.
 
     The base is the latest state in `past` that is far from the singular position; else the farthest one, or None if the

@@ -223,7 +223,7 @@ class IntegrationLoop:
         while self.code == a.PAUSED:
             across, over_jump = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
             began = time.process_time()
-            self._advance(buffers)
+            self._take_chunk(buffers)
             n_rows, n_steps = self.n_filled.tolist()
             t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
             is_copied = 2 * n_rows < len(buffers[0])  # a copy of a buffer that is less than half full saves memory
@@ -262,7 +262,7 @@ class IntegrationLoop:
         self._choose_method(across, len(steps))
         self.report(self.run.clock[self.run.a.T])
 
-    def _advance(self, buffers: Buffers) -> None:
+    def _take_chunk(self, buffers: Buffers) -> None:
         """Take one chunk of steps by the compiled `advance`, which fills `buffers`; store its code in `self.code`."""
         run, a = self.run, self.run.a
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.n_attempts()))

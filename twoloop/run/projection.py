@@ -283,12 +283,12 @@ def consistent_state(
     speeds = check_vector("v", v, system.n_q)
     kept = [] if keep is None else check_indices("keep", keep, system.n_q)
     with signals_of(system):
-        state = _project(system, t, guess, speeds, kept, check_assembly)
+        state = _project_state(system, t, guess, speeds, kept, check_assembly)
     state.moved_q, state.moved_v = _largest_move(state[0] - guess), _largest_move(state[1] - speeds)
     return state
 
 
-def _project(
+def _project_state(
     system: ConstrainedSystem, t: float, guess: Array, speeds: Array, kept: list[int], check_assembly: bool
 ) -> ConsistentState:
     """Return the projected state, without its moves."""
@@ -313,7 +313,7 @@ def _project(
         why = f"max|C_q v + C_t| stays at {_format_largest(violation.values)}"
         raise ValueError(_describe_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
     state = ConsistentState((position, velocity))
-    state.dependent, state.determinant_sign, state.margin = _assembly(scales.scaled(jacobian), free)
+    state.dependent, state.determinant_sign, state.margin = _identify_assembly(scales.scaled(jacobian), free)
     return state
 
 
@@ -329,7 +329,7 @@ class _LargeState(ConsistentState):
         q = self[0]
         jacobian = self.system.rows(self.t, q)
         scaled = scales_of(self.system, self.t, q, jacobian).scaled(jacobian)
-        self.dependent, self.determinant_sign, self.margin = _assembly(scaled, np.arange(len(q)))
+        self.dependent, self.determinant_sign, self.margin = _identify_assembly(scaled, np.arange(len(q)))
         return vars(self)[name]
 
 
@@ -385,7 +385,7 @@ def _describe_other_assembly(
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
     jacobian = system.jacobian(t, q1)
-    dependent, sign, _ = _assembly(scales.scaled(jacobian), free)
+    dependent, sign, _ = _identify_assembly(scales.scaled(jacobian), free)
     dependent_columns = list(dependent)
 
     def distance(a: Array, b: Array) -> float:
@@ -464,7 +464,7 @@ def _rank(scaled: Array) -> int:
     return int((values > RANK_CUTOFF * max(float(values.max(initial=0.0)), 1e-300)).sum())
 
 
-def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
+def _identify_assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
     """Return `dependent`, `determinant_sign` and `margin` of a ConsistentState, given the scaled C_q (n_c, n_q)."""
     rank = _rank(scaled[:, free])
     if rank == 0:

@@ -82,7 +82,7 @@ class Run:
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
         # ranks are computed at every start; the ranks of the last start are a guess that often saves a second workspace
-        self.work = self._workspace(*(system.derived.get("ranks", ()) if self.fixed_order is None else ()))
+        self.work = self._make_workspace(*(system.derived.get("ranks", ()) if self.fixed_order is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
         self.tolerances[indices.RTOL] = rtol
@@ -146,7 +146,7 @@ class Run:
         """
         new_run = self._copy_without_workspace()
         new_run.t0, new_run.compared_until, new_run.state[: len(q0)] = t0, [-np.inf], q0
-        new_run.work = new_run._workspace(len(self.work.rows), len(self.work.rows_v))
+        new_run.work = new_run._make_workspace(len(self.work.rows), len(self.work.rows_v))
         if new_run.restart(t0, q0, v0) != indices.DONE:
             return None
         new_run.redundant, new_run.rows_warning = new_run.find_redundant_rows()
@@ -234,7 +234,7 @@ class Run:
         control[a.TRIAL_STEPS] = TRIAL_STEPS if plan.on_trial else -1.0
         self.clock[a.H_LIMIT] = plan.limit_start
 
-    def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
+    def _make_workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Return a new workspace for the rank of C_q and the rank of all rows; None: full rank."""
         q0 = self.state[: self.system.n_q]
         pattern = pattern_of(self.system, self.t0, q0) if self.fixed_order is None else NO_PATTERN
@@ -269,7 +269,7 @@ class Run:
         if self.fixed_order is not None and self.plan.first is not None:
             self.plan = with_matrix_cost(self.plan, self.fixed_order.matrix_cost())
         self.kit = make_kit(self.system, t, q, self.plan, self.fixed_order)
-        self.work = self._workspace(rank, rank)
+        self.work = self._make_workspace(rank, rank)
         self.work.counters[:] = old_work.counters
         notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.LAST_JUMP, indices.NEXT_JUMP]
         self.work.notes[notes] = old_work.notes[notes]
@@ -293,7 +293,7 @@ class Run:
         code = start(self.kit, self.work, self.t0, self.state)
         if self.fixed_order is not None and code == indices.RANK_DIFFERS:
             rank = int(self.work.notes[indices.RANK])
-            self.work = self._workspace(rank, rank)
+            self.work = self._make_workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
         if self.fixed_order is not None and code not in (indices.DONE, indices.NOT_FINITE):
             if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
@@ -301,12 +301,12 @@ class Run:
             self.fixed_order = None
             self.kit = make_kit(self.system, self.t0, self.state[: self.system.n_q], self.plan)
             self.control[self.a.MAY_CROSS] = 1.0
-            self.work = self._workspace()
+            self.work = self._make_workspace()
             code = start(self.kit, self.work, self.t0, self.state)
         if code == indices.RANK_DIFFERS:
             ranks = int(self.work.notes[indices.RANK]), int(self.work.notes[indices.RANK_V])
             self.system.derived["ranks"] = ranks
-            self.work = self._workspace(*ranks)
+            self.work = self._make_workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
         if code == indices.GAMMA_INACCURATE:  # the first step will report this, so that the run has a result
             required_accuracy = self.work.notes[indices.GAMMA_REQUIRED]

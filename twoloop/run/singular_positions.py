@@ -39,7 +39,9 @@ def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_stat
     `crossings`: for each position the states before and after it. If the run ended before the crossing was complete,
     its last state, `end_state`, replaces the missing state after the position.
     """
-    ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]}
+    ratios = {
+        ends[0][0]: _least_ratio_between(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]
+    }
     singular = {t: ratio for t, ratio in ratios.items() if ratio < LOST_RANK_RATIO}
     regular = {t: ratio for t, ratio in ratios.items() if ratio >= LOST_RANK_RATIO}
     text = ""
@@ -59,15 +61,15 @@ def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_stat
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
     """Return the ratio of the `rank`-th largest singular value of the rows to the largest; 1 if there are no rows."""
-    return _ratio(system.rows(t, q), rank)
+    return _singular_value_ratio(system.rows(t, q), rank)
 
 
 def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
     """Return `singular_ratio` of rows scaled by `scaled_to_unit_masses`: it does not depend on units."""
-    return _ratio(scaled_to_unit_masses(system, t, q)[1], rank)
+    return _singular_value_ratio(scaled_to_unit_masses(system, t, q)[1], rank)
 
 
-def _ratio(rows: Array, rank: int) -> float:
+def _singular_value_ratio(rows: Array, rank: int) -> float:
     """Return the ratio of the `rank`-th largest singular value to the largest; 1 if there are no rows."""
     values = np.linalg.svd(rows, compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
@@ -79,7 +81,7 @@ def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: in
     return float(values[-1]) if len(values) else 0.0
 
 
-def _least_ratio(
+def _least_ratio_between(
     system: ConstrainedSystem, before: TimedState, after: TimedState, rank: int, ratio: Ratio = singular_ratio
 ) -> float:
     """Return the smallest value of `ratio` at N_POSITIONS positions of a cubic interpolation between two states."""
@@ -112,7 +114,7 @@ def describe_velocity_jump(
         )
         # if no step led across, the run's own steps may have left the branch: evaluate the ratio at the last state only
         here, there = (t0, first), (t1, last)
-        ratio = _least_ratio(system, here if across else there, there, rank, unit_free_ratio)
+        ratio = _least_ratio_between(system, here if across else there, there, rank, unit_free_ratio)
         if ratio >= threshold:
             continue
         largest_a = max(
@@ -244,7 +246,7 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
     if max(ratio, unit_free_ratio(system, t, q, rank)) > WEAK_RATIO:
         return ""
     allowed = atol + rtol * np.abs(q).max()
-    if not (np.abs(_displacement_to_singular(system, t, q, rank)) <= allowed).all():
+    if not (np.abs(_displacement_to_singular_position(system, t, q, rank)) <= allowed).all():
         return ""
     return (
         f"the run begins where the constraints nearly lose rank (the smallest singular value of the constraint "
@@ -254,7 +256,7 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
     )
 
 
-def _displacement_to_singular(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
+def _displacement_to_singular_position(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
     """Return an estimated displacement (n_q,) to the nearest singular position, to first order; not finite if unknown.
 
     Among the directions that the other constraints allow, the smallest singular value changes most along this one.

@@ -250,7 +250,7 @@ def _verify_pattern(w):
 
 
 @compiled
-def _do_other_task(f, w, task, t, q, v):
+def _do_task_between_evaluations(f, w, task, t, q, v):
     """Do one of the tasks that choose, check or factor something between evaluations; return a code."""
     if task == tasks.FIND_NULL_SPACE:
         code = evaluate_and_factor_columns(f, w, t, q)
@@ -272,7 +272,7 @@ def _do_other_task(f, w, task, t, q, v):
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """Do `task`, one of the numbers in tasks.py, at (t, q, v); return a code. Functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
-        return _do_other_task(f, w, task, t, q, v)
+        return _do_task_between_evaluations(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION) and w.time_is_up == 1.0:
         return STOPPED
     # methods that integrate all coordinates call the tasks EVALUATE_WITHOUT_PROJECTION and PROJECT

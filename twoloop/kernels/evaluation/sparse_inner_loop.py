@@ -500,7 +500,7 @@ def _solve_system(f, w, r, c, a, lam):
 
 
 @compiled
-def _do_other_task(f, w, task, t, q, v, a, lam):
+def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
     """Do a task other than evaluations and projections; return a code."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
@@ -529,7 +529,7 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if task == tasks.MULTIPLIERS:
         return _compute_multipliers(f, w, lam)
     if task >= tasks.FIND_NULL_SPACE:
-        return _do_other_task(f, w, task, t, q, v, a, lam)
+        return _do_task_between_evaluations(f, w, task, t, q, v, a, lam)
     code = DONE
     if task != tasks.ACCELERATIONS:
         code = _project_state(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)

@@ -154,7 +154,7 @@ def copy_vectors(work, source, target, count):
 
 
 @merged
-def _add_four(work, t, p, q, sign):
+def _add_product_in_four_lanes(work, t, p, q, sign):
     """Add sign * x * y to a vector in four adjacent lanes; t, p and q are indices in `work` of the vector, x and y."""
     t0, t1 = work[t] + sign * work[p] * work[q], work[t + 1] + sign * work[p + 1] * work[q + 1]
     t2, t3 = work[t + 2] + sign * work[p + 2] * work[q + 2], work[t + 3] + sign * work[p + 3] * work[q + 3]
@@ -165,7 +165,7 @@ def _add_four(work, t, p, q, sign):
 def add_product(work, target, x, y, sign):
     """Add sign * x * y to the vector `target`, reading four lanes before writing any, because vectors might overlap."""
     for k in range(0, LANES, 4):
-        _add_four(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
+        _add_product_in_four_lanes(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
 
 @merged

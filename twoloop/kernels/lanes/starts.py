@@ -363,7 +363,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
 
 
 @compiled
-def _check_other_guesses(code, settings, control, pattern, moves, work):
+def _check_nearby_guesses(code, settings, control, pattern, moves, work):
     """Clear RUNNING in lanes in which another guess has a projection far from its linear prediction by C_q."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
@@ -424,7 +424,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, valid, w
             run = min(first + k, n_runs - 1)
             for j in range(n):
                 work[(change_from_guess + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
-        _check_other_guesses(code, settings, control, pattern, moves, work)
+        _check_nearby_guesses(code, settings, control, pattern, moves, work)
         for k in range(min(LANES, n_runs - first)):
             valid[first + k] = int(work[at.RUNNING * LANES + k])
             for j in range(n):

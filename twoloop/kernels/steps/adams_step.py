@@ -168,7 +168,7 @@ def _compute_coefficients(memory, h, k):
 
 
 @merged
-def _predict(memory, h, k, old, new, state, q1, v1, n):
+def _predict_state(memory, h, k, old, new, state, q1, v1, n):
     """Store the predicted state in q1 and v1, and the differences predicted by table `old` in the table `new`."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
@@ -224,7 +224,7 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
 
 
 @merged
-def _error(g, G, h, order, largest_v, largest_q):
+def _estimate_error(g, G, h, order, largest_v, largest_q):
     """Return the estimated error of a step at `order`, in units of the tolerances.
 
     `largest_v`, `largest_q`: largest component of phi_{order+1}, divided by the tolerances of velocities, of positions.
@@ -253,9 +253,9 @@ def _choose_order(memory, h, k, table, d, n):
         v2, q2 = max(v2, x * a), max(q2, x * b)
         x = abs(table[k + 1, m] + d[m])
         v3, q3 = max(v3, x * a), max(q3, x * b)
-    error = _error(g, G, h, k, v0, q0)
-    below = _error(g, G, h, k - 1, v1, q1) if k > 1 else np.inf
-    far_below = _error(g, G, h, k - 2, v2, q2) if k > 2 else 0.0
+    error = _estimate_error(g, G, h, k, v0, q0)
+    below = _estimate_error(g, G, h, k - 1, v1, q1) if k > 1 else np.inf
+    far_below = _estimate_error(g, G, h, k - 2, v2, q2) if k > 2 else 0.0
     order, expected = k, error
     if (k > 2 and max(below, far_below) <= error) or (k == 2 and below <= 0.5 * error):
         order, expected = k - 1, below
@@ -265,7 +265,7 @@ def _choose_order(memory, h, k, table, d, n):
         if is_starting:
             order, expected = k + 1, error
         elif order == k and k < HIGHEST and memory[AGE] >= k + 1 and memory[DEPTH] > k:
-            above = _error(g, G, h, k + 1, v3, q3)
+            above = _estimate_error(g, G, h, k + 1, v3, q3)
             if k > 1 and below <= min(error, above):
                 order, expected = k - 1, below
             elif above < (0.5 * error if k == 1 else error):
@@ -292,7 +292,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.n_outer += 1
     old, new = _difference_table(memory, n, memory[CURRENT]), _difference_table(memory, n, 1.0 - memory[CURRENT])
     _compute_coefficients(memory, h, k)
-    _predict(memory, h, k, old, new, state, q1, v1, n)
+    _predict_state(memory, h, k, old, new, state, q1, v1, n)
     memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # the order of the next attempt if an evaluation fails in this attempt
     code = evaluate_without_projection(f, w, t + h, q1, v1, a1)
     if code != DONE:

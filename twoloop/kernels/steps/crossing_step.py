@@ -144,7 +144,7 @@ def _estimate_error(tolerances, h, state, legendre, a, n_kept):
 
 
 @merged
-def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
+def _integrate_polynomial(h, c, A, AA, a, q, v, q_end, v_end):
     """Set q_end and v_end to the state at the time c h after the beginning of the polynomial.
 
     (q, v): state at the beginning; A, AA (S): weights of the accelerations a (S, n) in their first and second integral.
@@ -362,7 +362,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                             _extrapolate_node(k, c, (last_0, last_1, last_2), a)
             time = begin + c[j] * duration
             _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
-            _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
+            _integrate_polynomial(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
             code = DONE
             renews_partition = not uses_generated_code or chooses_nodes
             if chooses_nodes:
@@ -386,11 +386,11 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 # pivots of the generated code were too small, and the general code used the partition of another
                 # stage: repeat the projection with a partition chosen at this stage
                 renews_partition, uses_generated_code = True, False
-                _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
+                _integrate_polynomial(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
                 code = renew_partition(f, w, time, q_stage)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
-            _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q1, v1)
+            _integrate_polynomial(duration, c[j], A[j], AA[j], a, q_0, v_0, q1, v1)
             for m in range(n):
                 weight = _velocity_weight(tolerances, m, n, h, state)
                 change = max(change, h * abs(a_stage[m] - a[j, m]) * weight)
@@ -414,7 +414,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
         # test the end of the step early: it is accurate enough after two sweeps, and most failing steps fail here
         if sweep == 1 and is_estimated:
-            _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
+            _integrate_polynomial(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
             code = _choose_partition_at_end(f, w, t + h, q1, pivot, min_node_pivot * largest_pivot)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
@@ -427,7 +427,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
-    _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
+    _integrate_polynomial(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
     code = _choose_partition_at_end(f, w, t + h, q1, pivot, min_node_pivot * largest_pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

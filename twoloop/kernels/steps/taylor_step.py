@@ -445,7 +445,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
 
 
 @compiled
-def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
+def _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
     """Return whether `defect` is a rounding error: at most NOISE_RATIO times the defect near the step's beginning."""
     if defect > MAX_NOISE:
         return False
@@ -470,7 +470,7 @@ def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
         if k < 0 and not (memory[SUSPECTED] == 1.0 and 0.0 < s < 1.0):
             continue
         defect = _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a)
-        if defect > 1.0 and not _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
+        if defect > 1.0 and not _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
             if memory[SUSPECTED] == 0.0 or t + s * h < memory[SUSPECT]:
                 memory[SUSPECT] = t + s * h
             memory[SUSPECTED] = 1.0
@@ -554,7 +554,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if checks_defect:
         defect = defect_ratio(tolerances, h, order, series_a, a1, q1, v1)
         if defect > 1.0:
-            noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
+            noise = _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
             if not noise:
                 return Attempt(DONE, min(defect, MAX_DEFECT), _factor_after_large_defect(defect, order))
             _evaluate_series(series, unit, order, x, q1, v1, series_a)
