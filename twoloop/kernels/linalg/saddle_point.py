@@ -28,6 +28,7 @@ from twoloop.kernels.linalg.dense import (
     invert_definite,
     ldl_factor,
     ldl_solve,
+    sum_rows,
     update_pattern,
 )
 from twoloop.kernels.linalg.markowitz_lu import (
@@ -177,11 +178,7 @@ def _apply_inverse_mass(f, w, x, y):
         for i in range(n):
             y[i] = x[i] * w.L[i, i]
     elif f.constant_mass == 1 and not has_banded_mass(f):
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += w.L[i, j] * x[j]
-            y[i] = total
+        sum_rows(x, w.L, y)  # the inverse is symmetric, and sums of rows are vectorised, unlike sums over j
     else:
         copy(x, y)
         if has_banded_mass(f):
