@@ -254,12 +254,10 @@ CONFIRM_RATIO, N_WIDER, N_NARROWER = 4.0, 8, 24
 BESIDE = (0.55, 1.8, 3.1)  # half-widths that confirm an estimate first, relative to its own
 RIPPLES = 3  # number of narrower intervals after which a smooth function shows only rounding
 LEAST_SPACINGS = 256.0  # smallest half-width, in spacings of floating-point numbers at the point
-# no other half-width is tried if the difference, with its estimated error, is below this fraction of the entry
-SETTLED = 2e-7
+SETTLED = 2e-7  # no other half-width is tried if difference and estimated error are below this fraction of the entry
 AGREEMENT = 3e-7  # an entry is not wrong if the difference is below this fraction of it
 DECAYED = 0.01  # the points resolve a function if its last coefficients are at most this fraction of the first
-# a function has a ripple if the ratio of its last two coefficients to those before, if not all are rounding, exceeds
-# this
+# a function has a ripple if its last two coefficients exceed this multiple of those before, unless all are rounding
 RIPPLE = 0.2
 CONSTANT = 100.0  # a function counts as constant if it varies by less than this number of rounding errors
 SAFETY = 5.0  # ratio of the allowed difference to the estimated error of the difference

@@ -120,8 +120,7 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
-# equations with more operations get no collocation code: code of this length takes 2 s to compile
-MAX_OPERATIONS = 5000
+MAX_OPERATIONS = 5000  # longer equations get no collocation code: code of this length takes 2 s to compile
 MIN_DIVISOR = 1e-300  # smallest divisor, and smallest allowed error, which replaces 0
 INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
@@ -131,16 +130,13 @@ STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
 # constants of the iteration, whose contraction rho is the ratio of the changes of velocities in two successive sweeps
-# sweeps end if the iteration error is at most this number of tolerances: total errors are then at most those of DOP853
-KAPPA = 0.02
+KAPPA = 0.02  # iteration error, in tolerances, that ends the sweeps: total errors are then at most those of DOP853
 TARGET_SWEEPS = 6.0  # number of sweeps for which the step size is chosen; larger with predictions of degree 6 and more
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged this number of sweeps after the target
 MAX_CONTRACTION = 0.8  # a step is rejected in its fourth sweep or later if the contraction is at least this
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
-# the guessed size of the first step is accepted if the contraction is between these two values
-FAST_START, SLOW_START = 0.04, 0.3
-# from this contraction on, changes below MAX_ROUNDING, relative to the values, count as rounding errors
-STAGNATION_RATIO = 0.5
+FAST_START, SLOW_START = 0.04, 0.3  # a contraction between these accepts the guess of the first step size
+STAGNATION_RATIO = 0.5  # from this contraction on, changes below MAX_ROUNDING times the values are rounding errors
 # values that replace KAPPA, MAX_ROUNDING and the limit of sweeps in steps of fixed size
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to the ratio of the iteration error to KAPPA, because its logarithm is computed

@@ -39,8 +39,7 @@ DOUBLE_POINTER = f"{DOUBLE}*"
 # generated code is used only if the relative error of accelerations at the start is at most this: in runs it grew up to
 # 200 times
 LARGEST_LOSS = 1e-8
-# this error is measured at up to this number of positions, at this distance, until pivots are large enough
-MAX_POSITIONS, DISTANCE = 4, 0.02
+MAX_POSITIONS, DISTANCE = 4, 0.02  # positions at which this error is measured, and their distance
 
 
 def write_accelerations(

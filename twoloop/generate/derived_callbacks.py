@@ -101,8 +101,7 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 
 Array = NDArray[np.float64]
 
-# callbacks are compared with exact derivatives only if C_q and A have at most this number of entries
-MAX_ENTRIES = 50_000
+MAX_ENTRIES = 50_000  # callbacks are compared with exact derivatives if C_q and A have at most this many entries
 # displacements from the start at which derivatives are compared: of q, relative to the sizes of the coordinates, and of
 # t, relative to FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)

@@ -60,8 +60,7 @@ N_FEW_COORDINATES = 24  # with more coordinates, MIN_INDEX_MANY replaces MIN_IND
 # gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
-# no refinement is needed if entries of M, with added rows, are at most this multiple of their pivots
-MAX_PIVOT_RATIO = 1e5
+MAX_PIVOT_RATIO = 1e5  # no refinement is needed if entries of M, with added rows, are at most this times their pivots
 SCALE_STEP = 1024.0  # scales of added rows differ by powers of this factor, which rarely change from start to start
 DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
 MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number

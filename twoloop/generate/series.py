@@ -23,8 +23,7 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-# series are traced only if M and [C_q; A] have at most this number of entries, unless the user chooses the Taylor
-# method
+# series are traced if M and [C_q; A] have at most this many entries, or if the user chooses Taylor
 MAX_ENTRIES = 200_000
 
 # callbacks from which a series is derived

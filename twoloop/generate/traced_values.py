@@ -37,7 +37,7 @@ MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run: large systems need fewer states
 # largest difference between call and trace that counts as a rounding error, relative to the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-# a trace is wrong if its relative difference from a call exceeds this; for smaller differences see `_is_systematic`
+# a trace is wrong if it differs from a call by more than this fraction; see also `_is_systematic`
 CLEAR_DIFFERENCE = 1e-6
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
 MARGIN = 0.01  # margin of a CheckedRegion, relative to its ranges: small compared with the steps of a run

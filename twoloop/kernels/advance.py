@@ -57,7 +57,7 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import PARTITION_CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-# a force is assumed to change suddenly in a rejected step whose error exceeds this number of tolerances
+# a force is assumed to change suddenly in a rejected step with an error of more tolerances than this
 SUDDEN_ERROR = 10.0
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
 # number of accepted steps, at first of guessed sizes, after which a short next step can end the trial of a method

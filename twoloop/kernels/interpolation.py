@@ -22,11 +22,9 @@ MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest i
 # v has a polynomial of its own if the rounding error of q over the duration of an interval exceeds this number of
 # tolerances of v
 MAX_VELOCITY_ROUNDING = 10.0
-# a position in an interval is singular if its pivot is below this fraction of the larger pivot at the ends of the
-# interval
+# a position is singular if its pivot is below this fraction of the larger pivot at the ends of its interval
 SINGULAR_PIVOT_RATIO = 0.01
-# any position is singular if its pivot is below this; for pivots see min_pivot_ratio in partition.py
-SINGULAR_PIVOT = 1e-5
+SINGULAR_PIVOT = 1e-5  # any position is singular if its pivot is below this; see min_pivot_ratio in partition.py
 # a position with a pivot below WEAK_PIVOT is singular, too, if velocities of the polynomials violate the constraints by
 # at most MAX_VIOLATION tolerances; the violation is about the pivot times the change by the projection
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05

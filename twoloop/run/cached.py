@@ -80,8 +80,7 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # number of calls that do not use an integrator after a callback raised an exception in it
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-# if the last run took less than this CPU time, s, elapsed time is recorded, because reading CPU time takes long
-SHORT_RUN = 1e-3
+SHORT_RUN = 1e-3  # if the last run took less CPU time, s, elapsed time is recorded: reading CPU time takes long
 HARMLESS = 0.01  # a correction of v0 is always accepted if it is at most this fraction of the tolerances
 REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
 
@@ -361,7 +360,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-# `set_up` need not check a start whose smallest pivot is at least this fraction of that of the first start
+# `set_up` need not check starts whose smallest pivot is at least this fraction of the first start's
 RECHECK_PIVOT = 0.1
 
 

@@ -197,15 +197,13 @@ def _dominant_eigenvalue(
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not to be trusted if rounding errors of velocities (or accelerations) exceed this number of tolerances
 MAX_LASTING_ERROR = 100.0
-# constraints do not determine the velocities at the end of a run if the ratio of singular values is at most this
-MAX_RATIO_AT_END = 1e-6
+MAX_RATIO_AT_END = 1e-6  # up to this ratio of singular values, constraints do not determine the velocities at the end
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
 CROSSINGS_MARK = "\0"  # stands in a message for the description of the singular positions that were crossed
-# a message mentions that the end is near if the time left is at most this fraction of the duration of the run
-NEAR_END = 1e-3
+NEAR_END = 1e-3  # a message mentions that the end is near if at most this fraction of the run is left
 
 _FAILURE_REASONS = {
     indices.DONE: "the error estimate stayed above the tolerances",

@@ -25,8 +25,7 @@ N_POSITIONS = 33  # number of positions between two states at which a ratio of s
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
 DISPLACEMENT = 1e-6
-# rows are divided by their norm, or by this fraction of the norm expected from the derivative of the row if that is
-# larger
+# rows are divided by their norm, or by this fraction of the norm expected from their derivative if that is larger
 MIN_ROW_NORM = 0.1
 # velocities have jumped if their change exceeds both JUMP_RATIO times the change that accelerations explain and
 # MIN_JUMP times the tolerances
@@ -197,8 +196,7 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-# rounding errors are estimated along the singular vectors whose singular value is at most this fraction of the largest
-# one
+# rounding errors are estimated along singular vectors with singular values up to this fraction of the largest one
 WEAK_RATIO = 1e-2
 # SMALL_PIVOT: with smaller ratios of pivots, rounding errors are always estimated; PIVOT_FACTOR: typical ratio of
 # pivots, divided by the ratio of singular values

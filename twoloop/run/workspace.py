@@ -109,12 +109,11 @@ def _derivative_entries(
     return entries
 
 
-# a direction of a body has no mass if its eigenvalue of M is at most this fraction of the largest one
+# a direction of a body has no mass if its eigenvalue of M is at most this fraction of the largest
 MASSLESS_RATIO = 1e-10
 # a row can give a body a mass in massless directions if its component along them is at least this fraction of the row
 MIN_MASSLESS_FRACTION = 1e-3
-# Newton's matrix has sparse factors if the number of coordinates is at least this multiple of LARGE
-MIN_SIZE_NEWTON = 1.6
+MIN_SIZE_NEWTON = 1.6  # Newton's matrix has sparse factors from this number of coordinates on, relative to LARGE
 MAX_SHARE = 0.05  # the fixed-order form has at most this share of the entries, and operations, of dense factors
 
 

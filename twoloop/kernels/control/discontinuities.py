@@ -161,26 +161,21 @@ N_SAMPLES = 20  # number of intervals between the samples that are taken and com
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
 # a change is sudden if the second difference exceeds this fraction of the range of the samples (pulses 4 spacings wide)
 SUDDEN_RATIO = 0.1
-# samples are examined only if their range exceeds this fraction of rtol times the largest value so far
-LEAST_RANGE = 0.1
+LEAST_RANGE = 0.1  # samples are examined if their range exceeds this fraction of rtol times the largest value so far
 # samples are examined only if their range exceeds this, in any unit: squares of smaller values underflow, and subnormal
 # numbers are too coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
 # smallest number of samples in a step, because all stages may miss a force that acts for a quarter of the step
 MIN_SAMPLES_IN_STEP = 8.0
-# samples ahead are taken again if the required spacing is less than this fraction of the last one
-RESAMPLE_BELOW = 0.25
+RESAMPLE_BELOW = 0.25  # samples ahead are taken again if the required spacing is below this fraction of the last one
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
-# two changes count as one if the time between them is at most this fraction of the widest spacing of samples
-EQUAL_CHANGES = 1e-5
+EQUAL_CHANGES = 1e-5  # changes count as one if they are apart by at most this fraction of the widest spacing of samples
 # time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
 # at zero, such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
-# a change is sudden only if it exceeds this multiple of the changes next to it: a smooth slope does not
-MIN_STEEPNESS_RATIO = 2.0
-# a discontinuity is suspected if a step is shorter than this fraction of the longest of the last steps
-SHORT_STEP = 0.5
+MIN_STEEPNESS_RATIO = 2.0  # a sudden change exceeds this multiple of the changes next to it; a smooth slope does not
+SHORT_STEP = 0.5  # a discontinuity is suspected if a step is below this fraction of the longest of the last steps
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # an acceleration decays if it changes by more than this fraction of the largest acceleration while a velocity changes
 # by its tolerance, see _acceleration_lasts

@@ -7,36 +7,32 @@ from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_ratio, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
-# a singular position is suspected if a step is shorter than this fraction of the longest of the last steps
-SHORT_STEP = 0.5
-# pivots of C_q are computed anew if a step is shorter than this fraction of the longest of the last steps
+SHORT_STEP = 0.5  # a singular position is suspected if a step is below this fraction of the longest of the last steps
+# pivots of C_q are computed anew if a step is below this fraction of the longest of the last steps
 COLLAPSED_STEP = 0.2
-# a singular position is near if the smallest pivot of C_q falls below this fraction of its largest value so far
+# a singular position is near if the smallest pivot of C_q is below this fraction of its maximum so far
 SINGULAR_PIVOT = 0.2
 # replaces SINGULAR_PIVOT in the fixed-order form, whose pivots are sines of angles between rows
 FIXED_ORDER_SINGULAR = 0.01
 # the fixed-order form repeats rejected steps with projected stages if the pivot is below this fraction of the largest
-# so far
 REPEAT_PIVOT = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
 MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, relative to the longest recent step
-# the run ends if the smallest pivot falls below this fraction of its largest value so far: rounding spoils
-# accelerations
+# the run ends if the smallest pivot is below this fraction of its maximum so far: rounding spoils accelerations
 UNDETERMINED_PIVOT = 1e-6
 CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that generated code does not use
 # the augmented form checks a partition every 1 + n // FREEDOMS_PER_CHECK steps for n degrees of freedom, because a
 # check computes the full matrix T
 FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
-# a step is checked if the pivot at one of its ends is below this fraction of the largest pivot so far
+# a step is checked if the pivot at one of its ends is below this fraction of the largest so far
 MAX_UNCHECKED_PIVOT = 0.5
 # the smallest pivot counts as zero in a step if a sample is below this fraction of its largest change between samples
 PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: smallest and largest result of near_pivot_ratio; MAX_ROUNDING_ERROR: allowed rounding
 # error, in tolerances; EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-# fixed-order form: a step is halved if the pivot at its end is below this fraction of that at its beginning
-MIN_END_RATIO = 0.25
+MIN_END_RATIO = 0.25  # fixed-order form: a step is halved if its last pivot is below this fraction of its first one
 
 
 @merged

@@ -37,8 +37,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-# methods with a trend keep the step size if the next one would be larger by at most this factor: that saves a
-# factorization
+# methods with a trend keep the step size if it could grow by at most this factor: this saves a factorization
 KEEP_BELOW_RATIO = 1.2
 
 

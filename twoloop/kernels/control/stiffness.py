@@ -69,8 +69,7 @@ COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run 
 # k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds this multiple of the rate of the motion
-# oscillations that steps at the stability limit excite have velocities of at most this number of tolerances
-QUIET_FACTOR = 10.0
+QUIET_FACTOR = 10.0  # steps at the stability limit excite oscillations with velocities of up to this many tolerances
 # an implicit method may allow longer steps, because a hidden rate is damped, if h rho exceeds this multiple of LIMIT
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
@@ -80,8 +79,7 @@ TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-# a trial has succeeded if the cost per second before it is at least this multiple of the cost per second in it
-MIN_GAIN = 1.2
+MIN_GAIN = 1.2  # a trial has succeeded if a second of motion cost at least this times as much before it
 N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial

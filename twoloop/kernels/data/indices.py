@@ -109,8 +109,7 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
     ATOL,  # first index of the absolute tolerances: one for each coordinate and its velocity
 ) = range(6)
 MAX_GAP_RATIO = 0.01  # value of GAP, relative to the duration of the run
-# an error of velocities near a singular position is reported if it exceeds this number of tolerances
-REPORTED_ERROR = 30.0
+REPORTED_ERROR = 30.0  # velocity errors of more tolerances than this are reported near a singular position
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
 # kinds of intervals between accepted states, for dense output; they tell which data the polynomials interpolate

@@ -92,10 +92,8 @@ def gather_independent_columns(G, rate, rows, independent, D):
 # to max|q|. MIN_STEP_RATIO: smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
-# rounding may make Gamma with the steps e and 2 e differ by up to this fraction of its size
-ROUNDING_DISAGREEMENT = 1e-9
-# e is doubled, to reduce rounding errors, if Gamma with the steps e and 2 e differs by less than this fraction of its
-# size
+ROUNDING_DISAGREEMENT = 1e-9  # rounding may make Gamma with the steps e and 2 e differ by up to this fraction
+# e is doubled, to reduce rounding, if Gamma with the steps e and 2 e differs by less than this fraction
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)

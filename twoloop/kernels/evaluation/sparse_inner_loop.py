@@ -65,10 +65,8 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-# a row is checked if its pivot is below this fraction of its size: the pivot may be a rounding error
-SUSPECT_PIVOT = 1e-6
-# factors by 1-by-1 pivots are accurate if each pivot is at least this fraction of the size of its row
-MIN_PIVOT = 1e-10
+SUSPECT_PIVOT = 1e-6  # a row is checked if its pivot, which may be a rounding error, is below this fraction of its size
+MIN_PIVOT = 1e-10  # factors by 1-by-1 pivots are accurate if each pivot is at least this fraction of its row's size
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular near a singular position, where stages must be projected
 # solutions are refined once if the smallest pivot, relative to the size of its row, is at most REFINE_ONCE_BELOW, and

@@ -25,8 +25,7 @@ from twoloop.kernels.lanes.layout import (
 # tolerance of a coordinate. From N_HEAD on, `options` contains the options of the method for a single run
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-# a force is assumed to jump in a rejected step whose error exceeds this number of tolerances, as in advance.py
-SUDDEN_ERROR = 10.0
+SUDDEN_ERROR = 10.0  # a force is assumed to jump in a rejected step with an error of more tolerances than this
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step, as in advance.py
 # a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `size_off_grid`
 END_ROUNDING = 1e-10

@@ -110,8 +110,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-# a step is accepted only if END_ERROR_WEIGHT * estimate_end_error is at most this; the paper has no such limit
-SUDDEN_ERROR = 10.0
+SUDDEN_ERROR = 10.0  # limit of END_ERROR_WEIGHT * estimate_end_error in accepted steps; the paper has no such limit
 
 
 @kernel(ATTEMPT)

@@ -177,7 +177,7 @@ def filter_dense_error(w, memory, z, e_q, e_v):
 MAX_ITERATIONS = 8  # largest number of Newton iterations of a stage: if they do not converge, the step fails
 DIVERGENCE_RATIO = 2.0  # Newton's method has diverged if a correction exceeds this multiple of the previous one
 LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences, with which convergence is linear
-# derivatives by differences are computed anew if a correction exceeds this fraction of the previous one
+# derivatives by differences are renewed if a correction exceeds this fraction of the previous one
 MAX_CONTRACTION = 0.1
 VELOCITY_WEIGHT = 0.1  # weight in the convergence test of the position error caused by a correction of velocities
 

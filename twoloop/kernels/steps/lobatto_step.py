@@ -51,13 +51,10 @@ SAFETY = 0.75  # factor on the step size for which the estimated error would equ
 MAX_LIMITED = 24.0  # the motion counts as stiff, and another method takes over, if LIMITED reaches this value
 MIN_CURVATURE = 0.1  # accelerations hardly vary within a step if CURVATURE is below this value
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
-# a singular position is near if a pivot falls below this fraction of the pivot at the beginning of the step
-MIN_PIVOT_RATIO = 0.4
-# with a tolerance below this, another method takes over after a singular position: otherwise five more runs of A02 are
-# wrong
+MIN_PIVOT_RATIO = 0.4  # a singular position is near if a pivot is below this fraction of that at the step's beginning
+# below this tolerance, another method takes over after a singular position: else five more runs of A02 are wrong
 TIGHT_TOLERANCE = 1e-8
-# another method takes over if FAILURES, to which a step without convergence adds 2, reaches this value
-MAX_FAILURES = 12.0
+MAX_FAILURES = 12.0  # another method takes over at this value of FAILURES, to which a step without convergence adds 2
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3

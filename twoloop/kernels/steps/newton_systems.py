@@ -72,8 +72,7 @@ from twoloop.kernels.steps.stages import (
 )
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
-# step sizes count as equal up to this relative difference, because rounding errors of times change them
-EQUAL_STEP_TOLERANCE = 1e-9
+EQUAL_STEP_TOLERANCE = 1e-9  # step sizes with this relative difference count as equal: rounding of times changes them
 # largest Newton correction, relative to the smallest tolerance, that counts as a rounding error if it does not decrease
 MAX_ROUNDING_CORRECTION = 0.1
 
