@@ -354,7 +354,7 @@ def rows_at_positions(f, t, positions, n_c, rows):
 
 
 @exact
-def _matrices_agree(fused, separate, tolerance, rounding_errors):
+def _is_close(fused, separate, tolerance, rounding_errors):
     """Return whether entries (i, j) of both matrices differ by up to tolerance * max|separate| + rounding_errors[i]."""
     largest = 0.0
     for i in range(separate.shape[0]):
@@ -381,17 +381,15 @@ def kinematics_agree(f, t, q, v, fused, separate, roundings, tolerance, rounding
     f.jacobian(t, q, f.p, separate_rows)
     f.constraint_rate(t, q, f.p, separate[1])
     f.gamma(t, q, v, f.p, separate[2])
-    is_close = _matrices_agree(fused_rows, separate_rows, tolerance, roundings)
+    is_close = _is_close(fused_rows, separate_rows, tolerance, roundings)
     for k in range(1, 3):
-        is_close = is_close and _matrices_agree(
+        is_close = is_close and _is_close(
             fused[k : k + 1].reshape((n_c, 1)), separate[k : k + 1].reshape((n_c, 1)), tolerance, roundings
         )
     for i in range(n_c):
         for j in range(n):
             roundings[i] += rounding * abs(separate_rows[i, j]) * abs(q[j])
-    return is_close and _matrices_agree(
-        fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, roundings
-    )
+    return is_close and _is_close(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, roundings)
 
 
 VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors

@@ -29,11 +29,8 @@ GOLDEN_SECTION = 0.6180339887498949
 
 
 @merged
-def _subtract_products_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
-    """Subtract from work[target] `count` products, of work[x + i * x_stride] and work[y + i * y_stride].
-
-    The same is done in the next three lanes, whose numbers follow those of the first.
-    """
+def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
+    """In four adjacent lanes, subtract from work[target] `count` products work[x] * work[y], x and y with strides."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -49,12 +46,11 @@ def _subtract_products_in_four_lanes(work, target, x, x_stride, y, y_stride, cou
 def subtract_products(work, target, x, x_stride, y, y_stride, count):
     """Subtract from vector `target` the products of the vectors x + i * x_stride and y + i * y_stride, i < `count`.
 
-    Vectors are given by their index in `work`; each has one number for each lane.
+    A vector has one number for each lane; `target`, x and y are numbers of vectors in `work`.
     """
     for k in range(0, LANES, 4):
-        _subtract_products_in_four_lanes(
-            work, target * LANES + k, x * LANES + k, x_stride * LANES, y * LANES + k, y_stride * LANES, count
-        )
+        x_0, y_0 = x * LANES + k, y * LANES + k
+        _subtract_in_four_lanes(work, target * LANES + k, x_0, x_stride * LANES, y_0, y_stride * LANES, count)
 
 
 @merged

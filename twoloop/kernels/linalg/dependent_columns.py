@@ -150,7 +150,7 @@ def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
 
 
 @compiled
-def _eliminate_columns(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
+def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
     """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate these columns."""
     row_active[i] = row_active[k] = 0
     n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
@@ -217,8 +217,6 @@ def choose_dependent_columns(G, kinds, rows, n_kept, numbers, integers, out):
             R, K, columns, row_active, row_sizes, column_sizes, squared_norms, row_scratch, union, block
         ):
             return 0
-        _eliminate_columns(
-            R, K, columns, row_active, row_sizes, column_sizes, union, block[0], block[1], block[2], block[3]
-        )
+        _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, block[0], block[1], block[2], block[3])
         n_active, n_blocks = n_active - (1 if block[0] == block[1] else 2), n_blocks + 1
     return n_blocks

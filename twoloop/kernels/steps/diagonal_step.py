@@ -376,7 +376,7 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
 
 
 @compiled
-def _estimate_error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
+def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
     """Return the largest component of the error estimate of `_store_weighted_sums`, in units of the tolerances.
 
     The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If the derivatives are
@@ -481,9 +481,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
     if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
     factor = min(1.0, deviation / (MAX_RATIO_BY_ONE_JUMP * widest))
-    error = _estimate_error(
-        f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, jump_weights, factor
-    )
+    error = _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, jump_weights, factor)
     if error <= 1.0:
         error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage))
     return error
@@ -550,9 +548,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error = 0.0
     memory[at.DERIVATIVES_RENEWED] = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _estimate_error(
-            f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, 1.0
-        )
+        error = _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, 1.0)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
         if options[options.size - 1] == 1.0:
