@@ -452,7 +452,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return whether a run from (t0, q0) may use this code: whether it was generated for the PivotChoice there."""
+        """Return whether a run from (t0, q0) may use this code: its pivots must be those chosen at this start."""
         try:
             return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:

@@ -400,7 +400,7 @@ class Elimination:
 
     @cached_property
     def reduced_program(self) -> Program | None:
-        """Return the program for accelerations that eliminates dependent coordinates; None if it costs too much."""
+        """Return the program for accelerations that eliminates dependent coordinates; None if it saves too little."""
         blocks = self.choice.blocks
         if not blocks:
             return None

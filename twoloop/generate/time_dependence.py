@@ -173,7 +173,7 @@ class DerivativeBounds(DegreeAlgebra):
     """
 
     def affine(self, expr: Affine) -> float:
-        """Return the largest rate of the terms of an affine expression."""
+        """Return the largest bound of a derivative among the terms of an affine expression."""
         return max(
             (math.inf if type(c) is Parameter else abs(c) * self.values.get(i, 1.0) for i, c in expr.terms.items()),
             default=0.0,

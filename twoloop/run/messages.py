@@ -356,7 +356,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 
 def _describe_contradiction(run: "Run") -> str:
-    """Return the message of a run that stopped as a redundant row is violated, or no branch leaves a singular start."""
+    """Return the message of a run that stopped: a redundant row is violated, or no branch leaves a singular start."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     if run.starts_singular:
         return (

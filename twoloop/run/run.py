@@ -288,7 +288,7 @@ class Run:
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
     def _compute_start_accelerations(self) -> None:
-        """Compute the accelerations at the start, if necessary with other ranks or another form of linear algebra."""
+        """Compute the accelerations at the start; if that fails, try other ranks or another form of linear algebra."""
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
         if self.fixed_order is not None and code == indices.RANK_DIFFERS:

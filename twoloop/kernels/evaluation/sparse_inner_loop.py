@@ -299,7 +299,7 @@ def _fill_residual(program, jacobian, force, x, r):
 
 @compiled
 def least_norm(f, w, lam):
-    """Replace lam by the multipliers of least norm with the same G^T lam; return DONE, or NEEDS_DENSE if this fails."""
+    """Replace lam by the multipliers of least norm with the same reactions G^T lam; return DONE, or NEEDS_DENSE."""
     program, n_q = f.ldl_program, w.Q.size
     n = program[N_PIVOTS]
     n_factors = n + program[N_OFF_DIAGONAL] + 1

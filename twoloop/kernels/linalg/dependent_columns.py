@@ -124,7 +124,7 @@ def _find_varying_pivots(R, K, columns, row_active, row_sizes, column_sizes, squ
 
 @merged
 def _append_entry(K, columns, row_sizes, i, j):
-    """Append column j to the list of the columns in which row i has entries, if row i has an entry there."""
+    """Append column j to the list of the columns of row i, unless entry (i, j) is always zero."""
     if K[i, j] != NONE:
         columns[i, row_sizes[i]] = j
         row_sizes[i] += 1

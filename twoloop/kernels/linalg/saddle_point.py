@@ -393,7 +393,7 @@ def solve_with_multipliers(f, w, r, c, a, lam):
 
 @compiled
 def least_norm(w, lam):
-    """Replace lam by the multipliers of least norm with the same G^T lam.
+    """Replace lam by the multipliers of least norm that give the same reactions G^T lam.
 
     Redundant row i is the sum over k of Z[i, k] times independent row k. The null space of G^T is spanned by the
     columns n_i = e_i - sum_k Z[i, k] e_k of a matrix N, and lam -= N (N^T N)^-1 N^T lam.

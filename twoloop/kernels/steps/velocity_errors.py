@@ -102,7 +102,7 @@ def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, 
 
 @compiled
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
-    """Return whether J agrees with the equations at the end of a step, at time t; also True if J does not matter.
+    """Return whether the stored derivatives J agree with the equations at the end of a step, t, or do not matter.
 
     (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `unfiltered` (n_dof each). So (e_v - unfiltered) / z
     is the velocity part of J (e_q, e_v). This product is compared with the difference of the accelerations between the
