@@ -99,8 +99,7 @@ def _have_short_changes(values: Array, rtol: float) -> NDArray[np.bool_]:
 
 # "auto" takes DOP853 first if a series takes more than this many operations per coordinate (measured at 2, 11 and 13),
 # and the tolerance is at least the second number. No method is faster on all mechanisms: at an error of 1e-6, DOP853
-# takes 1.7 times as long as series on four-bars, and series take over twice as long as DOP853 on the spatial
-# slider-crank
+# takes 1.7 times as long as series on four-bars, and series over twice as long as DOP853 on the spatial slider-crank
 COSTLY_SERIES, SMALLEST_FOR_DOP853 = 6.0, 1e-9
 N_STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # number of stages of the implicit methods
 IN_LANES = ("auto", "Taylor", "DOP853", *N_STAGES)  # presets that can run in lanes

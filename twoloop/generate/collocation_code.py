@@ -124,8 +124,7 @@ MAX_OPERATIONS = 5000  # longer equations get no collocation code: code of this 
 MIN_DIVISOR = 1e-300  # smallest divisor, and smallest allowed error, which replaces 0
 INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
-# after a step in which the program with fixed pivots (null_space.py) was not valid, the eliminations of this many steps
-# begin with M
+# number of steps whose elimination begins with M, after the program with fixed pivots (null_space.py) was not valid
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 

@@ -36,8 +36,7 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# generated code is used only if the relative error of accelerations at the start is at most this: in runs it grew up to
-# 200 times
+# generated code is used if accelerations at the start are wrong by at most this fraction; in runs it grew 200 times
 LARGEST_LOSS = 1e-8
 MAX_POSITIONS, DISTANCE = 4, 0.02  # positions at which this error is measured, and their distance
 
@@ -268,8 +267,7 @@ class SplitFunctions:
                 emit.store(value, array, j)
         return lowering.is_valid(program, results[0])
 
-    # methods called from outside: they write the bodies of functions for kernels, and the code of collocation steps in
-    # SIMD lanes
+    # methods called from outside: they write bodies of functions for kernels, and code of collocation steps in lanes
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         """Write code that stores the accelerations at (t, q, v) in `a`; return whether they are valid."""

@@ -54,10 +54,9 @@ MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
 # there is none, MIN_PIVOTS[-1] is chosen
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 N_FEW_COORDINATES = 24  # with more coordinates, MIN_INDEX_MANY replaces MIN_INDEX_FEW
-# all rows of G may be added to M if the index of the chosen entry of MIN_PIVOTS is at least this, that is, if pivots
-# are small. MIN_INDEX_FEW: with up to N_FEW_COORDINATES coordinates. MIN_INDEX_FEW_SINGULAR: if M is singular as well,
-# because Euler parameters lose two digits even in sound models. MIN_INDEX_MANY: with more coordinates, because the code
-# gets longer
+# all rows of G may be added to M if the index in MIN_PIVOTS is at least this, that is, if pivots are small.
+# MIN_INDEX_FEW: with up to N_FEW_COORDINATES coordinates. MIN_INDEX_FEW_SINGULAR: if M is singular as well, as Euler
+# parameters lose two digits even in sound models. MIN_INDEX_MANY: with more coordinates, as code gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
 MAX_PIVOT_RATIO = 1e5  # no refinement is needed if entries of M, with added rows, are at most this times their pivots

@@ -30,8 +30,7 @@ SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # operations without short pul
 MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, have no short pulses up to this degree
 MAX_DEGREE_OF_STATE = 32  # polynomials in q and v, and their roots, have no short pulses up to this degree
 MAX_DEGREE_OF_DIVISOR = 4  # up to this total degree of its divisors, in q and v, a quotient has no short pulses
-# a quotient has no short pulses if it decays, for large x, at most with this exponent, as 1 / (1 + (x / w)**2) does
-FASTEST_DECAY = -2.0
+FASTEST_DECAY = -2.0  # quotients that decay faster, for large x, may have short pulses; 1 / (1 + (x / w)**2) has none
 MAX_RATE = 4.0  # long steps resolve a sine if its argument changes by at most this per unit of a coordinate or velocity
 # callbacks are traced for this analysis only with at most this many coordinates: otherwise tracing may take seconds,
 # ten times as long as sampling the forces during a run

@@ -19,8 +19,7 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# v has a polynomial of its own if the rounding error of q over the duration of an interval exceeds this number of
-# tolerances of v
+# v has a polynomial of its own if rounding of q over an interval exceeds this number of tolerances of v
 MAX_VELOCITY_ROUNDING = 10.0
 # a position is singular if its pivot is below this fraction of the larger pivot at the ends of its interval
 SINGULAR_PIVOT_RATIO = 0.01

@@ -31,7 +31,7 @@ FEW_COORDINATES = 5  # with fewer coordinates, MAX_OPERATIONS_FEW replaces MAX_O
 SERIES_TOLERANCE_MANY = 1e-8  # replaces SERIES_TOLERANCE from MANY_COORDINATES on with generated code
 LOOSE = 3e-5  # from this tolerance on, the method for few digits integrates stiff motion
 TIGHTEST = 9e-7  # below this tolerance, the method for many digits integrates stiff motion
-# from this h rho on, stiffness may limit DOP853 (stable to 5.9) and Adams. h: step size, rho: largest rate of motion
+# from this h rho on (rho: largest rate of motion), stiffness may limit DOP853 (stable to 5.9) and Adams
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25
 LIMIT_FEW_OF_MANY = 2.0  # replaces LIMIT_FEW from MANY_COORDINATES on, where evaluations cost more than a trial
 # number of successive estimates of h rho above the limit before a trial, as accuracy may allow a few long steps; for

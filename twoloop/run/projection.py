@@ -32,8 +32,7 @@ Array = NDArray[np.float64]
 MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle between a row of C_q and the other rows is below this
 # MAX_CORRECTIONS: largest number of Newton iterations; ROUNDING: correction that ends them, relative to max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# a guess is on the same assembly if its projection differs from the prediction by C_q by at most this fraction of the
-# displacement of the guess
+# on the same assembly, projections deviate from predictions by C_q by at most this fraction of a guess's displacement
 MAX_NONLINEARITY = 0.5
 
 

@@ -159,8 +159,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-# a change is sudden if the second difference exceeds this fraction of the range of the samples (pulses 4 spacings wide)
-SUDDEN_RATIO = 0.1
+SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of samples
 LEAST_RANGE = 0.1  # samples are examined if their range exceeds this fraction of rtol times the largest value so far
 # samples are examined only if their range exceeds this, in any unit: squares of smaller values underflow, and subnormal
 # numbers are too coarsely spaced to look smooth

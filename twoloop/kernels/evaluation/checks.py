@@ -128,8 +128,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # the state satisfies the constraints up to rounding. DEFINITE: M varies, and all its eigenvalues are above their limit
 # by EIGENVALUE_MARGIN. INDEFINITE: M varies, and an eigenvalue is below its limit by EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-# recorded sizes of coordinates apply up to this distance from the recorded position, relative to these sizes
-MAX_RELATIVE_DISTANCE = 0.5
+MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes apply up to this distance from their position, relative to these sizes
 ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
 EIGENVALUE_MARGIN = 2.0  # factor by which eigenvalues must differ from their limit, so that rounding does not decide
 

@@ -239,8 +239,7 @@ def solve_by_schur_complement(f, w, r, c, a):
 
 
 MIN_ROWS = 8  # the augmented form is fastest if there are at least this many rows and degrees of freedom (measured: 7)
-# with at least this many coordinates, the augmented form is fastest with any number of degrees of freedom, unless M is
-# diagonal (measured: about 30)
+# from this number of coordinates on, the augmented form is always fastest, unless M is diagonal (measured: about 30)
 MIN_COORDINATES = 32
 
 

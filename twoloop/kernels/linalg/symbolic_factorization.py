@@ -245,7 +245,7 @@ Entries = tuple[Integers, Integers]  # row indices and column indices of the non
 # indices of the sizes with which a program begins; functions at the end of this module return its other sections
 N_COORDINATES, N_PIVOTS, N_OFF_DIAGONAL, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program with at most this many updates (multiplications) is always written
-# a longer program is written if it has at most this many updates per n^3, for n pivots: else dense factors are faster
+# longer programs have at most this many updates per n^3, for n pivots: with more, dense factors are faster
 MAX_UPDATE_RATIO = 1e-3
 MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer one takes too much memory
 

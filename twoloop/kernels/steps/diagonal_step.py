@@ -93,8 +93,7 @@ def factor_newton_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        # L D L^T fails if the matrix is indefinite, as for a compressed beam. The failed attempt has overwritten the
-        # matrix: fill it again, and use L U
+        # L D L^T fails, and overwrites the matrix, if it is indefinite, as for a compressed beam: use L U instead
         _fill_newton_matrix(w, memory, n, m, z, storage)
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 

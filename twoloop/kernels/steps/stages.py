@@ -13,8 +13,7 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-# the polynomial of the previous step predicts the stages if the step size is at most this multiple of the previous one
-MAX_STEP_RATIO = 3.0
+MAX_STEP_RATIO = 3.0  # up to this ratio to the previous step size, that step's polynomial predicts the stages
 # factor on the result of `estimate_end_error` in methods with Richardson's estimate, which misses only jumps of the
 # force between an end of the step and the nearest stage
 END_ERROR_WEIGHT = 0.01
