@@ -581,9 +581,6 @@ class FactorAndSolvePrograms:
     def _solve(self, rhs: Sequence[Affine]) -> list[Affine]:
         return solve(self._blocks, rhs)
 
-    def _independent_c(self) -> list[Affine]:
-        return [self._c[k] for k in self._choice.rows]
-
     def _make_solution_program(self) -> Program:
         """Return the program for "a" and "lam", the solution of the equations of motion."""
         lam = [self._zero] * len(self._c)
@@ -595,11 +592,12 @@ class FactorAndSolvePrograms:
     @cached_property
     def least_norm_program(self) -> Program:
         """Return the program for "lam", the multipliers of least norm."""
-        rows = [self._rows.get(k, []) for k in range(len(self._c))]
-        return Program(
-            self.graph,
-            {"lam": multipliers_of_least_norm(self.graph, self._independent_c(), rows, self._choice.rows, self._solve)},
+        rows, independent = (
+            [self._rows.get(k, []) for k in range(len(self._c))],
+            [self._c[k] for k in self._choice.rows],
         )
+        lam = multipliers_of_least_norm(self.graph, independent, rows, self._choice.rows, self._solve)
+        return Program(self.graph, {"lam": lam})
 
 
 def _shared_quantities(graph: Graph, factors: Sequence[int], other_programs: Sequence[Program]) -> list[int]:

@@ -648,12 +648,8 @@ class LaneCode(LaneSteps):
         """Return `orientation_change_mask` for the step; None for series, whose defects reveal singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
-        return orientation_change_mask(
-            emit, *(self._row_values(emit, memory, time, base) for time, base in self._ends_of_step(memory))
-        )
-
-    def _ends_of_step(self, memory: LaneMemory) -> list[tuple[int, Value]]:
-        return [(lanes.T, memory.state), (lanes.T_NEW, memory.new)]
+        ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)
+        return orientation_change_mask(emit, *(self._row_values(emit, memory, *end) for end in ends_of_step))
 
     def _row_values(self, emit: LaneEmitter, memory: LaneMemory, time: int, base: Value) -> list[dict[int, Value]]:
         """Return the nonzero entries of each row of G, by column; `time`: field of t; `base`: pointer to the state."""
