@@ -592,10 +592,8 @@ class FactorAndSolvePrograms:
     @cached_property
     def least_norm_program(self) -> Program:
         """Return the program for "lam", the multipliers of least norm."""
-        rows, independent = (
-            [self._rows.get(k, []) for k in range(len(self._c))],
-            [self._c[k] for k in self._choice.rows],
-        )
+        rows = [self._rows.get(k, []) for k in range(len(self._c))]
+        independent = [self._c[k] for k in self._choice.rows]
         lam = multipliers_of_least_norm(self.graph, independent, rows, self._choice.rows, self._solve)
         return Program(self.graph, {"lam": lam})
 
