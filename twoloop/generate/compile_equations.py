@@ -342,7 +342,7 @@ class SplitFunctions:
 
 
 def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
-    """Write an early return for invalid results, so that no argument is changed; write nothing in SIMD lanes."""
+    """Emit a return of false for invalid results, before the output arrays are written; emit none in SIMD lanes."""
     if is_valid.type == BIT:
         emit.builder.return_false_unless(is_valid)
 

@@ -416,7 +416,7 @@ class Elimination:
 
     @property
     def accelerations(self) -> list[Program]:
-        """Return the programs for accelerations: `reduced_program`, if there is one, then `mass_first_program`."""
+        """Return `reduced_program`, if there is one, and `mass_first_program`, which replaces it if it is not valid."""
         return (
             [self.mass_first_program]
             if self.reduced_program is None

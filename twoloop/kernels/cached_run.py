@@ -237,11 +237,13 @@ def _has_consistent_rows(w, b, n):
 
 
 @merged
-def _evaluate_start(checked_kit, b, t, q, v, sizes, shifts):
-    """Evaluate all callbacks at a start, store the results in arrays of `b`; return the flags, see `evaluate_start`."""
+def _evaluate_start(checked_kit, b, t, q, v, records, shifts):
+    """Evaluate all callbacks at a start into arrays of `b`; return flags such as CONSISTENT (see `evaluate_start`)."""
     for k in range(b.start_values.size):
         b.start_values[k] = 0.0
-    return b.evaluate_start(checked_kit, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings)
+    return b.evaluate_start(
+        checked_kit, t, q, v, records, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings
+    )
 
 
 @merged
@@ -253,7 +255,7 @@ def _add_known_entries(b):
 
 
 @merged
-def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, checks):
+def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     """Prepare a run from t to t1, with rows and coordinates chosen as before; return 0, REFUSED, IN_DOUBT or UNCHOSEN.
 
     `checked_kit` contains the callbacks that the check of the start calls; `checks`: the last check that Python made.
@@ -262,7 +264,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, checks):
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
     has_all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
-    flags = _evaluate_start(checked_kit, b, t, q, v, sizes, b.shifts[: 0 if has_all_entries else len(b.shifts)])
+    flags = _evaluate_start(checked_kit, b, t, q, v, records, b.shifts[: 0 if has_all_entries else len(b.shifts)])
     if has_all_entries:
         _add_known_entries(b)
     if flags & WELL_FORMED == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
@@ -378,7 +380,7 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
 
 
 @kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, i8), vectorized=True)
-def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, checks):
+def start_and_advance(f, checked_kit, w, b, t, t1, q, v, records, region, checks):
     """Start a run from t to t1, and take the first steps; return the number of steps, or one of the codes above.
 
     If a start is repeated bit for bit, the second run checks it again, and saves the data of the started run. The third
@@ -391,7 +393,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, checks):
     else:
         b.last_start[N_EQUAL] = NEVER
         checks = CHOICES_CHECKED if is_repeated else checks
-        start_code = _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, checks)
+        start_code = _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks)
         if start_code != 0:
             return start_code
         if is_repeated:

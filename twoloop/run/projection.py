@@ -403,7 +403,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # curvature may explain the distance: project a guess with the new dependent and the old other coordinates
+        # or curvature explains the distance: on the same assembly, a guess with dependent coordinates of `projected`
+        # and the others of q1 is projected back to q1
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)

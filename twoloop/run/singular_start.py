@@ -28,7 +28,8 @@ WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank rises if derivatives of zero singular values, relative to the derivatives of C_q, are larger than this
 MIN_RANK_DERIVATIVE = 1e-6
-# smallest derivative of the rows along v that counts, relative to the derivative along a velocity of tolerance size
+# the derivative of a zero singular value is certain if it is at least this multiple of its error, the derivative of the
+# rows along a velocity as large as its tolerances
 MIN_CLARITY = 10.0
 # relative change of the rows. BESIDE_CHANGE: from the start to a state beside it; STEP_CHANGE: in the first trial step
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6

@@ -414,7 +414,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
-    """Return the time of the next sudden change that samples in time alone show, or `next_change` if it is earlier."""
+    """Sample the forces ahead at constant (q, v); return the time of the first sudden change, at most `next_change`."""
     max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
     # closer samples are not needed with multistep methods (JUMP_RATIO = 1), because their error estimates show a jump,
     # or if C_t or b may jump (MAY_JUMP = 1), because the steps are then checked for jumps

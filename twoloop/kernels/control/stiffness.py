@@ -74,7 +74,8 @@ QUIET_FACTOR = 10.0  # steps at the stability limit excite oscillations with vel
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # the explicit method is tried again if h rho is below this multiple of LIMIT
-# factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method
+# the implicit method has to meet a tenth of the tolerances during its trial: its order is lower, and it must not win by
+# errors that are larger than those of the explicit method
 TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
@@ -313,7 +314,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # a trial that may not pay, or that needs finite differences, must cost little compared with the run so far
+    # unless stability surely limits the steps, a trial begins only if it is cheap compared with the cost of the run so
+    # far, or with a part of that expected for the whole run; more so if the Jacobian needs finite differences
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)
@@ -326,8 +328,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a run of high cost starts a trial whatever the rates are: if friction is about to reverse, few states show the
-    # largest rate. The condition on `cost` excludes the short steps at the start, when the expected cost is unknown
+    # a run of high cost starts a trial whatever the rates are: friction is stiff only while it reverses, and few
+    # estimates fall into this time. `cost > min_cost`: short steps at the start say little about the cost of the run
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > STABILITY_LIMIT

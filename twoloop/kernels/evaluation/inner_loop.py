@@ -90,7 +90,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_equations_at(f, w, t, q):
-    """Factor the equations of the accelerations at (t, q), from the rows of G, their factors and w.D; return a code."""
+    """Factor the linear system for accelerations at (t, q), after the rows and `find_null_space`; return a code."""
     if f.constant_mass == 0:
         w.factored = 0.0
         mass_matrix(f, w, t, q)
@@ -102,7 +102,7 @@ def factor_equations_at(f, w, t, q):
 
 @merged
 def compute_accelerations(f, w, t, q, v, a):
-    """Store the accelerations at (q, v) in `a`, from the rows of G, their factors and w.D; return a code."""
+    """Store the accelerations at (q, v) in `a`, after the rows, their factors and w.D (NULL_SPACE); return a code."""
     w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:

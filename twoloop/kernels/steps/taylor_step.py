@@ -358,7 +358,8 @@ TARGET_PREDICTION_ERROR = 0.3
 # times the defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
-# golden section: fractional parts of its multiples are evenly distributed from 0 to 1
+# places where the defect is checked shift by this fraction of their spacing at each attempt: multiples of the golden
+# section have evenly distributed fractional parts, so that no place is missed for long
 GOLDEN_SECTION = 0.6180339887498949
 MAX_DEFECT = 1e300  # replaces an infinite defect, which is returned if a function has no finite value within the step
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
