@@ -28,11 +28,11 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings | None = None) -> 
     commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == GROUP]
     own = rows[rows["family"] == "two-loop"]  # which stand in every verdict; of others, some may be older
-    made = own.reindex(columns=["case", "processor", "commit"]).groupby("case").first()
+    new = own.reindex(columns=["case", "processor", "commit"]).groupby("case").first()
     lines = []
     for case, at in (standings_of(tables.medians(rows)) if known is None else known).items():
-        at_commit = made.loc[case, "commit"]
-        about = {"processor": made.loc[case, "processor"], "case": case}
+        at_commit = new.loc[case, "commit"]
+        about = {"processor": new.loc[case, "processor"], "case": case}
         about["commit"] = at_commit if isinstance(at_commit, str) else commit[1] if commit else ""
         for error, standing in zip(DECADES, at, strict=True):
             for who, each in standing.items():
@@ -42,20 +42,20 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings | None = None) -> 
     return pd.DataFrame(lines, columns=COLUMNS)
 
 
-def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
+def added(path: Path, new: pd.DataFrame) -> pd.DataFrame:
     """Put new lines in the place of those of the same processors and mechanisms in the file."""
-    before = pd.read_csv(path) if path.is_file() else made[:0]
+    before = pd.read_csv(path) if path.is_file() else new[:0]
     place = ["processor", "case"]
-    again = before.set_index(place).index.isin(made.set_index(place).index)
-    return pd.concat([before[~again], made], ignore_index=True)[COLUMNS]
+    again = before.set_index(place).index.isin(new.set_index(place).index)
+    return pd.concat([before[~again], new], ignore_index=True)[COLUMNS]
 
 
 def kept(output: Output, rows: pd.DataFrame, stamp: str, known: Standings) -> list[dict[str, Any]]:
     """Keep the verdicts of these rows beside those of other processors, and compare theirs with each other one."""
-    made = verdicts(rows, stamp, known)
-    table = added(output.file(FILE), made)
+    new = verdicts(rows, stamp, known)
+    table = added(output.file(FILE), new)
     output.write(FILE, table.to_csv(index=False))
-    own = set(made["processor"])
+    own = set(new["processor"])
     return [pair for pair in findings_of(table) if any(line["name"] in own for line in pair["processors"])]
 
 

@@ -24,11 +24,11 @@ MARKS = {"alone": "ours", "missed": "others", "none": "–"}  # cells of the pic
 def make(output: Output) -> pd.DataFrame:
     call = output.call
     with output.kept() as kept:
-        made = [mechanisms.collect(call.wanted(mechanisms.runs(call.quick)), kept), first_calls.collect(kept, call)]
+        parts = [mechanisms.collect(call.wanted(mechanisms.runs(call.quick)), kept), first_calls.collect(kept, call)]
         minimal, errors = call.wanted(mechanisms.minimal_runs(call.quick)), () if call.quick else RESOLVED
-        made += [adaptive.collect(minimal, kept, mechanisms.row_at_end, lambda run: True, errors)]
+        parts += [adaptive.collect(minimal, kept, mechanisms.row_at_end, lambda run: True, errors)]
     # the time of a fixed calculation, by which times of several processors can be compared
-    return pd.concat(made, ignore_index=True).assign(calibration=CALIBRATION, calibration_s=calibration_s())
+    return pd.concat(parts, ignore_index=True).assign(calibration=CALIBRATION, calibration_s=calibration_s())
 
 
 def part(rows: pd.DataFrame, group: str) -> pd.DataFrame:

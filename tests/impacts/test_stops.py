@@ -213,8 +213,8 @@ def test_impacts_that_follow_ever_faster_come_one_by_one(masses, restitutions, x
     system, stops = line(masses, restitutions, wall)
     options = {"rtol": tolerance, "atol": tolerance}
     result = solve_with_stops(system, (0.0, 2.5), np.array(x), np.array(v, dtype=float), stops, **options)
-    known = one_by_one(masses, restitutions, x, v, 2.5, wall)
-    assert result.success and np.abs(result.q[:, -1] - known).max() < 10.0 * tolerance, result.message
+    expected = one_by_one(masses, restitutions, x, v, 2.5, wall)
+    assert result.success and np.abs(result.q[:, -1] - expected).max() < 10.0 * tolerance, result.message
 
 
 def test_rounding_of_coordinates_that_are_zero_does_not_end_a_motion():
@@ -227,8 +227,8 @@ def test_rounding_of_coordinates_that_are_zero_does_not_end_a_motion():
     for k in range(2):
         model.stop(f"{k + 1}", (x[k + 1], 0.0), f"{k}", (x[k], 0.0), normal=(1.0, 0.0), restitution=restitutions[k])
     _, result = moved(model, 2.5, rtol=1e-6, atol=1e-6)
-    known = one_by_one(masses, restitutions, x, speeds, 2.5, False)
-    np.testing.assert_allclose(result.q[::3, -1], known, atol=1e-5)
+    expected = one_by_one(masses, restitutions, x, speeds, 2.5, False)
+    np.testing.assert_allclose(result.q[::3, -1], expected, atol=1e-5)
 
 
 EQUAL, UNEQUAL = ([1.0] * 4, [1.0] * 3), ([1.0, 2.0, 1.5, 0.5], [0.3, 0.8, 0.2])  # masses and restitutions

@@ -82,8 +82,8 @@ def test_readme_has_the_numbers_of_its_other_reports():
     told = [f"{own['ended'] - own['wrong']} of {own['n']}" for own in singular]
     assert f"right in {told[0]} runs, `DOP853` and `compiled=False` in {told[1]}, IDA in {told[2]}." in README
     typical = {at["error"]: at["median"] for at in findings("work_precision")["typical"]}
-    told = [number(typical[error]) for error in (1e-4, 1e-8, 1e-10)]
-    assert "{} times our time at 1e-4 (median), but {} times at 1e-8 and {} times at 1e-10".format(*told) in README
+    ratios = [number(typical[error]) for error in (1e-4, 1e-8, 1e-10)]
+    assert "{} times our time at 1e-4 (median), but {} times at 1e-8 and {} times at 1e-10".format(*ratios) in README
     first = next(each for each in findings("work_precision")["first_calls"] if each["solver"] == "auto, compiled")
     assert f"takes up to {number(first['most'])} s ({first['n']} timed)" in README
     counts, untestable = findings("claims")["counts"], findings("claims")["untestable"]

@@ -616,9 +616,9 @@ def _new_run(
         branch = branch_at(system, t0, run.state, run.rank, options.atol + options.rtol * np.abs(v0).max())
         run.starts_singular = branch is not None
         if isinstance(branch, Branch) and not has_fixed_step:
-            beside, other = _create_run(system, t0, branch.q, branch.v, options, derived, check)
-            if beside.rank == branch.rank and beside.fixed_order is None:
-                run, code = beside, other
+            neighbour, neighbour_code = _create_run(system, t0, branch.q, branch.v, options, derived, check)
+            if neighbour.rank == branch.rank and neighbour.fixed_order is None:
+                run, code = neighbour, neighbour_code
                 run.move_to_singular_start(t0, q0, v0, branch.a, branch.first_size)
     if new:
         share_checked_bounds(original)
