@@ -165,30 +165,31 @@ def compute_accelerations_at(f, w, t, q, v, a):
 
 
 @merged
-def _add_least_correction(f, w, x):
-    """Add to x the least correction, in the metric of M, that changes G x by w.g; return max|correction|."""
+def _find_least_correction(f, w):
+    """Store in w.y the least correction x, in the metric of M, with G x = w.g; return max|x|, or inf if not finite."""
     w.Q[:] = 0.0
     solve(f, w, w.Q, w.g, w.y)
     largest = 0.0
-    for j in range(x.size):
+    for j in range(w.y.size):
         if not np.isfinite(w.y[j]):
             return np.inf
-        x[j] += w.y[j]
         largest = max(largest, abs(w.y[j]))
     return largest
 
 
 @merged
-def _correct_state(f, w, q, v):
-    """Correct q and v in place by one pass of the projection, with the factors at q; return their max|corrections|."""
+def _find_corrections(f, w, v):
+    """Correct v in place with the factors at q, and store the correction of q in w.y; return max|corrections|."""
     rows, n_c = w.rows_v, w.C.size
-    for i in range(rows.size):
-        w.g[rows[i]] = -w.C[rows[i]] if rows[i] < n_c else 0.0
-    correction_q = _add_least_correction(f, w, q)
     row_residual(w, v, rows)
     for i in range(rows.size):
         w.g[rows[i]] = -w.z[i]
-    return correction_q, _add_least_correction(f, w, v)
+    correction_v = _find_least_correction(f, w)
+    for j in range(v.size):
+        v[j] += w.y[j]
+    for i in range(rows.size):
+        w.g[rows[i]] = -w.C[rows[i]] if rows[i] < n_c else 0.0
+    return _find_least_correction(f, w), correction_v
 
 
 @merged
@@ -216,17 +217,20 @@ def project_state(f, w, t, q, v, theta, a, lam):
         # with NULL_SPACE, find_null_space has already evaluated the rates
         if f.kinematics_given == 0 and f.form != NULL_SPACE:
             constraint_rates(f, w, t, q, w.Rate)
-        correction_q, correction_v = _correct_state(f, w, q, v)
+        correction_q, correction_v = _find_corrections(f, w, v)
         if not np.isfinite(correction_q):
             return not_finite(w, CONSTRAINT, t, q)
-        if correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v)):
-            break
-        if correction_q <= w.pivot * theta:
+        has_converged = correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v))
+        is_last = has_converged or correction_q <= w.pivot * theta
+        if not has_converged:
             w.has_gamma = 0.0  # Gamma was computed at the old velocities: compute it again
-            break
-        if correction_q > CONTRACTION * last_correction:
-            if not is_rounding_of_positions(w, q, correction_q):
-                return INNER_DIVERGED
+        if not is_last and correction_q > CONTRACTION * last_correction:
+            if is_rounding_of_positions(w, q, correction_q):
+                break  # without this correction: it would be noise, which moves light bodies by much more than others
+            return INNER_DIVERGED
+        for j in range(q.size):
+            q[j] += w.y[j]
+        if is_last:
             break
         last_correction = max(correction_q, theta)
     code = compute_accelerations(f, w, t, q, v, a)

@@ -390,19 +390,13 @@ def _compute_multipliers(f, w, lam):
 
 
 @compiled
-def _add_least_correction(f, w, x):
-    """Add to x the least correction, in the metric of M, that changes G x by w.g; return max|correction|."""
-    n = x.size
+def _find_least_correction(f, w):
+    """Store in w.unknowns[:n] the least correction x, in the metric of M, with G x = w.g; return max|x|, or inf."""
+    n = w.unknowns.size - w.g.size
     w.unknowns[:n] = 0.0
     copy(w.g, w.unknowns[n:])
     solve_unknowns(f, w, 0)
-    largest = 0.0
-    for j in range(n):
-        if not np.isfinite(w.unknowns[j]):
-            return np.inf
-        x[j] += w.unknowns[j]
-        largest = max(largest, abs(w.unknowns[j]))
-    return largest
+    return largest_of(w.unknowns[:n]) if finite_vector(w.unknowns[:n]) else np.inf
 
 
 @compiled
@@ -428,33 +422,38 @@ def _project_state(f, w, t, q, v, theta):
         code = factor_equations_at(f, w, t, q)
         if code != DONE:
             return code
-        w.C[:] = 0.0
-        f.constraint(t, q, f.p, w.C)
         w.n_inner += 1
-        for i in range(w.g.size):
-            w.g[i] = -w.C[i]
-        correction_q = _add_least_correction(f, w, q)
-        if not np.isfinite(correction_q):
-            return not_finite(w, CONSTRAINT, t, q)
         constraint_rates(f, w, t, q, w.Rate)
         copy(w.Rate, w.g)
         _add_jacobian_times(f, w, v, w.g)
         for i in range(w.g.size):
             w.g[i] = -w.g[i]
-        correction_v = _add_least_correction(f, w, v)
+        correction_v = _find_least_correction(f, w)
         if not np.isfinite(correction_v):
             return not_finite(w, RATE, t, q)
-        if correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v)):
-            return DONE
-        if correction_q <= w.pivot * theta:
-            return DONE
-        if correction_q > CONTRACTION * last_correction:
+        for j in range(v.size):
+            v[j] += w.unknowns[j]
+        w.C[:] = 0.0
+        f.constraint(t, q, f.p, w.C)
+        for i in range(w.g.size):
+            w.g[i] = -w.C[i]
+        correction_q = _find_least_correction(f, w)
+        if not np.isfinite(correction_q):
+            return not_finite(w, CONSTRAINT, t, q)
+        is_last = correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v))
+        is_last = is_last or correction_q <= w.pivot * theta
+        if not is_last and correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
+            # this correction is left out: it would be noise, which moves light bodies by much more than others
             return (
                 DONE
                 if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))
                 else INNER_DIVERGED
             )
+        for j in range(q.size):
+            q[j] += w.unknowns[j]
+        if is_last:
+            return DONE
         last_correction = max(correction_q, theta)
     return INNER_DIVERGED
 
