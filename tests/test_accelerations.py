@@ -302,25 +302,24 @@ def test_results_that_refinement_changes_much_are_invalid(power, holds, longest,
     assert project(0.0, *(x.ctypes.data for x in (*given, *results))) == holds
 
 
-@pytest.mark.parametrize(("mass", "is_refined"), [(1e-7, True), (40.0, False)])
-def test_rows_added_to_much_less_inertia_need_refinement(mass, is_refined):
-    masses = {"n_q": 3, "mass": lambda t, q: np.diag([40.0, 1e-9, mass]), "jacobian": lambda t, q: q.reshape(1, 3)}
-    choice = PivotChoice.choose(pendulum(**masses), 0.0, np.array([-0.8, 0.36, 0.48]))
-    assert choice.added_rows == (0,) and choice.is_refined == is_refined
+@pytest.mark.parametrize(
+    ("pin", "offset", "rounding"),
+    [(0.0, (3.0, 1.5, -1.0), 1e-13), (0.0, (0.0, 0.0, 0.0), 1e-13), (100.0, (1e-4, 2e-4, -1e-4), 2e-12)],
+)
+def test_little_inertia_far_from_a_joint_or_about_it(pin, offset, rounding):
+    """Without refinement, or with one scale for all rows added to M, the equations hold to 3e-8 of their terms only.
 
-
-@pytest.mark.parametrize("position", [(3.0, 1.5, -1.0), (0.0, 0.0, 0.0)])
-def test_little_inertia_far_from_a_joint_or_about_it(position):
-    """Without refinement, or with one scale for all rows added to M, the equations hold to 3e-8 of their terms only."""
-    model, motion = SpatialModel(), {"position": position, "angular_velocity": (1.0, 2.0, 3.0)}
+    Near a joint far from the origin, rounding of C turns the bob: the last correction has to be left out.
+    """
+    model, motion = SpatialModel(), {"position": np.add(pin, offset), "angular_velocity": (1.0, 2.0, 3.0)}
     bob = model.body("bob", mass=1e4, inertia=(1e-5, 2e-5, 1.5e-5), **motion)
-    model.spherical("ground", bob, at=(0.0, 0.0, 0.0))
-    model.spring(bob, (0.2, 0.1, 0.3), "ground", (1.0, 2.0, 0.5), stiffness=20.0, damping=0.1)
+    model.spherical("ground", bob, at=(pin, pin, pin))
+    model.spring(bob, np.add(pin, (0.2, 0.1, 0.3)), "ground", np.add(pin, (1.0, 2.0, 0.5)), stiffness=20.0, damping=0.1)
     problem = model.problem((0.0, 0.01))
     for method in ("auto", "DOP853"):
-        result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, method, compiled=True)
+        result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, method, compiled=pin == 0.0)
         assert result.success and result.stats.n_rejected_error < 100
         for t, q, v, a, lam in zip(result.t, *(x.T for x in (result.q, result.v, result.a, result.lam)), strict=True):
             M, GT, Q = problem.system.mass(t, q), problem.system.jacobian(t, q).T, problem.system.force(t, q, v)
             left, terms = M @ a + GT @ lam - Q, abs(M) @ abs(a) + abs(GT) @ abs(lam) + abs(Q)
-            assert (np.abs(left) <= 1e-13 * (terms + 1.0)).all()
+            assert (np.abs(left) <= rounding * (terms + 1.0)).all()
