@@ -12,7 +12,7 @@ from scipy.linalg import null_space
 
 from tests.bodies.random_models import Both
 from tests.marks import slow
-from tests.problems import assert_same, pendulum, quick, worst
+from tests.problems import assert_same, quick, worst
 from twoloop import mechanisms, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.generate import compile_equations
