@@ -74,15 +74,15 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 Array = NDArray[np.float64]
 
 MAX_IDLE = 4  # largest number of idle integrators with equal options: one for each thread that integrates
-# number of chunks in the first call of compiled code, if no states are sampled for `StiffnessMonitor`: a longer call
-# would delay the answer to Ctrl-C by more than 0.1 s
+# the first call of compiled code takes this number of chunks, unless `StiffnessMonitor` needs states after each chunk.
+# With more chunks, the answer to Ctrl-C could take more than 0.1 s
 N_FIRST_CHUNKS = 4
-N_SKIPPED_CALLS = 16  # number of calls that do not use an integrator after a callback raised an exception in it
+N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time, s, elapsed time is recorded: reading CPU time takes long
+SHORT_RUN = 1e-3  # after a run of less CPU time, s, elapsed time replaces CPU time, which takes longer to read
 HARMLESS = 0.01  # a correction of v0 is always accepted if it is at most this fraction of the tolerances
-REACHED_END = Status.REACHED_END  # a global name, because access to a member of an Enum takes longer
+REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
 
 STEPS = OutputRequest()  # output at the ends of all steps
@@ -99,9 +99,9 @@ class RepeatRequest:
 class CachedIntegrator:
     """Integrator that is prepared once, and then used for many initial states, one after another.
 
-    run : a run that has not begun, and that nothing else uses. The system of the run is `system`, or a copy of it in
-        which programs derived from traces replace missing callbacks.
-    code : the generated code that the steps of the run call.
+    run : a run at its start, used by this integrator only. Its system is `system`, or a copy of `system` in which
+        programs derived from traces replace missing callbacks.
+    code : the generated code that the steps of the run call; None if they call none.
     definite : whether M is positive definite.
     shared : setup that systems share if they differ only in their parameters.
     """
@@ -118,29 +118,29 @@ class CachedIntegrator:
         self.parametric = None if shared is None else ParametricRun(shared, run)
         self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
-        # largest number of attempted steps, which is the largest number of states, in the first chunk
+        # largest number of attempted steps in the first chunk, and so of its states: each attempt adds at most one
         n_attempts = max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, n_attempts
         checked = system if self.parametric is None else self.parametric.system
-        # skips: number of coming calls that do not use the integrator, because a callback raised an exception
+        # skips: number of coming calls that will not use the integrator, because a callback raised an exception
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # indices in `arrays.block` at which the states begin, and at which the report of a run with one state begins
+        # indices in `arrays.block`: where the states begin; where the report begins if the run has one state only
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
         self.attributes_at_start = {key: getattr(run, key) for key in ("plan", "memory", "chunk", "kit")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.interpolation = OutputInterpolation(run)
-        self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether generated code is called
-        self.independent_rows = self.arrays.start_rows.tobytes()  # bytes of the indices of independent rows
+        self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # last entry: whether generated code is called
+        self.independent_rows = self.arrays.start_rows.tobytes()  # indices of the independent rows, as bytes
         self.redundancy = {self.independent_rows: (run.redundant, run.rows_warning)}
 
     @staticmethod
     def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
         """Return whether a cached integrator, which reuses its arrays, can provide the requested `output`."""
-        # `sol` and interpolated output must agree; `sol` must not use arrays that are filled for other parameters
+        # `sol` and interpolated output must agree; and the arrays that `sol` uses must not get other parameters later
         if output.dense and (output.interpolated_times is not None or shared is not None):
             return False
         return output.interpolated_times is None or not (
@@ -160,8 +160,8 @@ class CachedIntegrator:
     ) -> dict[str, Any] | RepeatRequest | None:
         """Integrate a system from a start; return the fields of the result, or a request to repeat the run.
 
-        Return None if the start needs more checks, or if a callback raised: `set_up` then describes the problem. After
-        a usual run, the fields are `status` and `later`, which computes the other fields from a copy of the arrays.
+        Return None if the start needs more checks, or if a callback raised: `set_up` then describes the problem. If
+        nothing unusual happens, the fields are `status` and `later`, a function that computes the others when read.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
         is_due = region.is_comparison_due()
@@ -186,7 +186,7 @@ class CachedIntegrator:
                 n = self._start_and_advance(*start, loops.STATE_CHECKED)
             if n == loops.UNCHOSEN and self._pivots_suit_start(t0, q0):
                 n = self._start_and_advance(*start, loops.CHOICES_CHECKED)
-        except Exception as error:  # raised by a callback: `IntegrationLoop` will handle it
+        except Exception as error:  # from a callback: the run is repeated, and `IntegrationLoop` handles the exception
             if raised_by_handler(error):
                 raise
             self.skips, arrays.last_start[loops.N_EQUAL] = N_SKIPPED_CALLS, loops.NEVER
@@ -213,11 +213,11 @@ class CachedIntegrator:
         fields["later"] = partial(
             _deferred_field, data, timed_states, self.run_fields, self.cpu_time, system, t1, self.options
         )
-        region.count_run()  # runs that `IntegrationLoop` has continued are counted by `check_callbacks_along_run`
+        region.count_run()  # if `IntegrationLoop` has continued a run, `check_callbacks_along_run` counts it instead
         return fields
 
     def _pivots_suit_start(self, t0: float, q0: Array) -> bool:
-        """Return whether the pivots of the code suit the start (T0, Q0), whose M and G are in the arrays."""
+        """Return whether the pivots chosen for the code are large enough at (t0, q0); M and G are in the arrays."""
         system, arrays = self.evaluation.system, self.arrays
         system.remember_at("mass and rows", (t0, q0.tobytes()), (arrays.mass.copy(), arrays.rows.copy()))
         return self.code is not None and self.code.is_valid_from(system, t0, q0)
@@ -236,9 +236,9 @@ class CachedIntegrator:
     ) -> dict[str, Any] | RepeatRequest | tuple[tuple[Array, Array] | None] | None:
         """Check the first chunk of a run, and integrate to the end if this chunk does not reach it or is unusual.
 
-        If the run is unusual, return the result of `integrate`, or None if the start needs more checks. Otherwise
-        return a tuple of one element: (output times, states), or None for output at all steps; store a requested `sol`
-        in `fields`. `is_due`: see `check_callbacks_along_run`.
+        If the run is unusual, return what `integrate` has to return: fields, a request, or None (the start needs more
+        checks). Otherwise store a requested `sol` in `fields`, and return a tuple with one element: (output times,
+        states), or None if all steps are output. `is_due`: see `check_callbacks_along_run`.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -282,7 +282,7 @@ class CachedIntegrator:
     def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
         """Update the redundant rows of the run at a new start; return False if start or parameters need more checks."""
         run = self.run
-        if run.rows_warning:  # rounding may decide which of several dependent rows is left out
+        if run.rows_warning:  # rounding may decide which of several dependent rows counts as redundant
             independent = self.arrays.start_rows.tobytes()
             if independent not in self.redundancy:
                 new_run = run.copy_to_start(run.t0, q0, v0)
@@ -294,7 +294,7 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Store the redundant rows, and the warning about them, that belong to these independent rows."""
+        """Store which rows are redundant, and the warning about them, given the independent rows as bytes."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows
@@ -303,7 +303,7 @@ class CachedIntegrator:
         """Restore the attributes of the run, other than arrays, that `IntegrationLoop` may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            # the run's own plan is unchanged, but its kit may have been renewed to load a step: use the new kit
+            # the plan is still the first one, but a new kit may contain a step that was loaded later: keep this kit
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
@@ -314,7 +314,7 @@ class CachedIntegrator:
         def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            # with the extreme states of this run, the checked region contains all states of an equal run
+            # once these extreme states are checked, the checked region contains all states of an equal run
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
         checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
@@ -327,14 +327,14 @@ def fields_of(
     """Return the fields of the result of a run, from the record of `IntegrationLoop`; `compiled`: see `Result`."""
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
     fields["t_end"] = t_end
-    if (own := options.own_tolerance) is not None:  # Newmark has a tolerance of its own for positions
-        error = own ** (2.0 / 3.0)  # error of a run whose steps all meet this tolerance
+    if (own := options.own_tolerance) is not None:  # tolerance of Newmark for positions
+        error = own ** (2.0 / 3.0)  # error of the whole run if each step meets this tolerance
         fields |= {"rtol": error, "atol": np.full(system.n_q, error), "untested": np.ones(len(record.h), dtype=bool)}
     return fields
 
 
 def _deferred_field(
-    data: Array,  # copy of the run's report, times, steps and states
+    data: Array,  # copy of the report, times, steps and states of a run
     timed_states: tuple[Array, Array] | None,  # output times and states; None: all steps
     run_fields: tuple[int, NDArray[np.int64], bool],
     cpu_time: float,
@@ -343,7 +343,7 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Return a dict with the deferred field `name` of a result and the fields that the same computation gives."""
+    """Compute the deferred field `name` of a result; return a dict with this field and others computed with it."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -360,14 +360,14 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-# `set_up` need not check starts whose smallest pivot is at least this fraction of the first start's
+# `set_up` need not check a start if its smallest pivot is at least this fraction of the pivot at the first start
 RECHECK_PIVOT = 0.1
 
 
 def arrays_of(
     run: Run, evaluation: StartEvaluation, code: GeneratedCode | None, definite: bool, options: Options, n_attempts: int
 ) -> SimpleNamespace:
-    """Return new arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for `n_attempts` attempts.
+    """Return new arrays for `start_and_advance` of kernels/cached_run.py, with space for `n_attempts` steps.
 
     `run` must be at its start; its clock, control and tolerances are replaced by views of one array.
     `evaluation.system` has the parameters of the call. For the other arguments see `CachedIntegrator`.
@@ -387,7 +387,7 @@ def arrays_of(
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = DependentColumns(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.choose else (none, none, 0, np.zeros(0), none, none)
-    nonzero = np.flatnonzero(memory.view(np.int64))  # indices of numbers with nonzero bits: -0.0 must be restored, too
+    nonzero = np.flatnonzero(memory.view(np.int64))  # indices of numbers with nonzero bits, to be restored: -0.0, too
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     start_constants: tuple[float, ...]
     start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.checks_within else 1.0
@@ -432,22 +432,22 @@ def arrays_of(
 
 
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
-    """Return a choice of pivots as the array of integers that kernels read, and the factor of the added rows."""
+    """Return a choice of pivots as an array of integers for kernels, and the factor of the rows added to M."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # kernels do not compare rows added to M: if the choice is refined, Python has to make it
+    # a refined choice compares rows that may be added to M, which only Python can do
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
 
 
-# limits of a system's cache. MAX_OPTIONS: number of sets of options. MAX_WORKSPACE: number of floats in the workspace
-# of a run. MAX_ENTRIES: number of entries with equal options; their starts differ, and may need different code
+# largest numbers in a system's cache. MAX_OPTIONS: sets of options. MAX_WORKSPACE: floats in the workspace of a run.
+# MAX_ENTRIES: entries with equal options but different starts, which may need different code
 MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
 class CacheEntry(NamedTuple):
-    """Run at its start, and idle integrators, for calls with the same options from this or other starts."""
+    """Cached run at its start, and idle integrators, for calls with the same options from the same or other starts."""
 
     run: Run
     start: tuple[float, bytes, bytes]  # t0, and the bytes of q0 and v0
@@ -456,10 +456,10 @@ class CacheEntry(NamedTuple):
     definite: bool  # whether M was definite at the start
     for_other_starts: bool  # whether copies of the run can begin at other starts
     idle: list[CachedIntegrator] | None  # integrators not in use; None: compiled code cannot start this run
-    shared: SharedSetup | None = None  # setup shared with systems that have other parameters
+    shared: SharedSetup | None = None  # setup shared with systems that differ only in their parameters
 
 
-# cached data of a system: its last start, its entries by options, and the id of code that the last run generated
+# cached data of a system: its last start, its entries (keys: options), and the id of code that the last run generated
 EMPTY_CACHE: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 
@@ -474,10 +474,10 @@ def cached_result(
     time_limit: float | None,
     interrupts: Interrupts,
 ) -> tuple[dict[str, Any], str] | RepeatRequest | Run | None:
-    """Integrate with a cached integrator for a system and options; create it at the first call.
+    """Integrate with the cached integrator for a system and options; create the integrator at the first call.
 
-    Return the fields of the result and a warning about redundant rows (or ""); or a request to repeat the run; or, if
-    the run cannot be cached, a `Run` at its start; or None, if `set_up` must check the start.
+    Return (fields of the result, warning about redundant rows or ""); or a request to repeat the run; or, if the run
+    cannot be cached, a `Run` at its start; or None if `set_up` must check the start.
     """
     entries = system.derived.get("runs", EMPTY_CACHE)[1].get(options.key, ())
     if not entries and (shared := system.shared.get("runs")):
@@ -512,9 +512,9 @@ def cached_result(
 def set_up(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, CacheEntry | None]:
-    """Return a run at its start (new, or a copy of a cached run), and the cache entry if one was added for it, or None.
+    """Return a run at its start (new, or a copy of a cached run), and the cache entry that this call added, or None.
 
-    Runs are cached if the method is one of twoloop's own, callbacks are compiled, and traces are trusted. Raise
+    A run is cached if twoloop provides the method, callbacks are compiled, and traces are trusted. Raise
     TypeError or ValueError if the start is refused, the method cannot run the system, or code cannot be generated.
     """
     if system.called_in_python:  # functions called in Python may depend on variables that change
@@ -563,13 +563,13 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return `trace_cache_of` a system, which the system remembers."""
+    """Return the TraceCache of a system, from `trace_cache_of` at the first call, then as the system remembers it."""
     cache: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
     return cache
 
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
-    """Cache a SharedSetup for systems that differ in their parameters, once the second of them is integrated."""
+    """Cache a SharedSetup for systems that differ only in their parameters, when the second of them is integrated."""
     key, functions, cached = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
     if key not in cached:
         system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {key: functions}
@@ -587,7 +587,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a copy of a cached run at another start; None if other code or another form of algebra is needed."""
+    """Return a copy of a cached run at another start; None if it needs other code, or other linear algebra."""
     _check_start(system, t0, q0, v0, options)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None
@@ -653,7 +653,7 @@ def _create_run(
 
 
 def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, options: Options) -> None:
-    """Check a start, unless it is the start that was checked last; raise if it is refused."""
+    """Check a start, unless the last check was of the same start; raise if the start is refused."""
     derivatives, harmless = options.check_derivatives, HARMLESS * (options.atol + options.rtol * np.abs(v0))
 
     def check() -> None:

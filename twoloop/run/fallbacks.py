@@ -1,7 +1,7 @@
 """Continue a run where its own steps cannot: with another method, across a singular position, or over a jump.
 
-A run in which forces changed for a short time is repeated with more evaluations, at most MAX_REPETITIONS times: changes
-caused by noise have no shortest duration, so that every repetition would find shorter ones. The last repetition warns.
+If forces changed for a short time, the run is repeated with more evaluations, at most MAX_REPETITIONS times: in forces
+with noise, every repetition would find shorter changes. The last repetition warns.
 """
 
 from typing import NamedTuple
@@ -19,11 +19,11 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import TimedState, least_singular_value
 from twoloop.run.workspace import kit_for_plan, make_kit
 
-# limits of the duration of the shortest change of forces or drives, relative to the longest time between evaluations.
-# Below REPEAT_BELOW, the run may have missed shorter changes, and is repeated. Below WARN_BELOW, it may have missed
-# changes of the same duration: a run that is not repeated then warns
+# ratio of two times: duration of the shortest change of forces or drives, over longest time between evaluations. Below
+# REPEAT_BELOW, the run may have missed shorter changes, and is repeated. Below WARN_BELOW, the run may even have missed
+# other changes of this duration, and warns if it is not repeated
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
-EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations of a repetition within the shortest change seen so far
+EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations that a repetition makes within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
 MAX_REPETITIONS = 2  # largest number of repetitions of a run
 
@@ -56,7 +56,7 @@ def warn_of_missed_changes(run: Run) -> str:
 Array = NDArray[np.float64]
 
 N_CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
-# largest singular value, relative to the largest of all, that counts as zero, as a redundant row causes it
+# singular values count as zero (because of a redundant row) up to this fraction of the largest singular value
 NEGLIGIBLE_RATIO = 1e-12
 MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to their right-hand side
 
@@ -83,7 +83,7 @@ def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
-    """Return [M G^T; G 0] with each row of G scaled to norm max|M|, the norms of the rows before, and max|M|."""
+    """Return [M G^T; G 0] with each row of G scaled to norm max|M|, the original norms of the rows, and max|M|."""
     mass, rows = system.mass(t, q), system.rows(t, q)
     norms, largest = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
     norms[norms == 0.0] = 1.0  # rows of zeros are not scaled
@@ -91,40 +91,40 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
 
 
-# step sizes to try across a singular position, relative to H_LONG, the longest of the last steps. Several sizes are
-# tried until no node of the step is at the position
+# step sizes to try across a singular position, relative to H_LONG, the longest of the last steps. Sizes are
+# tried in this order until no node of the step is at the position
 STEP_RATIOS = tuple(0.85**k for k in range(28))
 # step sizes, relative to H_LONG, to try afterwards if too few nodes of a step are beyond the singular position
 LARGER_RATIOS = tuple(1.4**k for k in range(1, 7))
-# distances from a singular position: smallest pivot of C_q at a state, relative to the largest such pivot so far
-FAR_BEFORE = 0.2  # smallest distance of a base, the state at which the polynomial across a singular position begins
+# "distance" of a state from a singular position: smallest pivot of C_q, relative to the largest such pivot of the run.
+# The base, the state at which the polynomial across the position begins, should have at least the distance FAR_BEFORE
+FAR_BEFORE = 0.2
 # limits of steps across a singular position. STRICT: the limits of the run. WIDER: evaluations may be GAP_FACTOR times
-# as far apart, or arbitrarily far if forces cannot be short. LOOSER: in addition, tolerances are TOLERANCE_FACTOR
-# times as large
+# as far apart (arbitrarily far if no force can be short). LOOSER: also, tolerances are multiplied by TOLERANCE_FACTOR
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 STRICT, WIDER, LOOSER = range(3)
 
 
 class Origin(NamedTuple):
-    """Origin and limits of polynomials across a singular position, for one series of attempts."""
+    """Where a polynomial across a singular position begins, and its limits, for attempts with several step sizes."""
 
-    earliest: float  # earliest time at which nodes may lie, s
-    base: TimedState | None  # earlier state through which the polynomial goes; None: it begins at the current state
+    earliest: float  # no node of the polynomial is before this time, s
+    base: TimedState | None  # earlier state at which the polynomial begins; None: it begins at the current state
     limits: int = STRICT  # STRICT, WIDER or LOOSER
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times a step from the
-# current state to its mirror image beyond the singular position (see _find_base_state)
+# largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times the size of a
+# step that ends as far beyond the singular position as the current state is before it (see _find_base_state)
 MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
-# another singular position is between an earlier state and the base if the ratio of their distances is below this
+# if the distance of an earlier state is below this fraction of the base's, another singular position is between them
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
-FAR_BEYOND = 0.3  # the run continues with its own method only at this distance beyond a singular position, or farther
+FAR_BEYOND = 0.3  # beyond a singular position, the run's own method continues only from this distance on
 
 
 def requires_crossing(run: Run, code: int) -> bool:
-    """Return whether the code that `advance` returned requires steps across a singular position."""
+    """Return whether `code`, which `advance` returned, requires steps across a singular position."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
@@ -135,7 +135,7 @@ def requires_crossing(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Replace a run's plan, whose steps fail or are unsuitable, by the substitute plan; retry the failed step size."""
+    """Replace a run's plan, whose steps fail or are unsuitable, by its substitute; retry the size of a failed step."""
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` never changes, and needs no copy
@@ -169,8 +169,8 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     base, run.mirrored_size = None, 0.0
     if not has_fixed_step:
         base, run.mirrored_size = _find_base_state(run, [place for place in past if place[0] >= earliest])
-    # try several origins: earlier nodes may be before a jump of a force; near the start or the end of the run there may
-    # be too few nodes; the polynomial from an old base may be too long
+    # one origin may fail: nodes may lie before a jump of a force; near the start or the end of the run, there may be
+    # too few nodes; a polynomial from an old base may be too long. So several origins are tried
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and clock[a.T] - clock[a.T_START] < h_long
     near_end = compiled and clock[a.T] + LARGER_RATIOS[-1] * h_long > run.t1
@@ -184,7 +184,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.MAY_CROSS], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
-    run.piece_ends = []  # an earlier run of a cached integrator may have ended within a polynomial
+    run.piece_ends = []  # not empty if the last run of a cached integrator ended within a polynomial
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0
@@ -193,7 +193,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
-    """Remove the first of `run.origins`, store it in the plan's memory, and set the step sizes and limits to try."""
+    """Move the first of `run.origins` to the plan's memory, and set the step sizes and limits to try with it."""
     from twoloop.kernels.steps.crossing_step import begin_polynomial
 
     a, clock = run.a, run.clock
@@ -222,10 +222,10 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 
 
 def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
-    """Return the base of the polynomial, and the mirrored step size, s.
+    """Return the base (first state) of a polynomial across a singular position, and the mirrored step size, s.
 
-    The base is the latest state in `past` that is far from the singular position; else the farthest one, or None if the
-    current state is farther. (At a distance s, rounding changes velocities by eps/s^2.) A step of the mirrored size
+    The base is the latest state in `past` far from the position (near it, at a singular value s, rounding changes
+    velocities by eps/s^2); else the farthest state; None if the current state is farther. A step of the mirrored size
     ends as far beyond the position as the base is before it, if the distance changes linearly; 0: the distance grows.
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
@@ -270,7 +270,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
     from twoloop.kernels.steps import crossing_step as kernels
 
     a, clock = run.a, run.clock
-    end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # time at which the polynomial ends; -inf: none
+    end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # time at which the polynomial ends; -inf: no polynomial
     # the current time, with a margin because the end of a piece may have a rounding error
     t_now = float(clock[a.T] + kernels.ROUNDING * run.crossing_size + 4.0 * np.spacing(abs(clock[a.T])))
     if code in (a.PAUSED, a.RANK_LOST) and end > t_now:
@@ -287,7 +287,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.piece_ends[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.piece_ends, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
-    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # no partition can be renewed at such a state
+    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # no partition can be chosen there
     if at_singular_start and code == a.RANK_LOST:
         code = a.PAUSED
     if n_accepted > 0:  # the whole polynomial counts as one step

@@ -1,9 +1,9 @@
 """Integrate chunk by chunk: call the compiled `advance`, handle the code that it returns, and record the run.
 
 Ctrl-C ends the run at any point, with the result so far. An exception between two arbitrary instructions of Python
-could leave arrays half written, and machine code cannot propagate exceptions between its calls of Python. So the signal
+could leave arrays half written, and machine code can propagate exceptions only from its calls of Python. So Ctrl-C
 raises `KeyboardInterrupt` only within functions of the user, which may take long and whose callers expect exceptions.
-Elsewhere it is stored until the loop checks for it.
+Elsewhere the signal is stored until the loop checks for it.
 """
 
 # module `signal` tries to convert each handler to an enum member, which takes 8 microseconds; `_signal` does not
@@ -80,16 +80,16 @@ MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next one
 
 
 class Interrupts:
-    """Handler of Ctrl-C that replaces Python's own (never a user's) until `restore_handlers` is called.
+    """Handler of Ctrl-C that replaces Python's own handler (never a user's) until `restore_handlers` is called.
 
     Before `install_handlers`, Ctrl-C raises KeyboardInterrupt, because there is no result yet that would be lost.
     """
 
-    n_signals, _is_installed = 0, False  # number of signals so far
+    n_signals, _is_installed = 0, False  # n_signals: number of times that Ctrl-C was pressed
     handlers: SignalHandlers | None = None
 
     def install_handlers(self) -> "Interrupts":
-        """Install the handlers, which store signals, or raise within functions of the user; return self."""
+        """Install handlers that store signals, but raise an exception within functions of the user; return self."""
         if self.handlers is None:
             self.handlers = SignalHandlers()
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -99,10 +99,10 @@ class Interrupts:
         return self
 
     def returns_result(self, error: BaseException) -> bool:
-        """Return whether a run that Ctrl-C ended returns a result; else a handler has raised KeyboardInterrupt."""
+        """Return whether a run that Ctrl-C ended returns a result; it does not if a signal handler raised `error`."""
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # a user's handler is not replaced, and raises; so does `_on_signal` after many signals
+        self.install_handlers()  # a user's handler stays, and may raise; so may `_on_signal` after many signals
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:
@@ -139,15 +139,15 @@ def interrupted_fields(system: ConstrainedSystem, t0: float, events: list[Any] |
 
 BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
 BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
-CHUNK_TO_EVENT = 16  # number of attempts in a chunk if an event may end the run: steps beyond the event are wasted
-# a chunk that takes more CPU time, s, is not followed by a larger one, so that Ctrl-C is noticed soon
+CHUNK_TO_EVENT = 16  # attempted steps per chunk if an event may end the run: steps beyond the event are wasted
+# chunks do not grow further once a chunk takes more than this CPU time, s, so that Ctrl-C is noticed soon
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 MAX_BASE_CANDIDATES = 16  # number of last states among which the base of a crossing step is sought
-CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1, by at most this number of durations of the run
+CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
-# MAX_SPARE: largest number of sets of buffers kept for later runs; MAX_SPARE_FLOATS: of floats in a buffer of states
+# largest number of sets of buffers kept for later runs, and of floats in the buffer of states of such a set
 MAX_SPARE, MAX_SPARE_FLOATS = 16, 250_000
 _spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for later runs, by their sizes
 
@@ -155,10 +155,10 @@ _spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for 
 class IntegrationLoop:
     """Loop that integrates a run to its end, and records it.
 
-    The run is at its start, or after a first chunk of steps, which `add_first_chunk` then records. In the second case,
-    `start` is the row [q, v, a, lam] at the start. `system`: the system of the result, if the run has a copy of it
-    whose arrays will be overwritten. `report` is called with the time reached after each chunk. `is_final_attempt`:
-    whether the run warns if it may have missed short changes; else the caller repeats it.
+    The run is at its start, or a first chunk of steps was taken: then `start` is the row [q, v, a, lam] at the start,
+    and `add_first_chunk` has to be called. `system`: the system of the result, if the arrays of the run's own system
+    will be overwritten. After each chunk, `report` is called with the time reached. `is_final_attempt`: whether a run
+    that may have missed short changes of forces warns; otherwise the caller repeats such a run.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class IntegrationLoop:
         has_terminal_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if has_terminal_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # number of attempts from one check of progress to the next, and total number of attempts at the next check
+        # attempted steps from one check of progress to the next; total number of attempted steps at the next check
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
@@ -207,7 +207,7 @@ class IntegrationLoop:
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
 
     def add_first_chunk(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
-        """Record copies of the first chunk's times, states and steps, and act on the code that `advance` returned."""
+        """Record copies of the first chunk's times, states and steps; act on `code`, which `advance` returned."""
         self.code, self.cpu_time = code, cpu_time
         self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._interval_kinds(steps, False, False))
         self._handle_code(steps, False, cpu_time)
@@ -252,7 +252,7 @@ class IntegrationLoop:
         return self._build_record(check_derivatives)
 
     def _handle_code(self, steps: Array, across: bool, chunk_time: float) -> None:
-        """Act on `self.code`; set it to PAUSED if the loop is to continue. `chunk_time`: CPU time of the chunk, s."""
+        """Act on `self.code`; set this code to PAUSED if the run goes on. `chunk_time`: CPU time of the chunk, s."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness_monitor.samples:
                 self.stiffness_monitor.add_steps(steps[:, self.run.a.H])
@@ -277,12 +277,12 @@ class IntegrationLoop:
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:
-            # Raised by a callback. A sample of forces ahead may be at a state that the motion never reaches: then
-            # continue without such samples. Else raise the exception at the end, unless an event has ended the run
+            # A callback raised the exception. If forces were sampled ahead, perhaps at a state that the motion never
+            # reaches, continue without such samples. Else raise it again at the end, unless an event has ended the run
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
-                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # a node may be beyond the reach of the motion
+                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # a node may be where no motion gets
             else:
                 self.code, self.callback_error = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:
@@ -294,7 +294,7 @@ class IntegrationLoop:
 
     @contextmanager
     def _deadline_timer(self) -> Iterator[None]:
-        """Return a context in which a timer stops machine code at the deadline, if a single attempt may take long."""
+        """Return a context in which, if a single step may take long, a timer stops machine code at the deadline."""
         run, notes = self.run, self.run.work.notes
         if self.deadline == np.inf or (run.system.n_q <= SMALL_SYSTEM and not run.system.called_in_python):
             yield
@@ -328,7 +328,7 @@ class IntegrationLoop:
             self.request.store.add(name, values)
 
     def _check_progress(self, steps: Array, across: bool, chunk_time: float) -> None:
-        """Choose the number of attempts of the next chunk; change `self.code` if the run stalls, or has to stop."""
+        """Choose how many steps the next chunk attempts; change `self.code` if the run stalls, or has to stop."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
         self.stiffness_monitor.add_steps(h)
@@ -349,7 +349,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, across: bool, n_steps: int) -> None:
-        """If `self.code` requires it, change plan, controls or kit of the next steps, and set the code to PAUSED."""
+        """If `self.code` requires another plan, controls or kit for the next steps, change them; set code PAUSED."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()
@@ -389,7 +389,7 @@ class IntegrationLoop:
         return states[-MAX_BASE_CANDIDATES:]
 
     def _correct_last_state(self) -> None:
-        """Replace [q, v, a] of the last recorded state by the run's state, which is on the polynomial of a crossing."""
+        """Replace [q, v, a] of the last recorded state by the run's state, which is on the crossing's polynomial."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)
@@ -397,13 +397,13 @@ class IntegrationLoop:
             self.latest_chunks[-1][1][-1, : len(row)] = row
 
     def _is_stalled(self, across: bool) -> bool:
-        """Return whether steps became too small, away from singular positions, for a method that has a substitute."""
+        """Return whether steps became too small away from singular positions, and the plan has a substitute."""
         run, a = self.run, self.run.a
         is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return is_too_small and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
 
     def _build_record(self, check_derivatives: bool) -> Record:
-        """Return the record of the ended run; cut what was stored after an interruption or the event that ended it."""
+        """Return the record of the finished run, without data after the interruption or the event that ended it."""
         run, recorder, code = self.run, self.recorder, self.code
         t, table = recorder.output()
         stats, store = statistics(run.work.counters, self.cpu_time), self.request.store
@@ -469,7 +469,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """Return all states at which steps had to end if the run passed near a singular position; else []."""
+        """Return the states at all times at which steps had to end if a singular position was near; else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (

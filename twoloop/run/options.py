@@ -19,7 +19,7 @@ SMALLEST_TOLERANCE = 1e-15  # rtol and atol must not both be smaller: rounding w
 
 @lru_cache(maxsize=1024)
 def _unique_key(*_: Any) -> object:
-    """Return one object for all equal arguments: as a key of a dict it is faster than a tuple of the arguments."""
+    """Return the same object for equal arguments; as a key of a dict, it is faster than a tuple of the arguments."""
     return object()
 
 
@@ -46,7 +46,7 @@ class Options:
 
     @cached_property
     def own_tolerance(self) -> float | None:
-        """Tolerance that replaces rtol and atol in a method with its own error test (Newmark); None: no such test."""
+        """Tolerance that replaces rtol and atol in a method with its own error test (Newmark); None: other methods."""
         return getattr(self.method, "error_tol", None)
 
     @cached_property
@@ -57,12 +57,12 @@ class Options:
 
     def set_step_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
-        run.work.notes[indices.NEXT_JUMP] = t1  # next jump of C_t: none is known before t1
+        run.work.notes[indices.NEXT_JUMP] = t1  # no jump of C_t is known before t1
         if self.step_size is None:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # arguments and options of the last call, if there was none
+NO_OPTIONS: Any = (None,) * 12, None  # stands for the arguments and options of the last call before the first call
 
 
 def options_of(
@@ -82,11 +82,11 @@ def options_of(
 ) -> Options:
     """Return the validated options of a call; raise TypeError or ValueError if one is wrong.
 
-    Arguments that are the objects of the last call are not checked again.
+    If all arguments are the same objects as in the last call, they are not checked again.
     """
     last_arguments, options = system.shared.get("options", NO_OPTIONS)
     m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last_arguments
-    # written out, because a loop or a tuple would take a tenth of the time of a short repeated call
+    # no loop over the arguments, because that would take a tenth of the time of a short repeated call
     same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
     same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
     if same and checks is check_derivatives and code is compiled:

@@ -1,8 +1,8 @@
 """Use one run for many systems that differ only in their parameters.
 
-Numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. For new parameters,
-choices that depend on these numbers are checked again, and callbacks are compared with their traces near the start. At
-states of the run, callbacks are compared with their traces if states or parameters are outside the checked region.
+Numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. New parameters replace
+them; then choices that depend on them are checked again, and callbacks are compared with their traces near the start.
+Along the run, this comparison is repeated if states or parameters are outside the region that was checked before.
 """
 
 import copy
@@ -35,9 +35,9 @@ PLAN_FIELDS = ("interior", "substitute", "within_newton")  # fields of a plan wh
 class SharedSetup:
     """Setup shared by the runs of systems that differ only in their parameters.
 
-    Copies of `run`, a run of one of the systems at its start, are integrated; its plan calls `code`, requested with
-    `method`, `fixed` (whether the step size is constant) and `compiled`. Raise ValueError if setup cannot be shared:
-    because the system is large, because a callback may branch on its parameters, or because numbers in the plan differ
+    `run`: run of one of the systems, at its start; copies of this run are integrated. `code`: the generated code that
+    it calls, requested with `method`, `fixed` (whether the step size is constant) and `compiled`. Raise ValueError if
+    setup cannot be shared: the system is large, a callback may branch on its parameters, or numbers in the plan differ
     from the values of their traced expressions.
     """
 
@@ -71,10 +71,10 @@ class SharedSetup:
 
 
 class ParametricRun:
-    """Run whose arrays `use_parameters_of` fills with the parameters of one system after another.
+    """Run that integrates one system after another: `use_parameters_of` writes a system's parameters to its arrays.
 
     `run` is a copy of the run of `shared`, at its start. The arrays contain the parameters of `current_system`;
-    `system` is a copy of that system with these arrays, and with a cache of its own.
+    `system` is a copy of `current_system` with these arrays, and with a cache of its own.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
@@ -94,7 +94,7 @@ class ParametricRun:
         run.kit = kit_for_plan(self.system, run.kit.flags, run.plan)
 
     def use_parameters_of(self, system: ConstrainedSystem) -> bool:
-        """Fill the arrays with the parameters of a system; return False if they contained these parameters already."""
+        """Fill the arrays with the parameters of a system; return False if the arrays contained them already."""
         if system is self.current_system:
             return False
         self._fill_arrays(system)
@@ -124,7 +124,7 @@ class ParametricRun:
             if with_derivatives:
                 check_derivatives(system, t0, q, lambda: has_exact_derivatives(system, t0, q, v))
             refuse_wrong_traces(run.traced, system, t0, t1, q, v)
-        except Exception:  # also raised by callbacks; `set_up` will describe the error
+        except Exception:  # such as an exception of a callback, which `set_up` will report
             return False
         return self._mass_agrees
 
@@ -149,5 +149,5 @@ def _values_of_plan(plan: Plan) -> Iterator[Any]:
             yield from _values_of_plan(value)
         elif name == "traced":
             yield [part.tobytes() for each in value for part in each.program[:-1]]
-        elif name != "stable_to":  # a lambda, which equals only itself
+        elif name != "stable_to":  # left out, because equal plans have different lambdas
             yield value.tobytes() if isinstance(value, np.ndarray) else value

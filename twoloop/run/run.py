@@ -40,11 +40,11 @@ from twoloop.run.workspace import add_newton_program, fixed_order_form, kit_for_
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
 
-# largest number of attempts in the first chunk of a small system; after each chunk, checks in Python take 0.2 ms
+# largest number of attempted steps in the first chunk of a small system; checks after each chunk take 0.2 ms in Python
 FIRST_CHUNK = 1024
-FIRST_CHUNK_IN_PYTHON = 64  # largest number of attempts in the first chunk if callbacks are slow Python functions
+FIRST_CHUNK_IN_PYTHON = 64  # the same number if callbacks are Python functions, which are slow
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
-TRIAL_STEPS = 10  # number of first steps; if one of them is short, a method that needs long steps is replaced
+TRIAL_STEPS = 10  # a method that needs long steps is replaced if one of its first TRIAL_STEPS steps is short
 NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the fixed-order form
 CONTRADICTION = 1e-6  # a row of C_q a = gamma contradicts other rows if its residual exceeds this fraction of its terms
 
@@ -52,7 +52,7 @@ CONTRADICTION = 1e-6  # a row of C_q a = gamma contradicts other rows if its res
 class Run:
     """Data of an integration: plan, kit, workspace, state and controls; a new object is at the start of the run.
 
-    Raise ValueError if the accelerations there cannot be computed, or the constraints contradict one another.
+    Raise ValueError if accelerations at the start cannot be computed, or if constraints contradict one another.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Run:
         self.kit = make_kit(system, t0, q0, plan, self.fixed_order)
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # ranks are computed at every start; the ranks of the last start are a guess that often saves a second workspace
+        # ranks are computed at every start, and may then require another workspace; usually those of the last start fit
         self.work = self._make_workspace(*(system.derived.get("ranks", ()) if self.fixed_order is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -94,15 +94,15 @@ class Run:
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
         self.control[loop_state.MAY_CROSS], self.control[loop_state.SAMPLE_MOTION] = self.fixed_order is None, 1.0
-        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # C_t of kinematics alone is zero
+        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # without them, C_t is zero
         self.control[loop_state.MAY_JUMP] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
-        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # largest number of attempts per call
+        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # most attempted steps per chunk
         self.clock = np.zeros(loop_state.N_CLOCK)
         self._reset_clock(t0)
         self.write_step_control(plan)
         self.substituted = False  # whether the substitute plan has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # ratio of pivots near a singular position
+        self.near_threshold = singular_threshold(rtol)  # a singular position is near if the ratio of pivots is smaller
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced), lambda: (may_be_short(system, force_traced), may_be_steep(system, force_traced))
@@ -113,23 +113,23 @@ class Run:
         self.may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # size, s, of a step that ends at the mirror image of its base
+        self.mirrored_size = 0.0  # size, s, of a step that ends as far beyond the position as it began before it
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
-        self.sizes_to_try: list[float] = []  # sizes of steps that are still to be tried, s
+        self.sizes_to_try: list[float] = []  # step sizes, s, that are still to be tried
         self.larger_sizes: list[float] = []  # larger sizes, s, to try if too few nodes are beyond the position
         self.crossing_size = 0.0  # size of the last attempted step across a singular position, s
         self.piece_ends: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
-        self.origins: list[Any] = []  # `Origin`s of polynomials across the position that are still to be tried
+        self.origins: list[Any] = []  # an `Origin` for each polynomial across the position that is still to be tried
         self.t1 = np.inf  # end of the run, s
         self.starts_singular = False  # whether the start is a singular position from which the rank rises
-        self.branch_known = False  # whether the branch of the motion that the run follows from such a start is known
-        self.jumps: list[float] = []  # times at which C_t or b jumped, and velocities with them
-        self.compared_until = [-np.inf]  # time up to which callbacks were compared; copies of the run share the list
-        self.region: CheckedRegion | None = None  # region in which callbacks were compared; integrators share it
-        self.varied_parameters: Array | None = None  # array of parameters, if the run is used for several systems
+        self.branch_known = False  # whether the branch of the motion that leaves such a start is known
+        self.jumps: list[float] = []  # times at which C_t or b, and therefore the velocities, jumped
+        self.compared_until = [-np.inf]  # callbacks were compared with traces up to this time; copies share the list
+        self.region: CheckedRegion | None = None  # states at which callbacks were compared; integrators share it
+        self.varied_parameters: Array | None = None  # array of parameters, if several systems use the run in turn
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
-        self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings about redundant rows, by these rows
+        self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings; the keys are the redundant rows
         self.redundant, self.rows_warning = self.find_redundant_rows()
         self.start_warning = self._start_warning()
 
@@ -140,7 +140,7 @@ class Run:
         return new_run
 
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Return a copy of this run at another start; None if ranks differ there, or accelerations cannot be computed.
+        """Return a copy of this run at another start; None if its ranks differ, or its accelerations are unknown.
 
         The run must not use the fixed-order form of linear algebra.
         """
@@ -154,7 +154,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to the state q, v at t, discard its past steps, compute the accelerations; return a code."""
+        """Set the run to the state q, v at t, discard its past steps, compute accelerations; return code (0: done)."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -163,7 +163,7 @@ class Run:
         return code
 
     def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, first_size: float) -> None:
-        """Move the start of a run from beside a singular position into it; `first_size`: first step size, s."""
+        """Move a run's start from a state beside a singular position to this position; `first_size`: first step, s."""
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
@@ -187,10 +187,10 @@ class Run:
     def advance(
         self, outputs: Array, buffers: Buffers, filled: NDArray[np.int64], active: tuple[Plan, Array, Kit] | None = None
     ) -> int:
-        """Take compiled steps to the last output time, or until Python must act; return the code of the reason.
+        """Take compiled steps to the last of `outputs`, or until Python must act; return a code: why the steps ended.
 
-        Steps must end at the times `outputs`. `filled` becomes the numbers of states and of steps in the buffers.
-        `active`: plan, controls and kit for this call, if they differ from `plan`, `control` and `kit`.
+        Steps end at all times in `outputs`. `filled` becomes the numbers of states and of steps in the buffers.
+        `active`: plan, controls and kit for this call, if they differ from the attributes of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
         tolerances = self.tolerances if plan is self.plan else self.crossing_tolerances
@@ -223,7 +223,7 @@ class Run:
         return self.plan.ends_at_outputs or self.control[self.a.FIXED_STEP] > 0.0
 
     def write_step_control(self, plan: Plan) -> None:
-        """Write the step-size control of a plan to the array `control`, and its first limit of steps to `clock`."""
+        """Write a plan's numbers for step-size control to `control`, and its first limit of step sizes to `clock`."""
         a, control = self.a, self.control
         control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
@@ -235,7 +235,7 @@ class Run:
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _make_workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
-        """Return a new workspace for the rank of C_q and the rank of all rows; None: full rank."""
+        """Return a new workspace for `rank`, the rank of C_q, and `rank_v`, the rank of [C_q; A]; None: full rank."""
         q0 = self.state[: self.system.n_q]
         pattern = pattern_of(self.system, self.t0, q0) if self.fixed_order is None else NO_PATTERN
         ranks = rank, rank_v
@@ -246,7 +246,7 @@ class Run:
         return work
 
     def may_succeed_in_other_form(self, code: int) -> bool:
-        """Return whether steps failed in the fixed-order form, see sparse_inner_loop.py, but may succeed in another."""
+        """Return whether steps failed in fixed-order algebra (sparse_inner_loop.py) but may succeed in another form."""
         failure_codes = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.fixed_order is not None
@@ -257,7 +257,7 @@ class Run:
     def change_form(self) -> None:
         """Change the form of linear algebra at the current state, and replace the run's kit and workspace.
 
-        The fixed-order form gets Newton's matrices, if missing; otherwise a form of saddle_point.py replaces it.
+        If the fixed-order form lacks Newton's matrices, add them; else replace it by a form of saddle_point.py.
         """
         n = self.system.n_q
         old_work, largest_pivot = self.work, float(self.clock[self.a.LARGEST_PIVOT])
@@ -366,7 +366,7 @@ class Run:
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def violated_rows(self, rows: Rows) -> NDArray[np.int64]:
-        """Return the indices of the rows of [C_q; A] that the accelerations at the start violate."""
+        """Return the indices of the rows of [C_q; A] whose equation the accelerations at the start violate."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
@@ -398,14 +398,14 @@ class Run:
     def limit_steps(self) -> None:
         """Set the largest step size so that the time between evaluations is at most a hundredth of the run.
 
-        If forces may be steep, the step size is at most a hundredth, too: a single stage may not reveal a steep force.
+        If forces may be steep, a step is at most a hundredth of the run: one stage may not reveal a steep force.
         """
         gap = 1.0 if self.may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the first step size, s, from a state; if `longest` (max_step) > 0, also limit the later step sizes."""
+        """Return the first step size, s, at a state; if `longest` (max_step) > 0, also limit the later step sizes."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size
@@ -418,7 +418,7 @@ class Run:
 
     def passed_near_singular(self) -> bool:
         """Return whether a step ended so near a singular position that rounding may have changed its velocities."""
-        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT  # pivots in a fixed order vary
+        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT  # fixed-order pivots vary more
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 
     def n_attempts(self) -> int:
