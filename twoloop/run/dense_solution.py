@@ -31,8 +31,8 @@ Groups = NDArray[np.int64]
 
 MAX_DIVIDED_INTERVALS = 512  # largest number of intervals with cached interior states
 MAX_ACCURATE_INTERVALS = 65536  # largest number of cached intervals that need no interior states
-# largest accepted residual of a polynomial in the constraints and the equations of motion, relative to the tolerances;
-# MAX_ERROR_ACROSS in steps across singular positions, where errors of velocities were ten times the residual
+# a polynomial is accurate if its residual in constraints and equations of motion, relative to the tolerances, is up to
+# MAX_ERROR; MAX_ERROR_ACROSS across singular positions, where velocities had errors of ten times the residual
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
 N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
 
@@ -60,8 +60,8 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 class Interpolator:
     """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
-    `t0` and `row`: time and [q, v, a] of a state of the run. `ranks`: ranks of C_q and [C_q; A]. `plans`: for some
-    kinds of intervals, the plan whose `parts` equal steps divide an interval. Other kinds are not divided.
+    `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: ranks of C_q and [C_q; A]. `plans`: for each kind of
+    interval that is divided, the plan that divides it into `plan.parts` equal steps.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class Interpolator:
         self.fixed_order = fixed_order_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()
-        self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of it
-        # interior states of intervals, with both ends: (times, states) by the time at which the interval begins
+        self.failures, self.warns = 0, True  # number of failures in the last call; whether to warn of failures
+        # keys of these dicts: times at which intervals begin. Interior states: (times, states), both ends included
         self.interior_states: dict[float, tuple[Array, Array]] = {}
-        # memories of crossing steps, which contain their polynomials, by the times at which the intervals begin
+        # memories of crossing steps, which contain the polynomials in these intervals
         self.crossing_memories: dict[float, Array] = {}
-        self.accurate_intervals: set[float] = set()  # first times of intervals that need no interior states
+        self.accurate_intervals: set[float] = set()  # beginnings of intervals that need no interior states
         self.may_divide = True  # whether interior states may be computed; false if they were read from a file
         self._allocate_scratch()
 
@@ -100,7 +100,7 @@ class Interpolator:
         system, t0, row = self.arguments[:3]
         q0, form = row[: system.n_q], self.fixed_order
         for plan in self.plans.values():
-            load_step(plan.second)  # load the step now: `result.sol` may need it at any time
+            load_step(plan.second)  # loaded here, because `result.sol` may need the step at any time
         self.kits = {kind: make_kit(system, t0, q0, plan, form) for kind, plan in self.plans.items()}
         self.kit = make_kit(system, t0, q0, None, form)
         pattern = pattern_of(system, t0, q0) if form is None else np.zeros((0, 0))
@@ -142,7 +142,7 @@ class Interpolator:
 
     def __reduce__(self) -> tuple[Any, ...]:  # for copies and pickles
         *arguments, plans = self.arguments
-        # generated code is called at addresses that are valid in this process only: copies do not use it
+        # copies do not call generated code, because its addresses are valid in this process only
         plans = {kind: plan.changed(own=()) if plan.own else plan for kind, plan in plans.items()}
         state = {name: getattr(self, name) for name in ("parts", "interior_states", "crossing_memories", "may_divide")}
         return type(self), (*arguments, plans), state
@@ -173,7 +173,7 @@ class Interpolator:
         return out
 
     def row_function(self, table: StateTable, t: float) -> Callable[[float], Array]:
-        """Return a function that returns the row [q, v] at any time in that interval of `table` which contains t."""
+        """Return a function that computes the row [q, v] at any time in the interval of `table` that contains t."""
         groups = _interval_groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, indices.END_TIME] = 1
         self._divide_inaccurate_intervals(table, groups)
@@ -195,7 +195,7 @@ class Interpolator:
             _warn_of_lost_rank(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
     def _interpolate_groups(self, table: StateTable, groups: Groups, times: Array, out: Array) -> int:
-        """Store rows [q, v] at the times of the groups in `out` (n, 2 n_q); return the number of failed projections."""
+        """Store rows [q, v] at the times of all groups in `out` (n, 2 n_q); return the number of failed projections."""
         inputs = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.scratch, out)
         failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
@@ -231,7 +231,7 @@ class Interpolator:
         errors = np.zeros(len(groups))
         errors[is_divided] = self._estimate_residuals(divided, own_groups)
         errors[~is_divided] = self._estimate_residuals(table, undivided)
-        # if the plan for this kind of interval failed to divide it, the interval is too long for a polynomial
+        # an interval that its plan failed to divide is too long for a polynomial
         errors[~is_divided & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
         is_accurate = errors <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
         self.accurate_intervals.update(table.t[groups[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
@@ -246,9 +246,9 @@ class Interpolator:
         return out
 
     def _repair_interval(self, table: StateTable, group: Groups, smallest: float) -> None:
-        """Cache other states for the polynomial of an interval if its residual with them is below `smallest`.
+        """Try other nodes for the polynomial of an interval; cache them if they reduce its residual below `smallest`.
 
-        The sets tried are states of a step across a singular position, states of N_REPAIR_STEPS steps, and two ends.
+        Nodes to try: states in a step across a singular position, states of N_REPAIR_STEPS steps, and the two ends.
         """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
@@ -288,18 +288,18 @@ class Interpolator:
         return self._states_in_crossing_step(table, i, plan.memory) if succeeded else None
 
     def _states_in_crossing_step(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states in interval i, from the polynomial (in `memory`) of a step across a singularity."""
+        """Return times and states in interval i from the polynomial in `memory`, which a crossing step has computed."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
         times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
         states = np.array([state_at(memory, options, t) for t in times])
-        # the stored accelerations are not copied, because they may consist of rounding errors
+        # the accelerations in the table are not copied, because rounding errors may dominate them
         states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]
         return times, states
 
     def _plan_for_repair(self, kind: int) -> tuple[Plan, Any]:
-        """Return the plan and the kit of N_REPAIR_STEPS steps for an interval of this kind with a poor polynomial."""
+        """Return plan and kit of N_REPAIR_STEPS steps, to divide an interval of this kind with a poor polynomial."""
         is_stiff = kind == indices.VELOCITIES
         if is_stiff not in self.repair_plans:
             from twoloop.methods.dop853 import DOP853
@@ -319,7 +319,7 @@ class Interpolator:
         return self.repair_plans[is_stiff]
 
     def _separate_divided_intervals(self, table: StateTable, groups: Groups) -> tuple[StateTable, Groups, Groups]:
-        """Return a StateTable of cached interior states, the groups of its intervals, and the groups without states."""
+        """Return a StateTable of the cached interior states, the groups that have such states, and the other groups."""
         start_times = table.t[groups[:, indices.FIRST_OWN]].tolist()
         is_divided = np.array([t in self.interior_states for t in start_times], dtype=bool)
         pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
@@ -390,7 +390,7 @@ class Interpolator:
             failures = fill(self.kit, self.work, times, states, out)
         self.failures, n = failures, self.system.n_q
         if failures > 0:
-            # at a start in a singular position a is known, and the run has warned that lam is not
+            # at a start in a singular position, a is known; lam is unknown, of which the run has warned
             is_missing = np.isnan(out[:, :n]).any(axis=1)
             out[is_missing & (times == self.arguments[1]), :n] = self.arguments[2][2 * n :]
             n_missing = int(np.isnan(out[:, :n]).any(axis=1).sum())
@@ -400,7 +400,7 @@ class Interpolator:
 
 
 def _blocks_of_groups(groups: Groups) -> list[Groups]:
-    """Return the groups in blocks of at most MAX_DIVIDED_INTERVALS, whose interior states the cache can contain."""
+    """Return the groups in blocks of at most MAX_DIVIDED_INTERVALS, so that the cache can hold a block's states."""
     return [groups[begin : begin + MAX_DIVIDED_INTERVALS] for begin in range(0, len(groups), MAX_DIVIDED_INTERVALS)]
 
 
@@ -410,7 +410,7 @@ def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
     groups[:, indices.KIND] = table.kinds[intervals]
     groups[:, indices.HIGH] = len(table.t) - 1
-    # polynomials across a singular position do not use the states before it, which may have rounding errors
+    # polynomials across a singular position do not use states before the crossing, which may have rounding errors
     is_crossing = np.append(False, table.kinds == indices.ACROSS)
     (crossing_starts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
     if crossing_starts.size:
@@ -460,13 +460,13 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.fill_accelerations(times, rows, a_and_lam)
-        if interpolator.fixed_order is not None or interpolator.repair_plans:  # its workspace may not suit another run
+        if interpolator.fixed_order is not None or interpolator.repair_plans:  # the workspace may not suit another run
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 
 
 def interpolator_of(run: Run, row: Array) -> Interpolator:
-    """Return a new interpolator for the states of a run; `row` is [q, v, a] at its start."""
+    """Return a new interpolator for the states of a run; `row` is [q, v, a] at the start of the run."""
     ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[indices.ATOL :]
     interiors = {kind: plan.fresh() for kind, plan in run.interior_plans.items()}
     return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)
@@ -495,7 +495,7 @@ class DenseState:
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return rows, in the order of time, as columns in the order of `t`; for a single time, as a vector."""
+        """Return rows, sorted by time, as columns in the order of `t`; for a single time, as a vector."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]

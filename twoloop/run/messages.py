@@ -1,9 +1,9 @@
 """Monitor a run, and describe its end: status, message and advice.
 
 `StallDetector` detects a run that makes no progress. `StiffnessMonitor` samples states; after the run,
-`describe_stiffness` decides whether stability, not accuracy, limited the steps. It estimates the fastest vibration and
-decay at the sampled states, by power iteration with dF/dq and dF/dv (F: accelerations), and compares their rates times
-the step size with the stability limits of the method.
+`describe_stiffness` decides whether stability, not accuracy, limited the steps: at the sampled states, it estimates the
+rates of the fastest vibration and decay, by power iteration with dF/dq and dF/dv (F: accelerations), and compares each
+rate, times the step size, with the stability limit of the method.
 """
 
 import sys
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # end codes of runs that `advance` does not return
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of the end of a run, in addition to those of `advance`
 STAGNATION_STEPS = 20_000  # smallest number of accepted steps over which the mean step size is computed
-# A run stalls if its mean step size is below STAGNATION_PACE times the largest one, and the rest of the run would take
+# A run stalls if its mean step size is below STAGNATION_PACE times its largest step, and the rest of the run would take
 # more than STAGNATION_LEFT steps; or if the rest would take more than MAX_STEPS_LEFT steps, that is, days.
 STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
 
@@ -47,7 +47,7 @@ STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
 class StallDetector:
     """Monitor of the sizes of accepted steps, to detect a run that makes no progress.
 
-    With the mean size of the last steps, the rest of the run may take at most `max_steps_left` steps.
+    A run is stalled if the rest of it, with the mean size of the last steps, takes more than `max_steps_left` steps.
     """
 
     def __init__(self, t0: float, max_steps_left: float):
@@ -61,7 +61,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether a run from t to t1 would take too many steps; False between checks, STAGNATION_STEPS apart."""
+        """Return whether a run from t to t1 would take too many steps; check only every STAGNATION_STEPS steps."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n
@@ -77,12 +77,12 @@ class StallDetector:
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
 N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
-INITIAL_FACTOR = 0.1  # `initial_direction` times this is added to the last eigenvectors, so that no component stays 0
-# the dominant eigenvalue is negative if the cosine between a direction and its image is below -MIN_ALIGNMENT
+INITIAL_FACTOR = 0.1  # this times `initial_direction` is added to the last eigenvectors: no component may stay 0
+# the dominant eigenvalue is negative if the cosine of the angle from a direction to its image is below -MIN_ALIGNMENT
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# a problem counts as stiff if the median of h * rate / limit over the samples is at least this. `rate`: fastest rate of
-# vibration or decay; `limit`: largest stable h * rate. In smooth motion the median is 0.4
+# a problem counts as stiff if the median of h * rate / limit over the samples is at least this. `h`: step size; `rate`:
+# of the fastest vibration or decay; `limit`: largest stable h * rate. In smooth motion the median is 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -113,7 +113,7 @@ class StiffnessMonitor:
         self.last_sizes = last if last.size == N_LAST_STEPS else np.concatenate([self.last_sizes, last])[-N_LAST_STEPS:]
 
     def sample_state(self, t: float, state: Array, n_q: int) -> None:
-        """Add the state after the last steps as a sample; in long runs only at every second, fourth, ... call."""
+        """Store the current state as a sample; in long runs, only at every second, fourth, eighth, ... call."""
         if self.plan.stable_to is None or self.last_sizes.size < N_LAST_STEPS:
             return
         self.n_calls += 1
@@ -128,7 +128,7 @@ class StiffnessMonitor:
 
 
 def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
-    """Return a sentence if stability limited the steps, else ""; it overwrites the arrays in `work`."""
+    """Return a sentence if stability limited the steps, else ""; overwrite the arrays in `work`."""
     if not monitor.samples or monitor.n_steps < MIN_STEPS:
         return ""
     initial = initial_direction(work.Q.size)
@@ -139,7 +139,7 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
             direction += INITIAL_FACTOR * initial
         try:
             vibration, decay = _fastest_rates(kit, work, sample, directions)
-        except Exception:  # raised by a callback at a displaced state, which the run did not visit
+        except Exception:  # of a callback at a displaced state, which was not a state of the run
             return ""
         h = sample.h
         samples.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))
@@ -170,7 +170,7 @@ def _dominant_eigenvalue(
 ) -> tuple[float, bool]:
     """Return the magnitude of the dominant eigenvalue of dF/dq or (`by_v`) dF/dv, and whether it is negative.
 
-    Power iteration in the coordinates `independent` begins with `direction`, which becomes the eigenvector.
+    The power iteration, in the coordinates `independent`, begins with `direction` and overwrites it by the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 
@@ -193,12 +193,12 @@ def _dominant_eigenvalue(
     return eigenvalue, is_negative
 
 
-# largest ratio of the smallest to the largest singular value of C_q (or inertia in M) that messages call singular
+# messages call C_q (or M) singular if the ratio of its smallest to its largest singular value is at most this
 MAX_SINGULAR_RATIO = 1e-3
-# a result is not to be trusted if rounding errors of velocities (or accelerations) exceed this number of tolerances
+# a result is not to be trusted if rounding errors of velocities (or accelerations) exceed this multiple of tolerances
 MAX_LASTING_ERROR = 100.0
 MAX_RATIO_AT_END = 1e-6  # up to this ratio of singular values, constraints do not determine the velocities at the end
-# advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
+# advice if no step leads across a singular position; loose tolerances help, because rounding errors are large near it
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
@@ -218,8 +218,8 @@ _FAILURE_REASONS = {
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} with a function that computes the text when it is read.
 
-    The text is computed later if it describes crossings, because that takes longer than many runs. Until then `system`
-    must not change; the arrays of the run may.
+    A text that describes crossings is computed later, because this takes longer than many runs. Until then `system`
+    must not change, but the arrays of the run may.
     """
     if CROSSINGS_MARK not in text:
         return {"message": text}
@@ -237,9 +237,9 @@ def reject_velocity_jumps(
 ) -> tuple[Status, str]:
     """Check whether rounding, or a change of branch, has changed velocities near a singular position.
 
-    If so, return RANK_LOST and a reason, else `status` and `message`.
+    If velocities have changed, return RANK_LOST and the reason, else return `status` and `message`.
 
-    `last_step`: [state before the last step] if velocities jumped in that step. `output_states`: those at output times.
+    `last_step`: [state before the last step] if velocities jumped in it. `output_states`: states at output times.
     """
     end_state, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(place for each in crossings for place in each), *output_states], end)
@@ -275,7 +275,7 @@ def describe_arrival(t: float, fixed: bool) -> str:
 
 
 def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Status, str]:
-    """Return the status and the message of a run that ended with a code of `advance`, or with one of this module."""
+    """Return the status and the message of a run that ended with `code`: a code of `advance`, or of this module."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
         text = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
@@ -459,7 +459,7 @@ def _describe_near_singular(run: "Run", t1: float) -> str:
 
 
 def describe_not_finite(run: "Run") -> str:
-    """Return words that name the callback that returned a value that is not finite, or that say where to look."""
+    """Return words that name the callback whose value is not finite, or that say where to look for it."""
     kind, fault_time = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
         name = run.kit.functions._fields[kind]

@@ -1,7 +1,7 @@
 """Project a guess onto the constraints (`consistent_state`); report how far the guess moved, and its assembly.
 
-Large systems are projected by sparse factors, except in three cases: rows that are dependent at consistent positions,
-but only nearly beside them; a position near a dead centre; a guess that may lead to another assembly.
+Large systems are projected by sparse factors, except in three cases: rows are dependent at consistent positions, but
+only nearly dependent at the guess; a dead centre is near; the guess may lead to another assembly.
 """
 
 from __future__ import annotations  # so that help() shows the name ArrayLike
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle between a row of C_q and the other rows is below this
 # MAX_CORRECTIONS: largest number of Newton iterations; ROUNDING: correction that ends them, relative to max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# on the same assembly, projections deviate from predictions by C_q by at most this fraction of a guess's displacement
+# on the same assembly, projected guesses are this close to their linear prediction, relative to their displacement
 MAX_NONLINEARITY = 0.5
 
 
@@ -50,7 +50,7 @@ class _SparseProjection:
         self.work.mass_values[:] = diagonal / np.bincount(rows, diagonal, system.n_q)[rows]
 
     def run_task(self, task: int, q: Array, v: Array, a: Array | None = None, lam: Array | None = None) -> int:
-        """Run a task of the inner loop, which may change q, v, a and lam, and return its code."""
+        """Run a task of the inner loop (see evaluation/tasks.py), which may change q, v, a and lam; return a code."""
         a, lam = self.work.x if a is None else a, self.work.lam if lam is None else lam
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
@@ -65,7 +65,7 @@ class _SparseProjection:
     def project_nearby(self, q: Array) -> Array | None:
         """Return q projected by the independent rows of C_q; None on failure, or if other constraints are violated.
 
-        The independent rows are not chosen anew: beside the constraints the other rows are only nearly dependent.
+        The independent rows are not chosen anew: off the constraints, the other rows are only nearly dependent.
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
         for _ in range(MAX_CORRECTIONS):
@@ -85,8 +85,8 @@ class _SparseProjection:
             return None
         if self.run_task(tasks.RESTORE, q, discarded) != indices.DONE:
             return None
-        v = v.copy()  # velocities are projected at the final positions only
-        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # the second RESTORE reaches rounding
+        v = v.copy()  # until the positions are final, only a copy of the velocities is projected
+        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # the second RESTORE leaves rounding errors
             if self.run_task(task, q, v) != indices.DONE:
                 return None
         self.position = q
@@ -97,13 +97,13 @@ class Dependence(NamedTuple):
     """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    coefficients: dict[int, Array]  # keys: dependent rows; values (n_c,): row = values @ independent rows
+    coefficients: dict[int, Array]  # keys: dependent rows; values: arrays x (n_c,) with row = x @ independent rows
     allowed_move: Array  # displacement (n_q,) that C_q allows; its largest entry is 1 in units of coordinates
-    project_nearby: Callable[[Array], Array | None]  # projects a position near q; returns None on failure
+    project_nearby: Callable[[Array], Array | None]  # function that projects a position near q; None: failed
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
-    """Return the Dependence of the rows of C_q of a large system at q; None if sparse factors are not reliable."""
+    """Return how the rows of C_q of a large system depend on others at q; None if sparse factors are not reliable."""
     form, all_rows = fixed_order_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
@@ -162,10 +162,10 @@ def project_sparsely(
 
 
 def _nearby_guesses_match(projection: _SparseProjection, position: Array, change: Array) -> bool:
-    """Return whether three guesses near `position` are projected to where the linearized constraints predict.
+    """Return whether the linearized constraints predict where three guesses near `position` are projected.
 
     The guesses are displaced from `position` by -2 `change`, and by two random vectors of at most max|change|. If one
-    of them is projected to another place, another assembly may be as near as the user's guess.
+    of them is projected to another place, another assembly may be as near to `position` as the user's guess.
     """
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
@@ -181,7 +181,7 @@ def _nearby_guesses_match(projection: _SparseProjection, position: Array, change
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-CONVERGED_VIOLATION = 1e-2  # violation that ends the iteration, relative to the violation allowed at a start
+CONVERGED_VIOLATION = 1e-2  # the iteration ends with this violation, relative to the violation allowed at a start
 # singular values count as zero if they are below this fraction of the largest one: RANK_CUTOFF for ranks, LSTSQ_CUTOFF
 # for least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
@@ -290,7 +290,7 @@ def consistent_state(
 def _project_state(
     system: ConstrainedSystem, t: float, guess: Array, speeds: Array, kept: list[int], check_assembly: bool
 ) -> ConsistentState:
-    """Return the projected state, without its moves."""
+    """Return the projected state, still without `moved_q` and `moved_v`."""
     free = np.array([j for j in range(system.n_q) if j not in kept], dtype=int)
     check_bounds(system, t, guess, speeds)
     system.check_returned(t, guess, speeds)
@@ -317,7 +317,7 @@ def _project_state(
 
 
 class _LargeState(ConsistentState):
-    """Consistent state of a large system; its assembly is computed on access, because that takes full matrices."""
+    """Consistent state of a large system; its assembly is computed when read, because this takes full matrices."""
 
     system: ConstrainedSystem
     t: float
@@ -346,7 +346,7 @@ def _projected_position(
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     has_redundant_rows = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
     cutoff = REDUNDANT_CUTOFF if has_redundant_rows else LSTSQ_CUTOFF
-    if has_redundant_rows:  # beside the constraints, redundant rows are only nearly dependent
+    if has_redundant_rows:  # off the constraints, redundant rows are only nearly dependent
         position, excess, iterations = _gauss_newton(system, t, guess, free, cutoff)
     if position is None or not excess <= 1.0:
         has_diverged = position is None
@@ -359,7 +359,7 @@ def _projected_position(
             f"is nearer to an assembled position{_describe_rank_loss(scales, jacobian, free, kept)}"
         )
     shift = float((np.abs(position - guess) / scales.columns).max())
-    if check_assembly and (violation.excess > 1.0 or shift > CONSISTENT):  # near a dead centre small errors move far
+    if check_assembly and (violation.excess > 1.0 or shift > CONSISTENT):  # small errors may move q far
         ending = _describe_other_assembly(system, t, position, guess, free, scales, cutoff)
         if ending is not None:
             jacobian_there = system.jacobian(t, position)
@@ -376,10 +376,10 @@ def _projected_position(
 def _describe_other_assembly(
     system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Describe where other guesses as far from `q1` as `guess` are projected; None: all on the same assembly.
+    """Project other guesses, as far from `q1` as `guess`; return words about another assembly, None: all on the same.
 
-    On the same assembly, guesses are projected to points near those that C_q predicts to first order, with the same
-    sign of the determinant. Two assemblies may differ in the dependent coordinates alone.
+    On the same assembly, a guess is projected near the point that C_q predicts to first order, and the determinant
+    keeps its sign. Two assemblies may differ in the dependent coordinates alone.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -403,8 +403,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # or curvature explains the distance: on the same assembly, a guess with dependent coordinates of `projected`
-        # and the others of q1 is projected back to q1
+        # perhaps curvature explains the distance. Then a guess with the dependent coordinates of `projected` and the
+        # other coordinates of q1 is projected back to q1
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
@@ -416,7 +416,7 @@ def _describe_other_assembly(
 
 
 def _describe_change(before: Array, after: Array, scales: Scales) -> str:
-    """Return words about the coordinate that changes most, with enough digits of both values to show the change."""
+    """Return words about the coordinate that changes most, with enough digits of both its values to show the change."""
     j = int(np.abs((after - before) / scales.columns).argmax())
     magnitude, change = max(abs(float(before[j])), abs(float(after[j]))), abs(float(after[j] - before[j]))
     digits = min(17, 3 + max(0, math.ceil(math.log10(magnitude / change)))) if change > 0.0 else 3
@@ -439,7 +439,7 @@ def _gauss_newton(
         scales = scales_of(system, t, q, jacobian)
         excess = Violation.measure_q(system, t, q, jacobian, scales).excess
         if excess == 0.0 or (excess <= CONVERGED_VIOLATION and excess >= 0.5 * least_excess):
-            return q, excess, iteration  # as close as rounding allows
+            return q, excess, iteration  # rounding prevents a smaller violation
         if excess < least_excess:
             least_excess, best_q = excess, q
         q = q + step

@@ -1,6 +1,6 @@
 """Record a run: its trajectory, status and cost (`Record`, to which `Result` adds views).
 
-A `Recorder` collects events, and states at accepted steps or output times; a store holds them in memory or in files.
+A `Recorder` collects events, and states at accepted steps or output times; a store keeps these in memory or in files.
 """
 
 import pickle
@@ -34,7 +34,7 @@ STEP_ARRAYS = ("h", "rejected_error", "rejected_convergence", "partitioned", "un
 class MemoryStore:
     """Store of named arrays in memory; an array is a list of parts until it is read."""
 
-    append_only = False  # whether rows cannot be changed after they were added, so that they must be complete
+    append_only = False  # whether rows must be complete when they are added, because they cannot be changed later
 
     def __init__(self) -> None:
         self._parts: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
@@ -90,7 +90,7 @@ class FileStore:
         return int(dtype.itemsize * np.prod(width, dtype=np.int64))
 
     def _write_header(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-        """Write the header, after the rows: if the process dies before that, the file still contains the old array."""
+        """Write the header; call this after writing rows, so that the file contains the old array until then."""
         header = repr({"descr": dtype.str, "fortran_order": False, "shape": shape})
         header = header.ljust(HEADER_SIZE - len(MAGIC) - 3) + "\n"
         file.flush()
@@ -100,7 +100,7 @@ class FileStore:
 
 
 def memory_map(path: Path) -> NDArray[Any]:
-    """Return the array in a NumPy file as a memory map, copy-on-write: changes of the array do not change the file."""
+    """Return the array in a NumPy file as a copy-on-write memory map: changes of the array do not change the file."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
@@ -116,7 +116,7 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING_STATES = 1024  # largest number of states that wait for the search for events, and for interpolation
+MAX_PENDING_STATES = 1024  # with more states since the last search for events and interpolation, both are done again
 
 
 class OutputRequest(NamedTuple):
@@ -124,13 +124,13 @@ class OutputRequest(NamedTuple):
 
     times: Array | None = None  # output times; None: the ends of all accepted steps
     ends_at_outputs: bool = False  # whether steps end at all output times, so that no states are interpolated
-    dense: bool = False  # whether the dense solution is requested
+    dense: bool = False  # whether dense output, `result.sol`, is requested
     events: list[Event] | None = None  # events to be searched for; None: no events were requested
     store: Any = None  # `MemoryStore` or `FileStore` to which the output is added; None: a new MemoryStore
 
     @property
     def interpolated_times(self) -> Array | None:
-        """Output times if states must be interpolated, else None."""
+        """Output times at which states must be interpolated, or None."""
         return None if self.ends_at_outputs else self.times
 
     @property
@@ -147,8 +147,8 @@ class OutputRequest(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, chunk by chunk.
 
-    The interval of a step is searched for events when all states through which its polynomials go are known, so that
-    the output does not depend on the chunks. Event functions are evaluated at least every `max_gap` seconds.
+    A step is searched for events when all nodes of its polynomials are known, so that output does not depend on chunks.
+    Event functions are evaluated at least every `max_gap` seconds.
     """
 
     def __init__(
@@ -161,13 +161,13 @@ class Recorder:
         max_gap: float,
     ):
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
-        self.n_steps = 0  # number of steps searched so far, at most up to a terminal event
-        self.last_step_size = 0.0  # time, s, from the beginning of the last step to a terminal event
+        self.n_steps = 0  # number of steps searched for events so far; the last one may contain a terminal event
+        self.last_step_size = 0.0  # time, s, from the beginning of this last step to the terminal event
         self.interrupted = False  # whether Ctrl-C interrupted the search for events, or the interpolation
-        # states at the ends of intervals still to be searched for events, and earlier nodes of their polynomials
+        # states at the ends of intervals that are still to be searched, and earlier nodes of the polynomials in these
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
-        self._next_interval = 0  # index of the first interval between these states that has not been searched
+        self._next_interval = 0  # index (in these arrays) of the first interval that is still to be searched
         self._n_outputs = 0
         may_end_run = request.events is not None and any(event.terminal < np.inf for event in request.events)
         self._max_pending = 0 if may_end_run or request.store.append_only else MAX_PENDING_STATES
@@ -195,7 +195,7 @@ class Recorder:
             self._rows[-1, : len(row)] = row
 
     def store_crossing(self, memory: Array) -> None:
-        """Copy the polynomial in a crossing step's `memory`, if there is one, for the interval after the last state."""
+        """If a crossing step's `memory` contains a polynomial, copy it for the interval after the last state."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -206,7 +206,7 @@ class Recorder:
         request, store = self.request, self.request.store
         if request.times is None:
             self._store_states(t, rows)
-        elif request.ends_at_outputs:  # steps also end at the ends of the run, which may not be output times
+        elif request.ends_at_outputs:  # steps also end at other times, such as the end of the run
             is_output = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
             self._store_states(t[is_output], rows[is_output])
         if request.dense:
@@ -215,7 +215,7 @@ class Recorder:
             store.add("sol_kinds", kinds)
 
     def _store_states(self, t: Array, rows: Array) -> None:
-        """Store times and rows: [q, v, a, lam], or [q, v], to which [a, lam] are added now or at the end of the run."""
+        """Store times and rows [q, v, a, lam] or [q, v]; [a, lam] are added to short rows, now or after the run."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._complete_rows(t, rows) if self.request.store.append_only else rows)
 
@@ -295,7 +295,7 @@ class Recorder:
             self.interpolator.fill_accelerations(times, rows, a_and_lam)
         except KeyboardInterrupt:
             self.interrupted = True
-            a_and_lam[np.isnan(a_and_lam).any(axis=1)] = np.nan  # a row may be half written
+            a_and_lam[np.isnan(a_and_lam).any(axis=1)] = np.nan  # the last row may be incomplete
         return np.concatenate([rows, a_and_lam], axis=1)
 
     def solution(self) -> DenseSolution | None:
@@ -514,13 +514,13 @@ class _Deferred:
     def __get__(self, record: Any, owner: Any = None) -> Any:
         values = {} if record is None else vars(record)
         if "later" not in values:
-            raise AttributeError(self.name)  # the class has no such attribute; the defaults are in dataclass fields
+            raise AttributeError(self.name)  # the class has no such attribute: dataclass fields have the defaults
         values.update(values["later"](self.name) | values)
         return values[self.name]
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-for _field in fields(Record):  # after the decorator, which would treat a descriptor as a default
+for _field in fields(Record):  # not in the class: the decorator `dataclass` would treat a descriptor as a default
     setattr(Record, _field.name, _Deferred(_field.name))
 
 
@@ -528,7 +528,7 @@ Integers = NDArray[np.int64]
 
 COUNT_NAMES = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 GET_COUNTS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
-# numbers of rejections by error, of rejections by convergence, and of partitions before the first step
+# counts before the first step: rejections by the error test, rejections for lack of convergence, partitions
 INITIAL_COUNTS = np.array([0, 0, 1])
 
 
@@ -552,7 +552,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return, for each row of `steps` by the run's plan, the kind of interval that the dense solution uses."""
+    """Return, for each row of `steps` (taken with the run's plan), the kind of its interval in the dense solution."""
     if run.plan.separate:
         return np.full(len(steps), indices.SEPARATE)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS

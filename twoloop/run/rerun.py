@@ -32,7 +32,7 @@ N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked 
 
 
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
-    """Return the region in which runs of the system, with the same traces and checks, have compared callbacks."""
+    """Return the region of states in which callbacks were compared with the same traces, by any run of the system."""
     if run.region is not None:
         return run.region
     key = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
@@ -51,10 +51,10 @@ def check_callbacks_along_run(
 ) -> tuple[Status, str]:
     """Compare callbacks with their traces at states of a run that ended at `end`; return a status and a message.
 
-    These are `status` and `message`, unless a callback is wrong: the message then begins with the difference. If
-    `check_derivatives`, derivatives are compared with exact ones, or with differences. Python forces are called twice,
-    and must return the same. `states(all_states)` returns states [t, q, v], latest first. States in the region that
-    earlier comparisons covered (`CheckedRegion`) are skipped, unless `is_due`. `is_inside`: the whole run lies in it.
+    Return `status` and `message` unchanged if all callbacks are right; else the message begins with the difference. If
+    `check_derivatives`, compare derivatives with exact ones, or with finite differences. Call Python forces twice: they
+    must return the same value. `states(all_states)` returns states [t, q, v], latest first. States inside the region of
+    earlier comparisons (`CheckedRegion`) are skipped, unless `is_due`. `is_inside`: the whole run is in this region.
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
@@ -85,10 +85,10 @@ def check_callbacks_along_run(
 
 
 def _check_derivatives(run: Run, states: Array, first_state: Array, status: Status, message: str) -> tuple[Status, str]:
-    """Compare derivatives with exact ones, or with differences, at states of a run; return a status and a message.
+    """Compare derivatives with exact ones, or finite differences, at states of a run; return a status and a message.
 
-    M, `kinematics` and values of entries are checked, too. `first_state`: the first state [t, q, v] of the run. The
-    result is `status` and `message`, unless something is wrong: WRONG_DERIVATIVE and a message that begins with it.
+    M, `kinematics` and values of entries are checked, too. `first_state`: the first state [t, q, v] of the run. If all
+    are right, return `status` and `message`; else WRONG_DERIVATIVE and a message that begins with the mistake.
     """
     n = run.system.n_q
     chosen_states = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
@@ -107,7 +107,7 @@ def _check_derivatives(run: Run, states: Array, first_state: Array, status: Stat
 
 
 def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
-    """Return words if two calls of a Python force at one of `states` (rows [t, q, v]) give two values, else None."""
+    """Return words if two calls of a Python force at one of `states` (rows [t, q, v]) return two values, else None."""
     n, forces = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -131,7 +131,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return (arguments, value) of a compiled force at the start; for Python functions clear samples, return None."""
+    """Return (arguments, value) of a compiled force at the start; for Python functions, clear their samples instead."""
     if functions := python_functions(system):
         functions.restart()
         return None
@@ -141,9 +141,9 @@ def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> t
 
 
 def describe_changed_force(run: Run) -> str | None:
-    """Return words if the force now differs from an earlier value in the run for the same arguments, else None.
+    """Return words if the force, for the same arguments, now differs from a value earlier in the run, else None.
 
-    A force may change slowly (with the clock) or once (after 1000 calls): two calls after the run do not show that.
+    Two calls after the run do not reveal a force that changes slowly (with the clock) or once (after 1000 calls).
     """
     system, functions = run.system, python_functions(run.system)
     if functions is None:
@@ -177,7 +177,7 @@ def _change_text(name: str, t: float, entry: int, first_value: float, second_val
 
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
-FIRST_FRACTION = 0.1  # first step size in a piece, relative to its duration, unless the last piece proposed one
+FIRST_FRACTION = 0.1  # first step size in a piece, relative to the piece, unless the last piece proposed a step size
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
 
 
@@ -190,10 +190,10 @@ class RerunPiece(NamedTuple):
 
 
 class IndependentRerun:
-    """Integrator that reruns pieces of a run with another method, each piece from a state of the run.
+    """Integrator that reruns pieces of a run with another method; each piece starts from a state of the run.
 
-    (t, q, v): any state of the run. `method`: "explicit" for `DOP853`. For stiff pieces a Radau method is used, whose
-    error test includes "all" components, or only "positions".
+    (t, q, v): any state of the run. `method`: "explicit" for `DOP853`; for stiff pieces "all" or "positions", a Radau
+    method whose error test includes all components, or only positions.
     """
 
     def __init__(

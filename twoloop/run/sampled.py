@@ -33,7 +33,7 @@ from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
-MAX_ATTEMPTS = 1024  # largest number of attempted steps in one call of `advance`; IntegrationLoop takes the others
+MAX_ATTEMPTS = 1024  # largest number of steps that `advance` attempts for a sample; IntegrationLoop takes more steps
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # callbacks that may depend on parameters that change at samples
 CHANGED_PARAMETERS = "the parameters changed at samples"  # value of the field `changes` of the result
 
@@ -63,8 +63,8 @@ class SampledState(NamedTuple):
 class SampledRun:
     """Integration from sample to sample, with parameters of the forces that may change at samples.
 
-    Only this object uses `system`, whose parameters `set_parameters` changes. Raise TypeError or ValueError if the
-    start is refused, or the method is a Taylor series, whose code is valid for given parameters only.
+    `set_parameters` changes the parameters of `system`, which therefore nothing else may use. Raise TypeError or
+    ValueError if the start is refused, or the method is a Taylor series, whose code is valid for fixed parameters only.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class SampledRun:
         if self._step_failed:
             self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
-        self._step_failed = True  # until the end is reached, as a callback may raise
+        self._step_failed = True  # set to False when the end is reached: a callback may raise an exception before that
         with signals_of(self.system):
             self._step_to(end)
         self.cpu_time += time.process_time() - began
@@ -173,7 +173,7 @@ class SampledRun:
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # earlier samples, which are not repeated, may have missed a change
+            if len(self.times) > 1:  # steps to earlier samples, which are not repeated, may have missed a change
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -211,7 +211,7 @@ class SampledRun:
         self._n_steps, self._step_failed = len(self.steps), False
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields of the result of the states at all samples so far."""
+        """Return the fields of a result that contains the states at all samples so far."""
         run, a = self.run, self.run.a
         steps = np.concatenate([np.empty((0, a.N_STEP_COLUMNS)), *self.steps[: self._n_steps]])
         fields: dict[str, Any] = {"h": steps[:, a.H], "untested": steps[:, a.JACOBIANS] > 0.0}
@@ -230,7 +230,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # a pair of methods: do not reset the scalars that tell which is active
+        if run.plan.first is not None:  # a pair of methods: keep the numbers that tell which one is active
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q
@@ -244,7 +244,7 @@ class SampledRun:
         self._parameters_changed = False
 
     def _return_to_sample(self) -> None:
-        """Replace the run, which failed or has to be repeated, by a new run from the state at the last sample."""
+        """Replace the run, which failed or has to be repeated, by a new run that starts from the last sample."""
         old_run, n = self.run, self.system.n_q
         try:
             self.run = self._create_run(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])

@@ -12,7 +12,7 @@ from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.events import Event
 from twoloop.problem.system import ConstrainedSystem
 
-# code objects of the functions of twoloop that call functions of the user
+# code objects of those functions of twoloop that call functions of the user
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
 COMPILERS = ("numba", "llvmlite")  # packages that break if an exception is raised between two of their instructions
 # signals whose handlers are replaced; not all of them exist on Windows
@@ -23,10 +23,10 @@ SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr
 class SignalHandlers:
     """Replacement of the user's signal handlers: calls them at safe points, and raises their exceptions again.
 
-    Python calls a handler at its next instruction, which may be one of numba. In Python code called by machine code, an
-    exception becomes a `SystemError`; during compilation, it breaks numba for the rest of the process. So the call of a
-    handler is delayed if a signal arrives in a compiler. Elsewhere the handler is called at once. As its exception may
-    be mistaken for that of a callback, `call_delayed` (between chunks of steps) and `restore` raise it again.
+    Python calls a handler before its next instruction, which may belong to numba. If the handler raises an exception,
+    this breaks numba for the rest of the process during compilation, and becomes a `SystemError` in Python code that
+    machine code called. So the call of a handler is delayed while a compiler runs. Elsewhere the handler is called at
+    once; `call_delayed` (between chunks of steps) and `restore` raise its exception again, if others have caught it.
     `ctrl_c`: whether to replace Python's own handler of Ctrl-C, too, as `Interrupts` does during integrations.
     """
 
@@ -59,11 +59,11 @@ class SignalHandlers:
         """Call the delayed handlers; raise the exception of a handler, if there was one."""
         while self._delayed_calls and self._handler_error is None:
             self._call_handler(*self._delayed_calls.pop(0))
-        if self._handler_error is not None:  # not cleared, because the caller may catch a KeyboardInterrupt
+        if self._handler_error is not None:  # kept for `restore`, because the caller may catch a KeyboardInterrupt
             raise self._handler_error from None
 
     def restore(self) -> None:
-        """Restore the user's handlers, except where the user has set other ones since; then call delayed handlers."""
+        """Restore the user's handlers, unless the user has set other ones meanwhile; then call delayed handlers."""
         for number, handler in self._user_handlers.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)
@@ -74,7 +74,7 @@ class SignalHandlers:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if error is not None and error is self._handler_error:
-            self._handler_error = None  # it propagates already
+            self._handler_error = None  # this exception propagates already: `restore` need not raise it
         self.restore()
 
 
@@ -93,7 +93,7 @@ def is_in_user_function(frame: FrameType | None) -> bool:
 
 
 def is_in_compiler(frame: FrameType | None) -> bool:
-    """Return whether a frame belongs to a call of a compiler, and not to a user's function called by the compiler."""
+    """Return whether a frame belongs to a running compiler, and not to a user's function that the compiler called."""
     while frame is not None and frame.f_code not in CALLERS_OF_USER_CODE:
         if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
             return True
@@ -103,7 +103,7 @@ def is_in_compiler(frame: FrameType | None) -> bool:
 
 def raised_by_handler(error: BaseException) -> bool:
     """Return whether an error was raised by a signal handler, according to its traceback."""
-    # a handler is a function, or a method or partial of one, or an object that is called
+    # a handler is a function, a method, a partial function, or an object with a method `__call__`
     callables = [_signal.getsignal(number) for number in SIGNAL_NUMBERS]
     functions = [getattr(each, "__func__", getattr(each, "func", each)) for each in callables if callable(each)]
     codes = {getattr(each, "__code__", getattr(type(each).__call__, "__code__", None)) for each in functions} - {None}

@@ -1,8 +1,8 @@
 """Describe singular positions: where steps crossed them, and how uncertain the motion is near them.
 
-Let s be the smallest singular value of the constraint Jacobian, and d its right singular vector. For a rounding error
+Let s be the smallest singular value of the constraint Jacobian, and d its right singular vector. With rounding errors
 eps, the constraints determine q along d only to eps / s. This uncertainty of q changes the Jacobian, so that velocities
-along d have errors of about eps / s^2.
+along d have errors of about eps / s^2. "Rows" are the rows of the Jacobian, [C_q; A].
 """
 
 from collections.abc import Callable, Iterator
@@ -23,12 +23,12 @@ Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 LOST_RANK_RATIO = 1e-2  # messages say that constraints lose rank if a ratio of singular values is smaller than this
 N_POSITIONS = 33  # number of positions between two states at which a ratio of singular values is evaluated
 MAX_SHOWN = 3  # largest number of singular positions in a message
-# displacement of finite differences (for gamma and derivatives of the rows), relative to the largest coordinate
+# displacement for finite differences (of gamma, and of the rows), relative to the largest coordinate
 DISPLACEMENT = 1e-6
-# rows are divided by their norm, or by this fraction of the norm expected from their derivative if that is larger
+# a row is divided by its norm, or by MIN_ROW_NORM times the norm expected from its derivative if this is larger
 MIN_ROW_NORM = 0.1
-# velocities have jumped if their change exceeds both JUMP_RATIO times the change that accelerations explain and
-# MIN_JUMP times the tolerances
+# velocities have jumped if their change is larger than JUMP_RATIO times the change that accelerations explain, and
+# larger than MIN_JUMP times the tolerances
 JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 
 
@@ -59,17 +59,17 @@ def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_stat
 
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the ratio of the `rank`-th largest singular value of the rows to the largest; 1 if there are no rows."""
+    """Return the `rank`-th largest singular value of the rows, relative to the largest one; 1 if there are no rows."""
     return _singular_value_ratio(system.rows(t, q), rank)
 
 
 def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return `singular_ratio` of rows scaled by `scaled_to_unit_masses`: it does not depend on units."""
+    """Return `singular_ratio` for rows scaled by `scaled_to_unit_masses`, so that it does not depend on units."""
     return _singular_value_ratio(scaled_to_unit_masses(system, t, q)[1], rank)
 
 
 def _singular_value_ratio(rows: Array, rank: int) -> float:
-    """Return the ratio of the `rank`-th largest singular value to the largest; 1 if there are no rows."""
+    """Return the `rank`-th largest singular value, relative to the largest one; 1 if there are no rows."""
     values = np.linalg.svd(rows, compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
@@ -96,9 +96,9 @@ def _least_ratio_between(
 def describe_velocity_jump(
     system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int, rtol: float, atol: Array
 ) -> str:
-    """Describe where velocities changed by more than accelerations explain; return "" if there is no such place.
+    """Describe where velocities changed by more than accelerations explain; return "" if they did not.
 
-    At such a place, other branches of the motion are within the tolerances, and the steps may have switched to one.
+    There, other branches of the motion are within the tolerances, and the steps may have switched to one of them.
     """
     n = system.n_q
     of_q, of_v = slice(n), slice(n, 2 * n)
@@ -111,7 +111,7 @@ def describe_velocity_jump(
         threshold = (
             min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / largest_q)) if largest_q > 0.0 else LOST_RANK_RATIO
         )
-        # if no step led across, the run's own steps may have left the branch: evaluate the ratio at the last state only
+        # without crossing steps, the run's own steps may have left the branch: use the ratio at the last state only
         here, there = (t0, first), (t1, last)
         ratio = _least_ratio_between(system, here if across else there, there, rank, unit_free_ratio)
         if ratio >= threshold:
@@ -154,7 +154,7 @@ def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tupl
 
 
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
-    """Return max|a_j|, computed without singular values of the rows below `min_ratio` times the largest."""
+    """Return max|a_j|, computed without singular values of the rows below `min_ratio` times the largest one."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     is_kept = values > min_ratio * values[0]
@@ -167,7 +167,7 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return M and the rows, scaled to unit masses and unit norms, the divisors of rows, and the units of coordinates.
+    """Return M and the rows, scaled to unit masses and unit norms, divisors of the rows, and units of the coordinates.
 
     The divisor of a row is its norm, or at least MIN_ROW_NORM times the norm expected from its derivative.
     """
@@ -198,8 +198,8 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
 # rounding errors are estimated along singular vectors with singular values up to this fraction of the largest one
 WEAK_RATIO = 1e-2
-# SMALL_PIVOT: with smaller ratios of pivots, rounding errors are always estimated; PIVOT_FACTOR: typical ratio of
-# pivots, divided by the ratio of singular values
+# ratio of the smallest pivot to the largest: below SMALL_PIVOT, rounding errors are always estimated; it is typically
+# PIVOT_FACTOR times the ratio of singular values
 SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
@@ -227,7 +227,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # a row may be small at this position only: use rows beside it for the rounding errors of the constraints
+        # a row may be small at this position only: rounding errors of the constraints follow from rows nearby
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(
@@ -257,7 +257,7 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
 def _displacement_to_singular_position(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
     """Return an estimated displacement (n_q,) to the nearest singular position, to first order; not finite if unknown.
 
-    Among the directions that the other constraints allow, the smallest singular value changes most along this one.
+    It points where the smallest singular value changes most, among the directions that the other constraints allow.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, other_directions = left[:, rank - 1], right[rank - 1], right[: rank - 1]

@@ -1,12 +1,12 @@
 """Start in a singular position, where C_q loses rank, if the velocities there belong to one branch of the motion only.
 
-Let u be the vectors with u^T C_q = 0 there. Along the motion, the first derivative of u^T (C_q v + C_t) is zero if v
-belongs to a branch, and the second one determines the accelerations, in addition to C_q a = gamma:
+Let u be the vectors with u^T C_q = 0 at the start. Along the motion, u^T (C_q v + C_t) has a zero first derivative if v
+belongs to a branch; its second derivative determines the accelerations, in addition to C_q a = gamma:
 
     3 u^T (dC_q/dt) a = -u^T d^2/dt^2 (C_q v + C_t), with constant velocities on the right.
 
-If the rows u^T dC_q/dt raise the rank to what it is beside the position, this branch is the only one with velocities
-v. Forces of constraint may act along these rows, too: the multipliers then grow without limit towards the position.
+If the rows u^T dC_q/dt raise the rank to the rank beside the position, this branch is the only one with velocities v.
+Constraint forces may act along these rows, too: then the multipliers grow without limit towards the position.
 """
 
 from typing import NamedTuple
@@ -22,18 +22,18 @@ from twoloop.run.singular_positions import DISPLACEMENT, scaled_to_unit_masses
 Array = NDArray[np.float64]
 
 CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for derivatives along the motion
-# weights of five samples in f' and f''
+# weights of five equally spaced samples of a function in its first and second derivative, for a spacing of 1
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
 # largest relative error of derivatives by finite differences; smaller derivatives count as 0
 MAX_DIFFERENCE_ERROR = 1e-8
-# the rank rises if derivatives of zero singular values, relative to the derivatives of C_q, are larger than this
+# the rank of C_q rises if a singular value that is zero has a derivative larger than this, relative to that of C_q
 MIN_RANK_DERIVATIVE = 1e-6
-# the derivative of a zero singular value is certain if it is at least this multiple of its error, the derivative of the
-# rows along a velocity as large as its tolerances
+# the derivative of a zero singular value is certain if it is at least this multiple of its uncertainty: the derivative
+# of the rows along velocities as large as the tolerances
 MIN_CLARITY = 10.0
-# relative change of the rows. BESIDE_CHANGE: from the start to a state beside it; STEP_CHANGE: in the first trial step
+# relative change of the rows: from the start to a state beside the start, and in the first step that is tried
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
-# N_BESIDE: number of states beside the start to try; MAX_CORRECTION: their largest correction per displacement
+# number of states beside the start to try; their largest correction by a projection, relative to the displacement
 N_BESIDE, MAX_CORRECTION = 6, 0.2
 MAX_RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, relative to the right-hand side
 
@@ -66,7 +66,7 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
 
 
 def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
-    """Return the result of `branch_at`; callbacks may raise exceptions."""
+    """Return the result of `branch_at`, or raise the exception of a callback."""
     q, v, a = np.split(state[: 3 * system.n_q], 3)
     direction = v if v.any() else a
     if not direction.any():
@@ -90,7 +90,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
         return None
     step = CHANGE_PER_SAMPLE / speed
     added_rows = lost @ derivative_of_rows(direction, step) / speed
-    slopes = np.linalg.svd(added_rows @ free, compute_uv=False)  # derivatives of the singular values that are zero
+    slopes = np.linalg.svd(added_rows @ free, compute_uv=False)  # derivatives of zero singular values
     if slopes.max() <= MIN_RANK_DERIVATIVE * norm:
         return None
     distance = step * float(np.abs(direction).max())  # largest displacement of a finite difference
@@ -124,5 +124,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time, s, in which rows change by `change`, given the speed (1/s) and acceleration of their change."""
+    """Return the time, s, in which rows change by `change`, given their first (1/s) and second (1/s^2) derivative."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

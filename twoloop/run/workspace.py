@@ -1,4 +1,4 @@
-"""Make kits (callbacks, flags and steps), workspaces (arrays for all kernels), and the fixed-order forms of systems."""
+"""Make kits (callbacks, flags and steps), workspaces (arrays for all kernels), and sparse forms of large systems."""
 
 from typing import Any, NamedTuple
 
@@ -40,9 +40,9 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# displacement of a coordinate or velocity x, relative to max(1, |x|), that shows which forces depend on x
+# to find which forces depend on a coordinate or velocity x, x is displaced by this fraction of max(1, |x|)
 DISPLACEMENT = 1e-3
-# sparse factors of Newton's matrix have at most this share of the entries, and operations, of dense factors
+# Newton's matrix gets sparse factors if they have at most this share of the entries, and operations, of dense factors
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -57,7 +57,7 @@ def newton_form(
 ) -> tuple[NDArray[np.int32], int] | None:
     """Return the program that factorizes Newton's matrix, see sparse_lu.py, and the number of groups of its columns.
 
-    The columns of a group are computed from one difference of forces. `mass`, `jacobian`: indices of nonzero entries.
+    One finite difference of forces yields all columns of a group. `mass`, `jacobian`: indices of nonzero entries.
     `bodies`: coordinates of each body. `stiff`: indices of `_stiff_rows`. Return None if sparse factors do not pay.
     """
     entries: set[tuple[int, int]] = set()
@@ -85,7 +85,7 @@ def _derivative_entries(
 ) -> set[tuple[int, int]]:
     """Return the indices of nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and of their transposes.
 
-    The search for entries ends after the column with which there are more than `max_entries` entries.
+    The search goes column by column, and ends after the column in which the count exceeds `max_entries`.
     """
 
     def reaction(q: Array) -> Array:
@@ -109,19 +109,19 @@ def _derivative_entries(
     return entries
 
 
-# a direction of a body has no mass if its eigenvalue of M is at most this fraction of the largest
+# a direction has no mass if the eigenvalue of a body's block of M is at most this fraction of its largest eigenvalue
 MASSLESS_RATIO = 1e-10
-# a row can give a body a mass in massless directions if its component along them is at least this fraction of the row
+# a row can give mass to the massless directions of a body if its part along them is at least this fraction of the row
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # Newton's matrix has sparse factors from this number of coordinates on, relative to LARGE
-MAX_SHARE = 0.05  # the fixed-order form has at most this share of the entries, and operations, of dense factors
+MIN_SIZE_NEWTON = 1.6  # Newton's matrix gets sparse factors from this number of coordinates on, relative to LARGE
+MAX_SHARE = 0.05  # sparse factors pay if they have at most this share of the entries, and operations, of dense factors
 
 
 class FixedOrderForm(NamedTuple):
     """Sparse factorization of a large system, in an order of elimination chosen once, and data for its workspaces."""
 
     program: NDArray[np.int32]
-    sizes: FixedOrderSizes  # sizes of arrays in a workspace
+    sizes: FixedOrderSizes  # sizes of the arrays in its workspaces
     mass: Entries  # row and column indices of the nonzero entries of M
     # (n_c, n_q), 1 where C_q may be nonzero, else 0; (0, n_q) if a callback computes only the entries of C_q
     pattern: Array
@@ -129,7 +129,7 @@ class FixedOrderForm(NamedTuple):
     mass_pattern: Array
     newton_arguments: tuple[Any, ...]  # arguments of `newton_form` that follow t0 and q0
     newton_program: NDArray[np.int32] | None = None  # factorizes Newton's matrix; None until a plan needs it
-    n_groups: int = 0  # number of column groups of Newton's matrix; one difference of forces yields a group
+    n_groups: int = 0  # number of groups of columns of Newton's matrix; one finite difference of forces yields a group
 
     def matrix_cost(self) -> float:
         """Return the estimated cost of Newton's matrix and its factors, in evaluations of accelerations."""
@@ -137,7 +137,7 @@ class FixedOrderForm(NamedTuple):
         return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def newton_matrices_size(self, matrices: int) -> int:
-        """Return the number of floats in a plan's sparse Newton matrices; `matrices`: its number of dense matrices."""
+        """Return the number of floats in the sparse matrices that replace a plan's `matrices` dense Newton matrices."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -148,7 +148,7 @@ class FixedOrderForm(NamedTuple):
 
 
 def fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> FixedOrderForm | None:
-    """Return the fixed-order form of a system for runs with `plans`; None if a plan cannot use it, or it is slower."""
+    """Return the fixed-order form of a system for runs with `plans`; None if a plan cannot use it or it is slower."""
     if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
         return None
     has_gamma = "gamma" in system.given or system.functions.gamma_program.size > 0
@@ -190,7 +190,7 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
     bodies = _coordinates_of_bodies(system, mass)
     stiff_rows = _stiff_rows(system, t0, q0, mass, jacobian, bodies)
     program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff_rows)
-    # number of multiplications that one evaluation by a dense Schur complement takes, about
+    # approximate number of multiplications that one evaluation takes with a dense Schur complement
     dense_cost = 0.5 * system.n_c * system.n_c * (system.n_q + system.n_c / 3.0)
     if program is None or program[N_UPDATES] > MAX_SHARE * dense_cost:
         return None
@@ -202,7 +202,7 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
     """Return the coordinates of each body to which a joint refers; of all bodies, if each has seven coordinates.
 
-    A joint refers to only one of its two bodies. So there may be bodies, at ends of chains, to which no joint refers.
+    A joint refers to only one of its two bodies. So there may be bodies at the ends of chains that no joint refers to.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - body[0] for j in body) for body in coordinates_by_joint}
@@ -216,10 +216,10 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, bodies: list[tuple[int, ...]]
 ) -> list[int]:
-    """Return indices of rows g that, added to a singular M as g g^T, give a mass to massless directions of a body.
+    """Return indices of rows g such that M + g g^T, for a singular M, gives mass to massless directions of a body.
 
-    See sparse_ldl.py. Such a row belongs to one body, as the norm of Euler parameters, and g g^T has entries only where
-    M has. No more rows than necessary are returned: others are treated like the rows of joints.
+    See sparse_ldl.py. Such a row belongs to one body (the norm of its Euler parameters, for example), and g g^T has
+    entries only where M has. No more rows than necessary are returned; other rows are treated like rows of joints.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, bodies))
@@ -279,13 +279,13 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
             mass = system.mass(t0, q0 + scale * magnitudes * direction)
-        except Exception:  # outside the domain of the callbacks; entries missed here are found during the run
+        except Exception:  # q is outside the domain of the callbacks; the run will find entries missed here
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return pattern
 
 
-GAMMA_ACCURACY = 1e-11  # smallest relative error that may be required of a gamma computed by differences of C_q and C_t
+GAMMA_ACCURACY = 1e-11  # no smaller relative error is required of a gamma computed by differences of C_q and C_t
 MAX_KITS = 16  # largest number of kits in the cache of a system
 
 
@@ -355,7 +355,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
-    # ids in the key stay unique, as the cached kits keep the objects with these ids alive
+    # ids in the key stay unique, because the cached kits keep the objects with these ids alive
     key: tuple[Any, ...] = id(system.functions), flags.tobytes()
     if plan is not None:
         key += (plan.inner, plan.step, plan.first, plan.second, len(LOADED_STEPS))
@@ -376,12 +376,12 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return a plan's step, and the first and second step of its pair of methods; the second is loaded when needed."""
+    """Return a plan's step, and the two steps of a pair of methods; the second one only if it is already loaded."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 
 def _copy_with_flags(kit: Kit) -> Kit:
-    """Return a copy of a kit with its own flags, which a run may change; a new kit would take ten times as long."""
+    """Return a copy of a kit whose flags a run may change; to make a new kit would take ten times as long."""
     new_kit, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.offsets["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
