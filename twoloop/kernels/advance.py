@@ -1,6 +1,7 @@
 """Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
-`advance` is the same for all methods: a method's functions are in `f` (a `Kit`), its data in `options` and `memory`.
+`advance` serves all methods: the functions of a method are in the kit `f`, its data in `options` and `memory`. `w` is
+the workspace, `Work`; `t`: time, s; `size`: step size, s; `state`, `new_state`: [q, v, a, lam] before and after a step.
 """
 
 import numpy as np
@@ -57,16 +58,15 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import PARTITION_CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-# a force is assumed to change suddenly in a rejected step with an error of more tolerances than this
-SUDDEN_ERROR = 10.0
-MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
-# number of accepted steps, at first of guessed sizes, after which a short next step can end the trial of a method
+SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
+MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to the size of a rejected step
+# the trial of a method can fail for short steps only after this number of accepted steps: the first size is a guess
 FIRST_JUDGED_STEP = 2
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
 def start(f, w, t, state):
-    """Factor M, choose the partition, and store a and lam in `state` [q, v, a, lam] at time t; return a code."""
+    """Factor M, choose the partition, and store a and lam in `state`; return DONE or a failure code."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     w.last_jump = t  # C_t or b of a drive may be discontinuous at the start
@@ -77,14 +77,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.gamma_given == 0:  # repeat: the first evaluation sets the scale of Gamma's errors
+    if code == DONE and f.gamma_given == 0:  # twice: the first time sets the scale for Gamma's errors
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return JUMP, RAMP or SMOOTH for C_t and b within a step, and beginning and end (s) of the jump or ramp."""
+    """Return JUMP, RAMP or SMOOTH for C_t and b in a step, and the times (s) between which the jump or ramp lies."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -98,7 +98,7 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return its code, its error in tolerances, and the ratio of the next step size to `size`.
+    """Attempt a step; return a code, the error in tolerances, and the ratio of the next step size to `size`.
 
     If the step crosses a jump of C_t or b (`crosses_jump`), the caller has already computed `new_state`.
     """
@@ -125,7 +125,7 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
     """Return whether a step must be repeated because C_t or b jumps, or has a ramp, within the step.
 
-    For a jump, JUMP_FROM, at which the repeated step ends, and JUMP_TO are stored in `clock`; for a ramp, H_NEXT.
+    Store in `clock`, for a jump: JUMP_FROM, where the repeated step has to end, and JUMP_TO; for a ramp: H_NEXT.
     """
     kind, low, high = _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
@@ -143,8 +143,8 @@ def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, st
 def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
     """Prepare the repetition of a failed step and return CONTINUE, or return an end code.
 
-    The step is repeated with a smaller size, with a new partition, or with both. A step of fixed size is repeated only
-    once, with a new partition; `t_repeated`: time, s, at the beginning of the fixed step that was repeated last.
+    A step is repeated with a smaller size, a new partition, or both; a step of fixed size, with a new partition and
+    only once. `t_repeated`: time, s, at which the last repeated step of fixed size began.
     """
     n = w.Q.size
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
@@ -173,9 +173,9 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
 
 @merged
 def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
-    """Store a smaller size than `size` in clock[H_NEXT] after a step with too large an error; return CONTINUE.
+    """Store a size below `size` in clock[H_NEXT] after a step whose error was too large; return CONTINUE.
 
-    Near a singular position, an end code is returned instead. `proposed_size`: size (s) that follows from the error.
+    Return an end code instead if a singular position is near. `proposed_size`: size (s) that follows from the error.
     """
     n = w.Q.size
     w.n_rejected_error += 1
@@ -192,7 +192,7 @@ def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
 
 @merged
 def _can_take_many_steps(control, clock):
-    """Return whether the method may take many steps in one call, without any checks by the loop between these steps."""
+    """Return whether the method may take many steps in one call, without checks between these steps."""
     if control[at.TAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
@@ -202,7 +202,7 @@ def _can_take_many_steps(control, clock):
 
 @merged
 def _pass_output_time(f, w, clock, outputs, state):
-    """Record the pivot at an output time, and increment clock[NEXT_OUTPUT]; return whether the time was the last."""
+    """Record the pivot at an output time, and increment clock[NEXT_OUTPUT]; return whether no output time is left."""
     record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
@@ -218,15 +218,15 @@ def advance(
     """Integrate from clock[T] and `state` until all times in `outputs` are reached; return an end code (loop_state.py).
 
     Steps are shortened to end at output times. A step size is the difference of two floating-point times, so that the
-    sum of the step sizes is exact. `clock` and `state` are updated in place; `new_state` is scratch, except that it
-    contains the state after a jump if the next step crosses one (APPLIES_JUMP).
+    sum of the step sizes is exact. `clock` and `state` are updated in place; `new_state` is scratch, except if the next
+    step crosses a jump (APPLIES_JUMP = 1): then it contains the state after the jump.
     With STORE_ALL = 1, all accepted states are stored in rows of out_t and out_state, otherwise the states at output
     times only; each accepted step is stored in a row of out_steps. On return, filled[0] is the number of rows stored in
     out_t and out_state, and filled[1] the number of rows stored in out_steps.
     """
     fixed_size = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
-    t_repeated = np.inf  # time (s) from which a step of fixed size was last repeated with a new partition
+    t_repeated = np.inf  # time (s) at which the last step of fixed size began that was repeated with a new partition
     filled[0] = 0
     filled[1] = 0
     n_attempts = 0.0
@@ -266,7 +266,7 @@ def advance(
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        n_grid_steps = 1.0  # number of steps of the grid that this step completes
+        n_grid_steps = 1.0  # number of steps, of the grid of fixed steps, that this step completes
         if fixed_size:
             size, n_grid_steps, reaches_goal = size_on_grid(clock, t, h, target, goal)
         else:
@@ -288,10 +288,10 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        if w.time_is_up == 1.0:  # discard this attempt, in which evaluations may be missing
+        if w.time_is_up == 1.0:  # the time limit may have cut evaluations short: discard this attempt
             f.commit(f, w, options, memory, tolerances, False)
             return at.PAUSED
-        # where a force jumps, an error estimate may be small by chance: `error_factor` increases it until JUMP_END
+        # near a jump of a force, the error estimate may be small by chance: until JUMP_END, `error_factor` increases it
         error_factor = control[at.JUMP_RATIO] if t < clock[at.JUMP_END] else 1.0
         accepted = code == DONE and error * error_factor <= 1.0
         if accepted and not reaches_goal and ends_near_singular(f, w, control, clock):
@@ -325,7 +325,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the method did not include `error_factor` in its `factor`
+        elif error_factor > 1.0 and error > 0.0:  # the method's `factor` does not allow for `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
@@ -362,7 +362,7 @@ def advance(
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
-            clock[at.FAILURE_CODE] = DONE  # no longer the reason for short steps
+            clock[at.FAILURE_CODE] = DONE  # the last failure no longer explains short steps
         if at_output and _pass_output_time(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
         if fixed_size and not at_output:

@@ -1,13 +1,13 @@
 """Start a run and take its first steps in one compiled call, which stores all results in one array.
 
 `start_and_advance` checks the start, keeps the independent rows and dependent coordinates of the previous run, takes
-steps, and fills one array:
+steps, and fills one array (`f` is the kit, `w` the workspace, `b` the other arrays, RUN_ARRAYS):
 
     ... | report: N_REPORT numbers, counters | times | steps | states ...
                                                              ^ a fixed index
 `advance` writes states from the fixed index on. The other parts, whose length depends on the number of steps, are then
-copied so that they end where the states begin. The result is contiguous: Python copies it as one slice, and splits the
-copy when a field of the result is used.
+copied so that they end where the states begin. So the used part is contiguous: Python copies it as one slice, and
+splits the copy when a field of the result is read.
 """
 
 import math
@@ -36,15 +36,15 @@ from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNT
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 from twoloop.kernels.linalg.dense import copy
 
-ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate; a smaller correction is omitted
+ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate; smaller corrections are omitted
 
 
 @merged
 def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     """Reset the workspace `w` in place before a run that starts at the position q (n_q).
 
-    `numbers` and `integers` are the parts of `w` that keep data from step to step. `pattern` is copied to w.pattern;
-    `accuracy` is the value of GAMMA_REQUIRED, `reuse` the smallest value of REUSE (see data/indices.py).
+    `numbers`, `integers`: the parts of `w` that keep data from step to step; `pattern`: copied to w.pattern;
+    `accuracy`: value for GAMMA_REQUIRED; `reuse`: lower limit of the value for REUSE (see data/indices.py).
     """
     for k in range(numbers.size):
         numbers[k] = 0.0
@@ -73,14 +73,14 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
 FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-GAP_RATIO = 10  # tolerances[GAP] over tolerances[DEFECT_GAP] if forces may change suddenly with position or velocity
+GAP_RATIO = 10  # ratio of GAP to DEFECT_GAP in `tolerances` if forces may change suddenly with position or velocity
 
 
 @exact
 def _first_step_size(state, n, t, span, smallest):
-    """Return the first step size (s): FIRST_STEP times the time in which coordinates change by the largest |q|.
+    """Return the first step size (s): FIRST_STEP times the time in which a coordinate changes by max|q|.
 
-    `smallest` is a lower bound of this |q|. The result is at most FIRST_STEP times the duration `span` (s) of the run,
+    `smallest`: lower bound of max|q|. The size is at most FIRST_STEP times the duration `span` (s) of the run,
     and at least MIN_FIRST_STEP spacings of floating-point numbers at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
@@ -92,7 +92,7 @@ def _first_step_size(state, n, t, span, smallest):
         time_scale = min(time_scale, distance / speed)
     if acceleration > 0.0:
         time_scale = min(time_scale, math.sqrt(distance / acceleration))
-    # the time in which velocities change by max|v| is a time scale only if the motion is not almost at rest
+    # the time in which velocities change by max|v| is also a time scale, unless the start is almost at rest
     if speed > 0.0 and acceleration > 0.0 and speed / acceleration > FIRST_STEP * time_scale:
         time_scale = min(time_scale, speed / acceleration)
     return max(FIRST_STEP * time_scale, MIN_FIRST_STEP * np.spacing(abs(t)))
@@ -102,8 +102,8 @@ def _first_step_size(state, n, t, span, smallest):
 def _set_step_limits(control, tolerances, span, longest, within):
     """Store GAP and DEFECT_GAP in `tolerances`, and MAX_STEP, TIME_SPACING and SPACING in `control`.
 
-    These limits keep the time between two evaluations of the equations below MAX_GAP_RATIO times the duration `span`
-    (s) of the run. Methods that evaluate the equations within steps (`within`) limit steps by `longest` (s) only.
+    They keep the time between two evaluations of the equations below MAX_GAP_RATIO times the duration `span` (s) of the
+    run. For methods that evaluate the equations within steps (`within`), only `longest` (s) limits the step size.
     """
     max_gap = MAX_GAP_RATIO * span
     tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
@@ -122,7 +122,7 @@ def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longes
 
 @merged
 def _is_within_bounds(t, rows, bounds):
-    """Return whether [t[k], rows[k]] is between bounds[0] and bounds[1] for all k, as far as the bounds reach."""
+    """Return whether, for all k, the leading numbers of [t[k], rows[k]] are between bounds[0] and bounds[1]."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -134,9 +134,9 @@ def _is_within_bounds(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Split `steps`, rows of out_steps, into step sizes h (s), `changes` of the counts, and flags `used_newton`.
+    """Split rows of out_steps into step sizes `h` (s), `changes` of the counts in each step, and flags `used_newton`.
 
-    `counts`: numbers of rejections and partitions, on entry before these steps, on return after them.
+    `counts`: numbers of rejections and partitions, on entry before the first step, on return after the last.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -145,18 +145,18 @@ def split_steps(steps, counts, h, changes, used_newton):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-# codes that `start_and_advance` returns instead of a number of steps. REFUSED: rows or coordinates chosen in the
-# previous run do not suit this start. IN_DOUBT: the start may violate the constraints and needs a closer check.
-# UNUSUAL: Python must read the report, and may have to continue the run. UNCHOSEN: Python must choose rows
+# codes that `start_and_advance` returns instead of a number of steps. REFUSED: the rows or coordinates that the
+# previous run chose do not suit this start. IN_DOUBT: the start may violate the constraints, and needs a closer check.
+# UNUSUAL: Python must read the report, and may have to continue the run. UNCHOSEN: Python must choose the rows
 REFUSED, IN_DOUBT, UNUSUAL, UNCHOSEN = -1, -2, -3, -4
-# checks of a start that Python has made, in this order: that it is consistent, and that the choices are the same there
+# which checks of a start Python has made: none; the start is consistent; also, it has the same rows and coordinates
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
-# arrays of runs from different starts: for checks of a start, the choice of rows, and the steps. Among them are
+# arrays that runs from different starts share: for checks of a start, the choice of rows, and the steps. Among them are
 # - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
 # - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
 # - `last_start`: the last start, see START; `start_rows`: indices of the independent rows at the last start
-# - `saved`, `saved_integers`: all data of a run that has just started at `last_start`, saved when a start is repeated
+# - `saved`, `saved_integers`: data of a run right after a start that was repeated, to repeat the start once more
 RUN_ARRAYS = Reference(
     "RunArrays",
     {
@@ -180,7 +180,7 @@ RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
 # indices in `constants`
 # - ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w; EQUATION_FORM: value of FORM
-# - RANK, WEAK: thresholds for `choose`; SCALE: factor s in M + s G^T G; MASS_FLAG: DEFINITE, INDEFINITE or 0
+# - RANK, WEAK: thresholds for `choose`; SCALE: factor s in M + s G^T G; MASS_FLAG: DEFINITE, INDEFINITE or 0 (constant)
 # - HAS_ALL_ENTRIES: 1 if `kinds` shows all entries of `rows`; CONTRADICTS: relative tolerance of redundant rows
 # - LEAST_PIVOT: smallest pivot of an accepted start; NEAR: pivot below which Python checks the run
 # - FIRST: first step size, s, that the user has chosen, or 0; LEAST: argument `smallest` of _first_step_size
@@ -189,16 +189,16 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 # - MIN_SAMPLES: shortest time between two sudden changes, in spacings of samples
 ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
 EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
-# indices in `expected`, the choices for which code was generated (empty without generated code). BOUND: result of
-# choose_rows, or OF_PYTHON if no kernel makes these choices. N_ROWS, N_ADDED: numbers of independent rows and of rows
-# added to M. FIRST_ROW: index of the first row
+# indices in `expected`: the choice of rows for which code was generated (empty without generated code). BOUND: result
+# of choose_rows, or OF_PYTHON if only Python can make the choice. N_ROWS, N_ADDED: number of independent rows, and of
+# rows added to M. FIRST_ROW: index at which the list of these rows begins
 BOUND, N_ROWS, N_ADDED, FIRST_ROW = range(4)
 OF_PYTHON = 100
 
 
 @merged
 def _has_choices_of_code(b):
-    """Choose rows and dependent coordinates at a start; return whether the generated code has the same choices."""
+    """Choose rows and dependent coordinates at a start; return whether code was generated for the same choices."""
     b.scratch[0] = 0.0
     first_bound = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
     n_rows, n_added = b.expected[N_ROWS], b.expected[N_ADDED]
@@ -238,7 +238,7 @@ def _has_consistent_rows(w, b, n):
 
 @merged
 def _evaluate_start(checked_kit, b, t, q, v, records, shifts):
-    """Evaluate all callbacks at a start into arrays of `b`; return flags such as CONSISTENT (see `evaluate_start`)."""
+    """Evaluate all callbacks at a start, store values in `b`; return flags such as CONSISTENT, see `evaluate_start`."""
     for k in range(b.start_values.size):
         b.start_values[k] = 0.0
     return b.evaluate_start(
@@ -248,7 +248,7 @@ def _evaluate_start(checked_kit, b, t, q, v, records, shifts):
 
 @merged
 def _add_known_entries(b):
-    """Set b.pattern to 1 where b.kinds shows entries of the rows."""
+    """Set b.pattern to 1 at entries of the constraint rows that are nonzero according to b.kinds."""
     pattern = b.pattern.reshape(b.pattern.size)
     for k in range(b.kinds.size):
         pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
@@ -256,9 +256,9 @@ def _add_known_entries(b):
 
 @merged
 def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
-    """Prepare a run from t to t1, with rows and coordinates chosen as before; return 0, REFUSED, IN_DOUBT or UNCHOSEN.
+    """Prepare a run from t to t1 with the rows and coordinates of the last run; return 0 or a code, such as REFUSED.
 
-    `checked_kit` contains the callbacks that the check of the start calls; `checks`: the last check that Python made.
+    `checked_kit`: kit with the callbacks for the check of the start; `checks`: which checks Python has already made.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -317,12 +317,12 @@ def _restore_start(b):
 
 # indices in `last_start`. N_EQUAL: number of successive runs from this start, at most 2. START: index of [t, t1, q, v]
 N_EQUAL, START = 0, 1
-NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started yet; the data of a run just started are saved
+NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started yet; a second run has saved the data of the start
 
 
 @exact
 def _equals_last_start(last_start, t, t1, q, v):
-    """Return whether the start (t, t1, q, v) equals `last_start` bit for bit, and store it in `last_start`."""
+    """Return whether (t, t1, q, v) equals `last_start` bit for bit, and store this start in `last_start`."""
     n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -336,7 +336,7 @@ def _equals_last_start(last_start, t, t1, q, v):
 # if Python need not check the run. JUMPED: 1 if velocities changed suddenly in the last step. IN_CHECKED_REGION: 1 if
 # all states are in the region in which callbacks were compared with their traces. DEFECT_KNOWN: 1 if the defect was
 # evaluated in every step. DEFECT: largest defect. LONGEST_GAP: longest time between two evaluations, s. END_CODE: code
-# that `advance` returned. IS_NEW: 1 if the start differs from the previous one. From N_REPORT on: the counters
+# that `advance` returned. IS_NEW: 1 if the start differs from the previous start. From N_REPORT on: the counters
 N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
 N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
@@ -381,10 +381,10 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
 
 @kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, i8), vectorized=True)
 def start_and_advance(f, checked_kit, w, b, t, t1, q, v, records, region, checks):
-    """Start a run from t to t1, and take the first steps; return the number of steps, or one of the codes above.
+    """Start a run from t to t1, and take the first steps; return the number of steps, or a code such as REFUSED.
 
-    If a start is repeated bit for bit, the second run checks it again, and saves the data of the started run. The third
-    and later runs restore these data without a check. For the arguments see _start_run and _write_report.
+    If a start is repeated bit for bit, the second run checks it again, and saves the data that a start computes. Later
+    runs restore these data, without a check. For the arguments see _start_run and _write_report.
     """
     f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
     is_repeated, n_equal = _equals_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]

@@ -4,7 +4,7 @@ import re
 
 import numba
 
-# oldest supported version of numba, and the first version above the supported ones, as in pyproject.toml
+# oldest supported version of numba, and the first later version that is not supported, as in pyproject.toml
 MIN_VERSION, END_VERSION = (0, 61), (0, 69)
 
 

@@ -5,9 +5,9 @@ of helpers in other files or of the values of globals, which numba freezes. It r
 written or if a file is damaged. And it runs code that other users have put into its folder.
 
 Here each function and key has its own file with a checksum. Code is loaded only from files and folders that belong to
-the user or root, and that no other user can write, as SSH requires of its keys: whoever can write or replace a file of
-machine code can run any code in the name of the user who loads it. A checksum does not prevent this, because the
-attacker can write the checksum, too.
+the user or root, and that no other user can write; SSH requires the same of its key files. The reason: whoever can
+write or replace a file of machine code can run any code in the name of the user who loads the file. A checksum does not
+prevent this, because the attacker can write the checksum, too.
 """
 
 import gc
@@ -114,7 +114,7 @@ def reason_to_distrust(folder: Path) -> str:
 
 
 def _reason_of_mode(status: os.stat_result) -> str:
-    """Return why another user can write a file or folder with this status, or "" if nobody can."""
+    """Return why another user can write a file or folder with this status, or "" if no other user can."""
     if os.name != "posix":
         return ""
     if reason := _reason_of_owner(status):
@@ -155,7 +155,7 @@ def _temporary_folder() -> str:
     return _temporary_folders[0].name
 
 
-_warnings: list[str] = []  # empty, or the warning that `_warn_first` has printed
+_warnings: list[str] = []  # the warning that `_warn_first` has printed; empty: none yet
 
 
 def _warn_first(text: str) -> None:
@@ -165,7 +165,7 @@ def _warn_first(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-MAX_ON_DISK = 500  # largest number of files on disk for each kind of functions that are generated for mechanisms
+MAX_ON_DISK = 500  # largest number of files on disk for each kind of functions generated for mechanisms
 CHECKSUM_SIZE = hashlib.sha256().digest_size  # length of the checksum at the beginning of a file, bytes
 
 
@@ -252,8 +252,8 @@ def compile_cached(
 ) -> Dispatcher:
     """Compile a function for one signature, or read its machine code from the disk; return numba's dispatcher.
 
-    digests : digests of everything on which the machine code depends, see `digests_of`. A file with another first
-        digest is out of date. The second digest is part of the key of a file, because functions with the same source
+    digests : two digests of everything on which the machine code depends, see `digests_of`. A file whose first digest
+        differs is out of date. The second digest is part of the key of a file, because functions with the same source
         may have different closure variables. None: the machine code is not stored on disk.
     announcement : text printed on stderr before the first compilation of this process.
     **options : options of numba.njit.
@@ -275,7 +275,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Return a context without garbage collection, which would take a sixth of the compile time, and free nothing."""
+    """Return a context without garbage collection, which would free nothing, but take a sixth of the compile time."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -286,7 +286,7 @@ def garbage_collection_off() -> Iterator[None]:
 
 
 class BoundedCache(dict[Any, Any]):
-    """Dictionary of the newest MAX_IN_MEMORY entries; older entries are removed, as each run of a sweep adds one."""
+    """Dictionary of the newest MAX_IN_MEMORY entries; without a limit, it would grow with each run of a sweep."""
 
     def __setitem__(self, key: Any, value: Any) -> None:
         super().__setitem__(key, value)
@@ -319,9 +319,9 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
     """Return a copy of a nested function or lambda with a unique name; return any other function unchanged.
 
-    Numba's symbols consist of the qualified name of a function and the number of functions compiled so far in the
-    process. If two closures with the same name are compiled by different processes, their symbols may be equal: then
-    both run the code that is loaded first.
+    Numba names machine code by the qualified name of a function and the number of functions compiled so far in the
+    process. If two processes compile closures with the same qualified name, these names may be equal; a process that
+    loads both from the disk would then run the code that it loaded first for both.
     """
     if digests is None or "<" not in function.__qualname__:
         return function
@@ -340,7 +340,7 @@ class _CodeCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if cache_dir:  # numba would create the folder with access rights that depend on the umask
+        if cache_dir:  # created here, because numba would leave its access rights to the umask
             with suppress(OSError):
                 make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
@@ -358,7 +358,7 @@ class _CodeCache(FunctionCache):
         """Return the machine code for a signature, or None if it has to be compiled."""
         try:
             overload = super().load_overload(sig, target_context)
-        except Exception:  # an incompatible file from another installation: it is overwritten after the compilation
+        except Exception:  # an incompatible file from another installation; compilation will overwrite it
             overload = None
         if overload is None and self._announcement:
             warn_once(self._announcement)
@@ -407,10 +407,10 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
     """Return two digests of everything on which the machine code of a function depends; replace its helpers' caches.
 
-    The first digest covers the code, defaults and globals of the function, and the attributes that it uses of modules.
-    The second digest covers its closure variables. If one of these values is a compiled helper, the values that the
-    helper uses are hashed, too, and twoloop's cache replaces numba's cache of the helper. Returns None if a value may
-    change without a change of the digest.
+    The first digest covers the code, defaults and globals of the function, and the attributes of modules that it uses;
+    the second, its closure variables. If one of these values is a compiled helper, the values that the helper uses are
+    hashed, too, and twoloop's cache replaces numba's cache of the helper. Return None if a value may change without a
+    change of the digest.
     """
     digests, helpers = _digests_and_helpers(function)
     for each in helpers:
@@ -419,7 +419,7 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the digests of `digests_of`, and the compiled helpers, each of them after the helpers that it calls."""
+    """Return the digests of `digests_of`, and the compiled helpers in an order in which callees come before callers."""
     code, closure = Digest(), Digest()
     closure.names = reachable_names(function)  # names of attributes of modules that the function may use
     try:
@@ -434,7 +434,7 @@ def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] 
 def helper(function: Callable[..., Any]) -> Any:
     """Decorate a function that compiled callbacks call, like numba's `njit` with the cache of twoloop.
 
-    The function must not allocate arrays, so that it does not need numba's runtime, whose reference counts would take
+    The function must not allocate arrays. So it does not need numba's runtime, whose counting of references would take
     longer than the computation of a row of C_q.
     """
     options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
@@ -449,10 +449,10 @@ _COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 
 
 def _use_twoloop_cache(helper: Any) -> None:
-    """Replace numba's cache of a helper by that of twoloop, and recompile the helper if its digests have changed.
+    """Replace numba's cache of a helper by twoloop's cache, and recompile the helper if its digests have changed.
 
-    Numba's cache does not notice changes of functions in other files that the helper calls. Functions compiled later
-    use the code of the helper that numba compiled or loaded first, perhaps before the first call of this function.
+    Numba's cache does not notice changes in other files of functions that the helper calls. If numba has already loaded
+    outdated code of the helper, functions compiled later would use this code.
     """
     digests, compiled = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
     has_changed = compiled is not None and compiled != digests

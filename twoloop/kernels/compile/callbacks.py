@@ -3,9 +3,9 @@
 All kinds are defined in the table `KINDS`. Its entries determine the signature that numba compiles, the fields of
 `Functions` in the kernels, the methods and the documentation of `ConstrainedSystem`, and adapters for Python functions.
 
-If a function computes indices, for example into a table, all its indices are checked in every call. Otherwise machine
-code might read memory beyond the end of an array, or crash the process. A function whose indices are constants or loop
-counters is not checked: its first call shows whether the indices are valid.
+If a function computes an index, for example into a table, every call checks all its indices. Without this check,
+machine code might read memory beyond the end of an array, or crash the process. A function whose indices are constants
+or loop counters is not checked in this way: its first call shows whether the indices are valid.
 """
 
 import ast
@@ -39,9 +39,9 @@ SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed
 
 
 def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return the function to compile instead of `function`, and numba's options, with bounds checks if needed.
+    """Return the function to compile in place of `function`, and numba's options, with bounds checks if needed.
 
-    The function is `function` or, if a helper computes indices, a copy that calls bounds-checked copies of its helpers.
+    If a helper computes indices, this is a copy of `function` that calls bounds-checked copies of its helpers.
     """
     helpers = [helper for place in frozen_locations(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
@@ -54,12 +54,12 @@ def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
     helper = python_function(original)
     if helper is None:
         return copy
-    copy.__qualname__ = f"{helper.__qualname__}.watched"  # so that numba's symbols differ from those of the helper
+    copy.__qualname__ = f"{helper.__qualname__}.watched"  # numba needs different names for different machine code
     return jit(**{**options_of(original), **BOUNDS_CHECK})(give_unique_name(copy, digests_of(helper)))
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
-    """Return whether an index in a function may be other than a constant or loop counter; True if it has no source."""
+    """Return whether a function may use an index that is no constant or loop counter; True if its source is unknown."""
     if is_twoloop(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
@@ -71,7 +71,7 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
 
 
 def _computed_names(tree: ast.AST) -> set[str]:
-    """Return the names of variables in a function that may be other than constants, loop counters and array sizes."""
+    """Return the names of variables in a function that may hold more than constants, loop counters and array sizes."""
     computed = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
         n_before = len(computed)
@@ -106,17 +106,17 @@ def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
     if isinstance(node, ast.Subscript):
         return _is_safe_index(node.value, computed) and _is_safe_index(node.slice, computed)
     if isinstance(node, ast.BinOp | ast.UnaryOp | ast.Tuple | ast.List | ast.Slice):
-        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # nodes that are no expressions
+        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # nodes that are not expressions
         return all(_is_safe_index(each, computed) for each in ast.iter_child_nodes(node) if not isinstance(each, kinds))
     return False
 
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # its memory layout is that of VECTOR
+READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # has the same memory layout as VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
-# size of each vector that callbacks receive, as the name of an attribute of a system; lam: the multipliers of C
+# attribute of a system that gives the size of each vector that callbacks receive; lam: the multipliers of C = 0
 STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
@@ -124,14 +124,14 @@ STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 class CallbackKind:
     """Describe one kind of callback.
 
-    state : arguments between t and p, keys of `STATE_SIZES`.
+    state : names of the arguments between t and p, which are keys of `STATE_SIZES`.
     output : name of the array that the callback fills.
     shape : sizes of this array, as names of attributes of a system, such as "n_q".
     meaning : meaning of the output in a few words, for messages.
     note : remarks for the documentation.
-    absent : replacement if the callback is not given. "": no replacement, because the callback must be given; "zeros":
+    absent : what replaces a callback that is not given. "": nothing, because the callback must be given; "zeros":
         a callback that changes nothing; "differences": a callback that computes differences of C, see `jacobian.py`;
-        "kernels": no replacement, because the kernels compute differences themselves.
+        "kernels": nothing, because the kernels compute differences themselves.
     needed_by : name of a size of the system, "n_c" or "n_a"; the callback must be given if this size is above zero.
     more : names and shapes of further arrays that the callback fills. Such a callback must be compiled.
     """
@@ -157,12 +157,12 @@ class CallbackKind:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Return the names of the arguments of a callback of this kind that fills its arrays in place."""
+        """Return the names of the arguments of a callback of this kind, including the arrays that it fills."""
         return ("t", *self.state, "p", *(name for name, _ in self.outputs))
 
     @cached_property
     def signature(self) -> Any:
-        """Return the signature with which kernels call a callback: all arrays are writable."""
+        """Return the signature with which kernels call a callback; in it, all arrays are writable."""
         return self._signature(VECTOR)
 
     @property
@@ -374,7 +374,7 @@ def compile_callback(
     named_function: Callable[..., Any] | None = None,
     allocates: bool = True,
 ) -> Dispatcher:
-    """Compile a function that fills its arrays in place as a callback; raise TypeError if it cannot be compiled.
+    """Compile, as a callback, a function that fills its arrays in place; raise TypeError if this is impossible.
 
     `digests`: see `compile_cached`; `named_function`: the function that error messages name, by default `function`;
     `allocates`: see `callback`.
@@ -385,12 +385,12 @@ def compile_callback(
         digests = f"{digests[0]} {options}", digests[1]
     try:
         dispatcher = compile_cached(compiled, KINDS[kind].read_only_signature, digests, **options)
-    except Exception as error:  # not only errors of numba: its assertions may fail, too
+    except Exception as error:  # numba raises its own errors, but its assertions may fail, too
         dispatcher = _compile_with_writable_inputs(kind, compiled, digests, named_function or function, error, options)
     else:
         add_signature(dispatcher, KINDS[kind].signature)
     if digests is not None:
-        # register the digest now, because values that the function uses may change after its compilation
+        # register the digest now, because values that the function uses may change later, but not its machine code
         register_digest(dispatcher, f"{kind} {digests}")
     frozen_values(dispatcher, function)
     return dispatcher
@@ -406,7 +406,7 @@ def _compile_with_writable_inputs(
 ) -> Dispatcher:
     """Compile a callback with writable inputs, because its helpers may not accept read-only arrays.
 
-    Raises TypeError if the callback itself writes to its inputs. `error`: raised with read-only inputs.
+    Raise TypeError if the callback itself writes to its inputs. `error`: what compiling with read-only inputs raised.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)
@@ -427,7 +427,7 @@ _HELPER_REJECTS_READ_ONLY = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 @cache
 def zero_callback(kind: str) -> Dispatcher:
-    """Return a compiled callback that leaves its outputs at zero, the replacement of a missing optional callback."""
+    """Return a compiled callback that leaves its outputs at zero, to replace a missing optional callback."""
 
     def leave_zeros(t, q, p, out):
         pass
@@ -457,9 +457,9 @@ def _name_and_location(function: Callable[..., Any]) -> str:
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
-# pattern of an excerpt of a source file in numba's messages, which ends with the mark ^ in a line of its own
+# pattern of an excerpt from a source file in numba's messages; the excerpt ends with a line that contains only ^
 _SOURCE_EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
-# pattern of beginnings of lines in numba's messages that give no reason, but only refer to other lines
+# pattern of the beginnings of those lines in numba's messages that give no reason
 _UNINFORMATIVE_LINE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"

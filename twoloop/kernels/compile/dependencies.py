@@ -27,8 +27,8 @@ from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, optio
 # libraries whose functions are hashed by name only; files of machine code also record the versions of numba and numpy
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-# largest number of code objects whose loaded names are cached: runs create new functions with the same code, and to
-# read their instructions again would take most of the time of tracing
+# largest number of code objects whose loaded names are cached. Runs create new functions with the same code; to read
+# the instructions of each again would take most of the time of tracing
 MAX_CODES = 2000
 DIGEST_VERSION = 2  # part of all digests: increase it if machine code cached by earlier versions may be wrong
 
@@ -45,7 +45,7 @@ _DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # texts
 
 
 def register_digest(callback: Dispatcher, text: str) -> None:
-    """Register the text that is hashed for a callback instead of its code and the values that it uses."""
+    """Register a text; digests then hash this text in place of the callback's code and the values that it uses."""
     _DIGEST_TEXTS[callback] = text
 
 
@@ -63,7 +63,7 @@ class Digest:
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
-        self.names: set[str] = set()  # names of the attributes of modules that the current function may use
+        self.names: set[str] = set()  # names of those attributes of modules that the current function may use
         self.positions: dict[tuple[int, str], int] = {}  # position of each value added so far, by its id and name
         self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it calls
 
@@ -136,7 +136,7 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
-        """Return whether a value is added for the first time, and register it; hash the position of a known value."""
+        """Register a value and return True if it is new; else hash the position of its first occurrence."""
         key = (id(value), name)
         if key in self.positions:
             self.hash.update(f"<again {self.positions[key]}>".encode())
@@ -152,7 +152,7 @@ def names_of_code(code: types.CodeType) -> set[str]:
 
 
 def globals_of(function: Any) -> dict[str, Any]:
-    """Return the globals that a function and functions within it load, by name; for `math.log`, the global `math`."""
+    """Return the globals that a function and functions within it load, by name; `math.log` loads the global `math`."""
     names = {each.name for each in _loaded_names(function.__code__) if not each.free} & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
@@ -176,7 +176,7 @@ def is_library(module: str) -> bool:
 
 
 def is_twoloop(module: str) -> bool:
-    """Return whether a module is part of twoloop or generated: its globals are constant, and its indices valid."""
+    """Return whether a module is part of twoloop or generated, so that its globals are constant and indices valid."""
     return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
 
 
@@ -184,14 +184,14 @@ def is_twoloop(module: str) -> bool:
 LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
 FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback with the result of `frozen_values`
-NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that do not use the value that was loaded last
+NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that ignore the value that was loaded last
 
 
 class FrozenValue(NamedTuple):
     """Describe a value that a function uses, and where it is stored.
 
-    holder : cell or dict that contains the value, which may be replaced later. None: the value is a default or an item
-        of a tuple, which cannot be replaced.
+    holder : cell or dict that contains the value, where another value may replace it later. None: the value cannot be
+        replaced, because it is a default or an item of a tuple.
     key : key of the value if the holder is a dict.
     name : name in messages, such as "package.module.K" or "TABLES[0]".
     """
@@ -203,7 +203,7 @@ class FrozenValue(NamedTuple):
 
 
 class _LoadedName(NamedTuple):
-    """Name that a code object loads, of a global or (`free`) closure variable, and the attributes loaded from it."""
+    """Global variable (or closure variable: `free`) that a code object loads, and the attributes it loads from it."""
 
     free: bool
     name: str
@@ -211,10 +211,10 @@ class _LoadedName(NamedTuple):
 
 
 def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue, bytes | None]]:
-    """Return the values that numba has frozen in a compiled function, with the bytes of each array (None for others).
+    """Return the values that numba has frozen in a compiled function, with the bytes of each value that is an array.
 
     The first call, just after the compilation, stores this list in an attribute of `compiled`. `function`: the original
-    function, if a copy of it was compiled.
+    function, if a copy of it was compiled. Other values have None in place of bytes.
     """
     values: list[tuple[FrozenValue, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
     if values is None:
@@ -231,7 +231,7 @@ def _array_bytes(value: Any) -> bytes | None:
 def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[FrozenValue]:
     """Yield the values in a function and its helpers that numba freezes: numbers, arrays, text, functions, modules.
 
-    Functions of twoloop use only constants, which are not yielded; the helpers that they call are searched.
+    Values in functions of twoloop are constants, and not yielded; but helpers that these functions call are searched.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
@@ -277,13 +277,13 @@ def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenVa
     seen.add(id(location.value))
     fields = getattr(location.value, "_fields", None)
     for k, value in enumerate(location.value):
-        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # other items cannot change
+        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # items of other types cannot change
             name = f"{location.name}[{k}]" if fields is None else f"{location.name}.{fields[k]}"
             yield from _value_and_items(FrozenValue(None, "", name, value), seen)
 
 
 def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
-    """Yield the defaults, globals and closure variables of a function; of modules, also the used attributes."""
+    """Yield the defaults, globals and closure variables of a function, and those attributes of modules that it uses."""
     code, namespace = function.__code__, function.__globals__
     last_arguments = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last_arguments, (function.__defaults__ or ())[::-1], strict=False):
@@ -302,8 +302,8 @@ def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
 def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
     """Yield the attributes of a user's module, and of modules within this module, that a function uses.
 
-    `attributes` are the names loaded one after another, as in `module.inner.K`. If there are none, the module itself is
-    assigned to a variable or passed to a helper, and all attributes listed in `names` are yielded.
+    `attributes`: names loaded one after another, such as ("inner", "K") for `module.inner.K`. If there are none, the
+    module itself is assigned to a variable or passed to a helper; then all attributes listed in `names` are yielded.
     """
     if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
         return
@@ -336,8 +336,8 @@ def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
 class FunctionCopier:
     """Copy functions, and replace the compiled helpers in their globals, defaults and closure variables.
 
-    `wrap(copy, original)` returns the replacement of the helper `original`; `copy` is a copy of its Python function,
-    in which values are replaced after this call.
+    `wrap(copy, original)` returns the replacement of the helper `original`; `copy` is a copy of its Python function.
+    After the call of `wrap`, helpers that `copy` uses are replaced, too.
     """
 
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value, or the value itself; `names`: which attributes of modules are replaced."""
+        """Return the replacement of a value, or the value itself; `names`: attributes of modules to be replaced."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -372,7 +372,7 @@ class FunctionCopier:
         return self.copies[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
-        """Return the replacement of a Python function that is not compiled itself."""
+        """Return the replacement of a Python function that is not a compiled helper."""
         self._add_copy(function)
         return self.copies[id(function)]
 

@@ -1,8 +1,8 @@
 """Compile LLVM functions generated for one mechanism, cache them on disk, and load them, without numba.
 
-For each function, numba writes, parses and optimises about a thousand additional lines of code, and its front end takes
-ten milliseconds for each line of source. Generated code consists of arithmetic on numbers in memory, already in the
-right order, so that LLVM can emit machine code after few optimisations.
+For each function, numba would write, parse and optimise about a thousand additional lines of code, and its front end
+would take ten milliseconds for each line of source. Generated code consists of arithmetic on numbers in memory, already
+in a good order, so that LLVM can emit machine code after few optimisations.
 """
 
 from collections import defaultdict
@@ -37,14 +37,14 @@ class GeneratedFunctions:
 
 
 class DeferredFunctions:
-    """Functions that are generated only when an address is used first, because many runs do not use them."""
+    """Functions that are generated when one of their addresses is first used, because many runs do not use them."""
 
     def __init__(self, generate: Callable[[], GeneratedFunctions]):
         self._generate = generate
 
     @cached_property
     def functions(self) -> GeneratedFunctions:
-        """Generate the functions at the first access; they stay in memory with this object."""
+        """Generate the functions at the first access; they stay in memory as long as this object."""
         return self._generate()
 
     @property
@@ -62,9 +62,9 @@ def generated_functions(
     """Return the functions of a module from memory or from the disk, or compile the text that `write` returns.
 
     kind : name of the cache, which contains the newest MAX_ON_DISK modules on disk.
-    stamp, key : digest of the Python code that generates the functions, and digest of the expressions that they
-        compute.
-    write : returns the names of the functions and the text of the LLVM module.
+    stamp : digest of the Python code that generates the functions.
+    key : digest of the expressions that the functions compute.
+    write : function that returns the names of the functions and the text of the LLVM module.
     optimise : whether LLVM optimises the code.
     """
     if (functions := _FUNCTIONS_IN_MEMORY[kind].get(key)) is not None:
@@ -72,7 +72,7 @@ def generated_functions(
     files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
         names_and_content = files.load(disk_key)
-    except Exception:  # an incompatible file from another installation: it is overwritten after the compilation
+    except Exception:  # an incompatible file from another installation; compilation will overwrite it
         names_and_content = None
     if names_and_content is None:
         names, text = write()
@@ -120,7 +120,7 @@ def _shared_target_machine() -> Any:
 
 @cache
 def _two_pass_manager() -> tuple[Any, Any]:
-    """Return LLVM's manager of two passes, and a builder of passes; cached, because LLVM leaks about 300 kB per pass.
+    """Return LLVM's pass manager with two passes, and its pass builder; cached, because LLVM leaks 300 kB per pass.
 
     The two passes make the code of small mechanisms a tenth faster; all other passes together gain no further speed.
     """
@@ -131,7 +131,7 @@ def _two_pass_manager() -> tuple[Any, Any]:
 
 
 def _all_pass_manager() -> tuple[Any, Any]:
-    """Return LLVM's manager of all passes and their builder, for one module; only llvmlite 0.44 requires all passes."""
+    """Return LLVM's pass manager with all passes, and its pass builder, for one module; for llvmlite 0.44 only."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 

@@ -1,17 +1,17 @@
 """Compile each kernel together with its helpers; no machine code is emitted for helpers alone.
 
-By default, numba optimises each function together with all functions that it calls, and emits its machine code. So a
-helper at depth five is optimised six times, and the machine code emitted for the helper alone is never called. Here,
-helpers remain LLVM's intermediate code, and only the kernel that calls them is optimised. Passes of numba's front end
-that find nothing to do are skipped; they take half of its time. Loops are neither unrolled nor vectorised, unless the
-kernel requests it: most loops in kernels are short, and tests of their length would cost more than is gained.
+By default, numba optimises each function together with all functions that it calls, and emits machine code for each. So
+a helper at depth five is optimised six times, and the machine code for the helper alone is never called. Here, helpers
+remain LLVM's intermediate code, and only the kernel that calls them is optimised. Passes of numba's front end that find
+nothing to do in kernels, but take half of its time, are skipped. Loops are neither unrolled nor vectorised, unless a
+kernel requests it: most loops in kernels are short, so that tests of their length would cost more than is gained.
 
 While a kernel is compiled, `kernel_rules` replaces some of numba's functions; other functions compiled at that time are
-not affected. In kernels, negative indices do not count from the end of an array: kernels have no such indices, and the
-code for them would hide from LLVM that elements are adjacent. The other replacements yield the same machine code in
-less time: half of the time of a compilation, numba's Python code computes the same results repeatedly.
+not affected. One replacement leaves out the code for negative indices, which kernels do not use: this code would hide
+from LLVM that elements are adjacent. The other replacements yield the same machine code in less time, by caching what
+numba's Python code would compute again and again during half of the compile time.
 
-Modules that need private parts of numba to generate code import them from this one.
+Modules that need private parts of numba to generate code import these parts from this module.
 """
 
 from collections.abc import Callable, Iterator
@@ -45,7 +45,7 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "discard_compiled_code", "j
 def jitable_templates(function: Any) -> list[Any]:
     """Return numba's templates of a function decorated by `register_jitable`, or an empty list for other functions.
 
-    Numba compiles such a function again for each function that calls it.
+    Numba compiles a function with this decorator again for each function that calls it.
     """
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
@@ -61,7 +61,7 @@ def jitable_templates(function: Any) -> list[Any]:
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
-    """Let a compiled function, which has one signature, also be called with arguments of a second signature.
+    """Add a second signature to a compiled function, which can then be called with arguments of both signatures.
 
     The arguments of both signatures must have the same layout in memory.
     """
@@ -69,7 +69,7 @@ def add_signature(function: Dispatcher, signature: Any) -> None:
     (compiled,) = dispatcher.overloads.values()
     dispatcher._insert([each._code for each in signature.args], compiled.entry_point, False)
     dispatcher.overloads[signature.args] = compiled._replace(signature=signature)
-    description = copy(compiled.fndesc)  # compiled callers read the types of the arguments in this description
+    description = copy(compiled.fndesc)  # from this description, numba takes the types of arguments in calls
     description.argtypes = signature.args
     dispatcher.targetctx.insert_user_function(compiled.entry_point, description, [compiled.library])
 
@@ -145,7 +145,7 @@ _type_sizes: dict[str, int] = {}
 
 
 def _cached_type_size(self: Any, kind: Any) -> Any:
-    """Return the size of a type, bytes, from a cache; numba would make LLVM parse a module for each variable."""
+    """Return the size of a type in bytes, from a cache; without it, LLVM would parse a module for each variable."""
     name = str(kind)
     if name not in _type_sizes:
         _type_sizes[name] = _numba_type_size(self, kind)
@@ -157,16 +157,16 @@ _inlined_code: dict[Any, Any] = {}
 
 
 def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """Return the intermediate code of an inlined function, from a cache; numba would analyse it at each call."""
+    """Return the intermediate code of an inlined function, from a cache; without it, numba analyses it at each call."""
     if (function, enable_ssa) not in _inlined_code:
         _inlined_code[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
     code = copy(_inlined_code[function, enable_ssa])
-    code.func_id = FunctionIdentity.from_function(function)  # new for each copy: it determines the names of variables
+    code.func_id = FunctionIdentity.from_function(function)  # each copy needs its own, for unique names of variables
     return code
 
 
-_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types of those parts of a statement that contain no variables
+_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types of parts of a statement that contain no variables
 
 
 def _variables_of_statement(self: Any, part: Any) -> list[Any]:
@@ -189,9 +189,9 @@ _numba_load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_registries_once(self: Any) -> None:
-    """Install numba's implementations of Python and NumPy functions; numba would import them for each function.
+    """Install numba's implementations of Python and NumPy functions once; numba would import them for each function.
 
-    All copies of a context share the registries, to which numba adds new intrinsics.
+    All copies of a context share numba's registries of implementations, which also get new intrinsics.
     """
     if self._registries:
         for registry in list(self._registries):
@@ -204,7 +204,7 @@ _LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of events tha
 
 
 def _skip_lock_events(report: Any) -> Any:
-    """Return a function that reports all events except locks, of which each kernel has thousands."""
+    """Return a function that reports all events except those of locks, of which each kernel would cause thousands."""
     return lambda kind, *args, **named: None if kind in _LOCK_EVENTS else report(kind, *args, **named)
 
 
@@ -220,13 +220,13 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _skip_lock_events(event.start_event)),
     (event, "end_event", _skip_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # placeholder for an attribute that the owner does not have itself
+_MISSING_ATTRIBUTE = object()  # stands for an attribute that the owner inherits, but does not have itself
 _depth = [0]  # number of nested compilations of kernels
 
 
 @contextmanager
 def kernel_rules() -> Iterator[None]:
-    """Return a context for compiling a kernel, in which functions of numba are replaced by those of `_RULES`."""
+    """Return a context for compiling a kernel, in which the replacements in `_RULES` are active in numba."""
     if _depth[0] == 0:
         originals = [vars(owner).get(name, _MISSING_ATTRIBUTE) for owner, name, _ in _RULES]
         for owner, name, rule in _RULES:
@@ -245,7 +245,7 @@ def kernel_rules() -> Iterator[None]:
 
 
 class _CodegenWithoutEnvironment:
-    """Wrapper of numba's code generator that stores no addresses of environments, as helpers are never loaded."""
+    """Wrapper of numba's code generator that stores no addresses of environments, because helpers are never loaded."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -302,8 +302,8 @@ class _VectorizedLibrary(_KernelLibrary):
     vectorized = True
 
 
-# passes of numba that find nothing to do in kernels: they are for nested functions, expressions of whole arrays,
-# overloads that replace calls before lowering, and code that is not allowed in compiled functions
+# passes of numba that find nothing to do in kernels: for nested functions, expressions of whole arrays, overloads that
+# replace calls before code is generated, and code that is not allowed in compiled functions
 _SKIPPED_PASSES = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
 
@@ -362,7 +362,7 @@ _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 
 def machine_code_address(function: Dispatcher, signature: Any) -> int:
-    """Return the address of the machine code of a compiled function, which uses numba's calling convention."""
+    """Return the address of the machine code of a compiled function, to be called with numba's calling convention."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
         _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

@@ -1,8 +1,8 @@
 """Types of structures that are passed to kernels by reference, as one pointer to a table of addresses and lengths.
 
 Numba passes a named tuple by value, member by member: a workspace of forty arrays becomes about three hundred
-arguments, which every call that LLVM does not inline writes to memory. A value of type `Reference` has the members as
-attributes, and is a single argument.
+arguments, which every call that LLVM does not inline writes to memory. A structure of type `Reference` has the members
+as attributes, but is a single argument.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ _REFERENCES: dict[str, Any] = {}  # all types `Reference`, by name
 
 
 def _reference_named(name: str) -> Any:
-    """Return the `Reference` of this name; pickle calls this function, so that no copies arise."""
+    """Return the `Reference` of this name; pickle calls this function, so that it creates no copies of types."""
     return _REFERENCES[name]
 
 
@@ -40,7 +40,7 @@ class Reference(types.Type):
 
     name : unique name of the type.
     arrays : types of the fields that are arrays: contiguous, with one or two dimensions.
-    elements : for some arrays: indices of elements, by the names under which kernels read and write them.
+    elements : for some arrays, the indices of elements that kernels read and write as attributes, by attribute names.
     """
 
     def __init__(
@@ -50,13 +50,13 @@ class Reference(types.Type):
         _REFERENCES[name] = self
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
-        # array and index of each element that has a name
+        # (array, index) of each element that is an attribute
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # names of the generated functions among `functions`
         self.offsets: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = BoundedCache()  # addresses by tuples of functions: `machine_code_address` is slow
+        self._addresses: Any = BoundedCache()  # keys: tuples of functions; cached, because finding addresses is slow
         for field, kind in self.arrays.items():
             self.offsets[field] = self.n_words
             self.n_words += 1 + kind.ndim
@@ -65,7 +65,7 @@ class Reference(types.Type):
         return _reference_named, (self.name,)
 
     def __repr__(self) -> str:
-        """Return the name and a digest of the layout, which are part of the keys of machine code on disk."""
+        """Return the name and a digest of the layout; both become part of the keys of machine code on disk."""
         fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
         fields += self.elements.items()
         fields += [
@@ -83,7 +83,7 @@ class Reference(types.Type):
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
         """Add fields for generated functions, whose signatures are given by name.
 
-        Before a call, the caller has to check that the function is not missing.
+        A kernel has to check, before it calls such a function, that the function is not missing.
         """
         for field, signature in signatures.items():
             self.functions[field] = signature
@@ -100,8 +100,8 @@ class Reference(types.Type):
     def table(self, values: Any) -> Any:
         """Return the table (int64) for the object `values`, whose attributes are the arrays and functions of this type.
 
-        The object must exist as long as the table is used. It holds a function compiled by numba as an object (None if
-        missing), but a generated function as its address (0 if missing).
+        The object must exist as long as the table is used. It holds function objects for functions compiled by numba
+        (None if missing), but addresses for generated functions (0 if missing).
         """
         words: list[int] = []
         for field, kind in self.arrays.items():
@@ -129,9 +129,9 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Emit code that converts an argument from Python to a pointer: an int, or the attribute `address` of an object.
+    """Emit code that converts an argument from Python to a pointer.
 
-    An int saves the lookup of the attribute, which takes a tenth of a microsecond.
+    The argument is an object with an attribute `address`, or the address itself: that saves a tenth of a microsecond.
     """
     python_type = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -150,7 +150,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any) -> Any:
-    """Emit code that loads the word at an offset of a table; LLVM may assume that this word never changes."""
+    """Emit code that loads a word of a table; LLVM may assume that this word never changes."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), offset)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -179,7 +179,7 @@ class _FieldTypes(AttributeTemplate):
 
 
 def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    """Emit code for the address of an element that has a name."""
+    """Emit code for the address of an array element that is an attribute."""
     array, index = typ.elements[field]
     item_type = context.get_data_type(typ.arrays[array].dtype)
     data = _load_word(context, builder, pointer, typ.offsets[array], item_type.as_pointer())
@@ -188,7 +188,7 @@ def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: 
 
 @lower_setattr_generic(Reference)
 def _store_element(context: Any, builder: Any, sig: Any, args: Any, field: str) -> None:
-    """Emit code that stores a number in an element that has a name."""
+    """Emit code that stores a number in an array element that is an attribute."""
     pointer, value = args
     builder.store(value, _element_address(context, builder, sig.args[0], pointer, field))
 
@@ -217,7 +217,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # the structure remains in registers; numba's helper would store it to memory
+    for name, value in fields.items():  # stays in registers; numba's helper would use memory
         index = model.get_field_position(name)
         element = ir.Constant(array.type.elements[index], None) if value is None else value
         array = builder.insert_value(array, element, index)
@@ -225,7 +225,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
 
 
 def _define_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define how numba calls field `field` of a `Reference`, a function compiled by numba."""
+    """Define how numba calls the function in the field `field` of a `Reference`, if numba compiled this function."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
@@ -253,7 +253,7 @@ def _llvm_type(kind: Any) -> Any:
 
 
 def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define how numba calls field `field` of a `Reference`, a generated function."""
+    """Define how numba calls the function in the field `field` of a `Reference`, if this function was generated."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)

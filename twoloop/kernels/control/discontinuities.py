@@ -1,22 +1,22 @@
 """Detect sudden changes of forces, C_t and b ahead of a step, such as gusts, blows and switches.
 
 A step evaluates the equations at its stages only, and may miss a force that acts between two stages. So forces, C_t and
-b are sampled ahead of the step, which costs less than evaluations of the equations.
+b are sampled ahead of the step (`f`: kit, `w`: workspace), which costs less than evaluations of the equations.
 
 - A force, C_t or b is smooth if the second differences of its samples are small relative to the range of the samples
   (after the straight line from the first to the last sample is subtracted). A change within one or two samples makes
   second differences as large as the range. The step then ends at the change, as it does where a value is not finite.
 - If forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples
-  follow the motion: the parabola of the present position, velocity and acceleration. One set of samples is taken for
+  follow the motion, on a parabola with the present position, velocity and acceleration. One set of samples is taken for
   one long step, or for all short steps that end within MIN_TIME_AHEAD spacings.
-- All other samples are samples in time alone, at the state at which the step begins. Their spacing is also limited to a
+- All other samples are "in time alone": at the state at which the step begins. Their spacing is also limited to a
   fraction of the step size.
 - The shortest time between two changes, and the shortest duration of a change within a short step, are recorded. If the
-  spacing of samples is not much smaller, equally short changes may be missed: a message says so.
+  spacing of samples is not much smaller, other changes as short may have been missed: a message says so.
 
-A jump of C_t or b, as at the end of a ramp in a drive, changes velocities as an impulse does. Methods that restore the
-dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So if velocities
-change in a step by more than accelerations explain, C_t and b are sampled at thirteen times within the step. The
+A jump of C_t or b, for example at the end of a ramp in a drive, changes velocities as an impulse does. Methods that
+restore the dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So if
+velocities change in a step by more than accelerations explain, C_t and b are sampled at thirteen times in the step. The
 twelfth difference of these samples is almost zero if C_t and b are smooth on the scale of the step, and falls by 2^12
 when the interval is halved. If C_t or b jumps, the difference stays as large as the jump in one half of the interval.
 """
@@ -36,22 +36,22 @@ N_PARTS = 12  # number of equal parts of an interval; C_t and b are sampled at t
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
-TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, relative to the slope times np.spacing(t)
-STEEPNESS = 4.0  # a part of a step is a ramp if the slope of C_t or b exceeds this multiple of the mean slope
-MAX_RAMP_SHARE = 0.125  # a step has to end at a ramp that is at most this fraction of the step size long
-MIN_SPACINGS = 8.0  # bisection ends if an interval is at most this number of spacings of floating-point numbers long
+TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, over the slope of C_t or b times np.spacing(t)
+STEEPNESS = 4.0  # a part of a step is a ramp if the slope of C_t or b there exceeds this multiple of the mean slope
+MAX_RAMP_SHARE = 0.125  # a step has to end at a ramp if the ramp takes at most this fraction of the step
+MIN_SPACINGS = 8.0  # bisection ends at an interval of this length, in spacings of floating-point numbers
 SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in an interval
 
 
 @compiled
 def _sample_rates(f, w, t, q, velocity, begin, end):
-    """Store C_t and b at thirteen times from `begin` to `end` in the rows of w.rates, at q + velocity (time - t)."""
+    """Store C_t and b in rows of w.rates: at thirteen times from `begin` to `end`, at q + velocity (time - t)."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * velocity[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
-        if not finite_vector(w.rates[k]):  # such as the derivative of |t| at 0: use the next floating-point time
+        if not finite_vector(w.rates[k]):  # as the derivative of |t| at 0 is: use the next floating-point time
             constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
 
 
@@ -77,7 +77,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the error of (G x)[row] that the tolerances of x (n_q coordinates or velocities) allow."""
+    """Return the error of (G x)[row] that the tolerances of x allow; x: n_q coordinates or velocities."""
     largest = 0.0
     if f.form == FIXED_ORDER:
         rows, columns, _ = jacobian_entries_of(f.ldl_program)
@@ -94,7 +94,7 @@ def _allowed_error(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest difference of a velocity change from h times the mean acceleration, in tolerances."""
+    """Return the largest difference, in tolerances, of a velocity change and h times the mean acceleration."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -108,7 +108,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     """Return SMOOTH, RAMP or JUMP for the least smooth row of C_t and b from t to `end`, and two times (s).
 
     The times are beginning and end of the jump or ramp, or t and `end` if the row is smooth. If a ramp fills the step,
-    its first half is returned: accelerations may be zero at both ends of the ramp, and a method that evaluates only
+    they enclose its first half: accelerations may be zero at both ends of the ramp, and a method that evaluates only
     there would miss the ramp. (q, v) is the state at t; positions are extrapolated along `velocity` (n_q).
     """
     begin = t
@@ -152,34 +152,34 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
             return JUMP, begin, end
     if steepest > STEEPNESS * mean:
         return RAMP, low, high
-    if end - begin < h:  # one half of the step is not smooth either: a ramp fills the step, or the row has a kink
+    if end - begin < h:  # a half of the step is not smooth either: a ramp fills the step, or the row has a kink
         return RAMP, t, t + 0.5 * h
     return SMOOTH, t, t + h
 
 
-N_SAMPLES = 20  # number of intervals between the samples that are taken and compared together
+N_SAMPLES = 20  # number of intervals between the samples of one set
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
 SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of samples
 LEAST_RANGE = 0.1  # samples are examined if their range exceeds this fraction of rtol times the largest value so far
-# samples are examined only if their range exceeds this, in any unit: squares of smaller values underflow, and subnormal
-# numbers are too coarsely spaced to look smooth
+# samples are examined only if their range also exceeds this number, in any unit: squares of smaller values underflow,
+# and subnormal numbers are too coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
-# smallest number of samples in a step, because all stages may miss a force that acts for a quarter of the step
+# smallest number of samples in a step: the stages alone may all miss a force that acts for a quarter of the step
 MIN_SAMPLES_IN_STEP = 8.0
-RESAMPLE_BELOW = 0.25  # samples ahead are taken again if the required spacing is below this fraction of the last one
+RESAMPLE_BELOW = 0.25  # samples ahead are taken again if their spacing has to fall below this fraction of the last one
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
-EQUAL_CHANGES = 1e-5  # changes count as one if they are apart by at most this fraction of the widest spacing of samples
-# time after the start, relative to GAP, before which changes are not recorded: rounding errors make forces that begin
+EQUAL_CHANGES = 1e-5  # two changes count as one up to this distance, relative to the widest spacing of samples
+# changes are recorded only from this time after the start on, relative to GAP: rounding errors make forces that begin
 # at zero, such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a sudden change exceeds this multiple of the changes next to it; a smooth slope does not
 SHORT_STEP = 0.5  # a discontinuity is suspected if a step is below this fraction of the longest of the last steps
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
-# an acceleration decays if it changes by more than this fraction of the largest acceleration while a velocity changes
-# by its tolerance, see _acceleration_lasts
+# accelerations decay, see _acceleration_lasts, if one changes by more than this fraction of the largest acceleration
+# while a velocity changes by its tolerance
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # a change up to this time after a step's beginning, in spacings of samples, counts as passed
+CHANGE_MARGIN = 0.01  # changes up to this time (in spacings of samples) after the beginning of a step count as passed
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes, after the samples, that stores the largest |value| of each column
 MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes that stores values between two samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
@@ -187,7 +187,7 @@ N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b at `time` in `values`, for the state reached from (q, v) in `elapsed` s at constant a."""
+    """Store forces, C_t and b in `values`: at `time`, in the state after `elapsed` s from (q, v) at constant a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -198,14 +198,14 @@ def _sample_forces(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _least_ranges(tolerances, largest, n):
-    """Return the smallest ranges of samples that matter, of forces (the first n components) and of C_t and b."""
+    """Return the smallest ranges of samples to be examined: of forces (the first n components), and of C_t and b."""
     least = LEAST_RANGE * tolerances[RTOL]
     return max(LEAST_VALUE, least * largest_of(largest[:n])), max(LEAST_VALUE, least * largest_of(largest[n:]))
 
 
 @compiled
 def _is_smooth_bend(values, k, n):
-    """Return whether the second difference at k resembles its neighbour in sign and size (n + 1 values in all)."""
+    """Return whether the second differences at k and beside k are similar in sign and size, for n + 1 values."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -218,8 +218,8 @@ def _is_smooth_bend(values, k, n):
 def _find_sudden_bend(values, n, slope, min_range, strict):
     """Return the index of the first sudden bend of n + 1 values (0: none), and the limit of second differences.
 
-    The limit is SUDDEN_RATIO times the range of the values minus a line of slope `slope` (per sample). The index is 0
-    if this range is at most `min_range`. If `strict`, bends of a smooth curve are excluded, see `_is_smooth_bend`.
+    The limit is SUDDEN_RATIO times the range of the values after a line of slope `slope` (per sample) is subtracted. If
+    this range is at most `min_range`, return index 0. `strict`: ignore bends of a smooth curve, see `_is_smooth_bend`.
     """
     low = high = 0.0
     for k in range(1, n + 1):
@@ -238,11 +238,11 @@ def _find_sudden_bend(values, n, slope, min_range, strict):
 def _first_sudden_bend(values, n, detrends, min_range):
     """Return the index of the first sudden bend of n + 1 samples (0: none), and the limit of its second difference.
 
-    If `detrends` is 1, the straight line from the first to the last value is subtracted before the search, which is
-    repeated among the values before the bend, until it finds no earlier bend. `min_range`: see `_find_sudden_bend`.
+    The search is repeated among the values before the bend, until it finds no earlier bend. If `detrends` is 1, each
+    search subtracts the straight line from the first to the last value. `min_range`: see `_find_sudden_bend`.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
-    while index > 1:  # few samples of a smooth curve may bend as much, hence `strict`
+    while index > 1:  # strict = True, because a few samples of a smooth curve may bend as much as a jump
         slope = detrends * (values[index] - values[0]) / index
         earlier, bound = _find_sudden_bend(values, index, slope, min_range, True)
         if earlier == 0:
@@ -253,7 +253,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return whether two samples differ by more than `limit`, and far more than from `previous` and `following`."""
+    """Return whether two samples differ by more than `limit`, and much more than from the samples on either side."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     neighbouring_change = max(sign * (first_value - previous), sign * (following - second_value))
@@ -262,7 +262,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time just after component j changes, between samples k and k + 1 at the times `low` and `high`."""
+    """Return the time right after the change of component j between sample k, at `low`, and sample k + 1, at `high`."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):
@@ -278,7 +278,7 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 
 @compiled
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
-    """Update LAST_CHANGE and SHORTEST_CHANGE in `clock` by the sudden changes on both sides of the bend at `index`.
+    """Update LAST_CHANGE and SHORTEST_CHANGE in `clock` by sudden changes right before and after the bend at `index`.
 
     Sample k, from 0 to n, is at the time begin + k * spacing. `column`: index of the component that bends. `limit`:
     largest difference of two samples that is not a sudden change.
@@ -301,7 +301,7 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 
 @compiled
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
-    """Return the time of the first sample at which a component changes suddenly (or infinity), and of the last sample.
+    """Return the time of the first sample with a sudden change of a component (or infinity), and of the last sample.
 
     (q, v, a) is the state at t. Samples are taken from `begin` on, at most until `last`: along the motion if
     `follows_motion` is 1, or at the state (q, v) if it is 0.
@@ -337,7 +337,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Update SHORTEST_CHANGE in `clock` by changes within a short step, which samples ahead of the step have missed."""
+    """Update SHORTEST_CHANGE in `clock` by changes within a short step that the samples ahead of it have missed."""
     changes, spacing, begin, end = w.changes, control[at.TIME_SPACING], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
@@ -361,10 +361,10 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
-    """Return whether accelerations change by at most MAX_LASTING_CHANGE while a velocity changes by its tolerance.
+    """Return whether accelerations last: a change of a velocity by its tolerance hardly changes them.
 
-    Accelerations change more if stiff friction keeps a body at rest: then the acceleration is a rounding error of
-    balanced forces, and a parabola with this acceleration would lead far from the state of rest. (Q, V, A) is scratch.
+    If stiff friction keeps a body at rest, accelerations do not last: they are rounding errors of balanced forces, and
+    a parabola with these accelerations would lead far from the state of rest. (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
     for m in range(n):
@@ -401,7 +401,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # close samples along the motion also count as samples in time alone, unless these must continue at a known change
+    # closely spaced samples along the motion replace samples in time alone, unless these must go on at a known change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -416,13 +416,13 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
     """Sample the forces ahead at constant (q, v); return the time of the first sudden change, at most `next_change`."""
     max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
-    # closer samples are not needed with multistep methods (JUMP_RATIO = 1), because their error estimates show a jump,
-    # or if C_t or b may jump (MAY_JUMP = 1), because the steps are then checked for jumps
+    # closer samples are needed neither for multistep methods (JUMP_RATIO = 1), whose error estimates show a jump, nor
+    # if C_t or b may jump (MAY_JUMP = 1), because then each step is checked for jumps
     may_resample = control[at.JUMP_RATIO] > 1.0 and control[at.MAY_JUMP] == 0.0
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # the next samples must find the same change again
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # then the next samples must show this change, too
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)
@@ -434,7 +434,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return `size` (s), or less if a force or drive changes suddenly within it: the step from t ends at the change.
+    """Return the step size: `size` (s), or less, to end the step from t at a sudden change of a force or drive.
 
     Forces, C_t and b are sampled ahead of t, at most until `last`. `new_state` is scratch.
     """
@@ -448,7 +448,7 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     next_change = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > t_near else np.inf
     next_change_of_motion = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > t_near else np.inf
     is_at_change = next_change == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
-    # do not sample again near the end of a run: samples of ever shorter spans would find the same change again
+    # do not sample again near the end of a run: ever shorter sets of samples would show the same change again
     if control[at.BY_TIME] == 1.0 and not (is_at_change and size <= (1.0 + CHANGE_MARGIN) * clock[at.SAMPLED_EVERY]):
         next_change = _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = next_change

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
     NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller takes a dense form
     NEEDS_COMPILATION,  # the step is not compiled: the caller compiles it and repeats the call
 ) = range(12)
-SUSPENDED = 0.5  # value of MAY_CROSS after all crossing steps across a singular position have failed
-CONTINUE = -1  # value that functions return instead of an end code if the loop continues
+SUSPENDED = 0.5  # value of MAY_CROSS after all attempts to cross a singular position have failed
+CONTINUE = -1  # value that functions return in place of an end code if the loop goes on
 
 # indices in the rule of step-size control: the ratio of the next step size to the present one is SAFETY
-# error**-EXPONENT, but at least FACTOR_MIN and at most FACTOR_MAX. LEAST_ERROR: if positive, the change of the error
-# from step to step (Hairer & Wanner II, IV.8) is used, too, in which errors count as at least LEAST_ERROR
+# error**-EXPONENT, but at least FACTOR_MIN and at most FACTOR_MAX. If LEAST_ERROR > 0, the ratio also depends on the
+# trend of the error from step to step (Hairer & Wanner II, IV.8), in which errors count as at least LEAST_ERROR
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
 # indices in the history of step-size control: size (s) and error (in tolerances) of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
@@ -38,34 +38,34 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     FIXED_STEP,  # fixed step size, s; 0: step-size control
     LIMIT_START,  # value of H_LIMIT if none of the last LIMIT_MEMORY steps failed, s
     LIMIT_FACTOR,  # value of H_LIMIT after a failed step, relative to the size of this step
-    LIMIT_MEMORY,  # number of accepted steps after which a failed step no longer limits step sizes
+    LIMIT_MEMORY,  # number of accepted steps during which a failed step limits the step size
     MAX_STEPS,  # largest number of accepted steps
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
     SYMMETRIC,  # 1: each step uses the partition chosen at its midpoint; 0: a partition is used until it is poor
-    MAX_ATTEMPTS,  # largest number of attempted steps in one call, after which the caller can check progress and time
+    MAX_ATTEMPTS,  # number of attempted steps after which a call returns, so that the caller checks progress and time
     # 1: stop with NEAR_SINGULAR near a singular position; 0: do not stop; SUSPENDED: do not stop near the present
     # singular position; the value is 1 again after the run has left this position
     MAY_CROSS,
     SHORTEST,  # smallest allowed step size, s; steps of at most EQUAL_SPACINGS spacings of t are too short as well
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
-    TRIAL_STEPS,  # stop with SWITCH_METHOD if the size after one of the first TRIAL_STEPS steps is at most GAP
+    TRIAL_STEPS,  # stop with SWITCH_METHOD if one of the first TRIAL_STEPS steps proposes a next size of at most GAP
     MAY_JUMP,  # 1: C_t or b may jump
-    JUMP_RATIO,  # largest ratio of an error to its estimate near a jump of a force, see SUDDEN_ERROR in advance.py
+    JUMP_RATIO,  # near a jump of a force, the error may be this multiple of its estimate, see SUDDEN_ERROR (advance.py)
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
-    TIME_SPACING,  # largest spacing of samples in time alone, which are taken ahead of short steps, too, s
+    TIME_SPACING,  # largest spacing, s, of samples in time alone (these are taken ahead of short steps, too)
     # 1: samples follow the motion; 0: samples stay at the state, because a callback raised an error along the motion
     SAMPLE_MOTION,
     BY_TIME,  # 1: forces may change suddenly with time
-    BY_STATE,  # 1: forces may change suddenly with position or velocity: short steps are sampled along the motion, too
-    FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before the first step
+    BY_STATE,  # 1: forces may change suddenly with position or velocity; short steps also need samples along the motion
+    FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: this size is a guess, and may grow before the step
     MAX_EVALUATION_GAP,  # longest part of a step without an evaluation of the equations, relative to the step size
     TAKES_MANY,  # 1: the method can take many steps in one call, without checks between them
     CHECKS_WITHIN,  # 1: once a run has come near a singular position, check within each step whether one is near
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
 
-# columns of `out_steps`, which has one row for each accepted step. H: step size, s; other columns: total numbers, since
-# the run began, of rejections by the error, failures, partitions, and Jacobians (0 after an explicit step)
+# columns of `out_steps`, which has one row for each accepted step. H: step size, s; the other columns count, since the
+# start of the run: rejections by the error test, failures, partitions, and Jacobians (JACOBIANS: 0 in an explicit step)
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
 # indices in `clock`, after the history
@@ -79,12 +79,12 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     N_FIXED,  # number of completed steps of this grid
     FAILURE_CODE,  # code of the last failed attempt, which explains short steps; DONE: no attempt failed recently
     H_FAILED,  # size of the last failed step, for messages, s
-    H_LONG,  # longest of the last steps, s, which count less the older they are, see H_LONG_DECAY in step_size.py
+    H_LONG,  # longest of the last steps, s; older steps count less, see H_LONG_DECAY in step_size.py
     LARGEST_PIVOT,  # largest value so far of PIVOT in Work.notes, the smallest pivot of C_q
-    JUMP_FROM,  # time at the beginning of the next interval with a jump of C_t or b, s; infinite: none is known
+    JUMP_FROM,  # time at which the next interval with a jump of C_t or b begins, s; infinite: no jump is known
     JUMP_TO,  # time at which this interval ends, s
     APPLIES_JUMP,  # 1: the next step goes from JUMP_FROM to JUMP_TO; new_state is the state after the jump
-    JUMP_END,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
+    JUMP_END,  # end of the last step that was rejected with an error above SUDDEN_ERROR, s
     PIVOT_HERE,  # fixed-order form: value of PIVOT in Work.notes at the end of the last step
     # samples in time alone (at a fixed state) and samples along the motion: see discontinuities.py
     SAMPLED_TO,  # time of the last sample in time alone, s
@@ -92,23 +92,23 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     WIDEST_SAMPLING,  # widest spacing of samples so far, s
     DISCONTINUITY,  # time of the next sudden change that samples in time alone show, s
     DISCONTINUITY_OF_MOTION,  # time of the next sudden change that samples along the motion show, s
-    COMPARED,  # beginning of the last short step whose samples were compared with samples before and after the step, s
+    COMPARED,  # beginning, s, of the last short step in which samples were compared with samples before and after it
     LAST_CHANGE,  # time of the last sudden change of a force, C_t or b, s
     SHORTEST_CHANGE,  # shortest time between two sudden changes, s
     MOTION_SAMPLED_TO,  # time of the last sample along the motion, s
     SAMPLES_MOTION,  # 1 while callbacks are sampled along the motion, at states that the motion may not reach
-    # smallest result of min_pivot_ratio (partition.py) at output times and grid points, where steps have to end
+    # smallest result of min_pivot_ratio (partition.py) at output times and at grid times of fixed steps
     PIVOT_AT_OUTPUT,
     PIVOT_PASSED,  # smallest pivot within steps, over LARGEST_PIVOT, since MAY_CROSS became SUSPENDED; 0: none yet
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 29)
 
-# constants of the power iterations in stiffness.py and run/messages.py, which estimate rho (1/s), the largest rate of
-# the motion; it follows from eigenvalues of dF/dq and dF/dv, where F are the accelerations
+# constants of the power iterations in stiffness.py and run/messages.py. These estimate rho (1/s), the largest rate of
+# the motion, from the eigenvalues of dF/dq and dF/dv, where F are the accelerations
 DISPLACEMENT = 1e-6  # displacement in finite differences, relative to the largest coordinate or velocity
 INNER_TOL = 1e-8  # tolerance of Newton's method for the projection of positions onto the constraints
 
 
 def initial_direction(n_q: int) -> NDArray[np.float64]:
-    """Return the first direction (n_q) of a power iteration, with different components, as in a vibration."""
+    """Return the first direction (n_q) of a power iteration; its components differ, as in a vibration."""
     return np.asarray(0.3 + 0.1 * (np.arange(n_q) % 7))

@@ -1,7 +1,7 @@
 """Step-size control: the size of the next step, the times at which steps end, and additional error measures.
 
-The next step size follows from the error of the last step. In methods with a trend (Gustafsson, ACM TOMS 20 (1994),
-496) it also depends on how the error has changed since the last accepted step.
+The next step size follows from the error of the last step. For methods with a trend (Gustafsson, ACM TOMS 20 (1994),
+496) the next size also depends on how the error has changed since the last accepted step.
 
 Errors that the embedded formula does not show are measured in two ways:
 
@@ -9,12 +9,12 @@ Errors that the embedded formula does not show are measured in two ways:
   constraints. In the same assembly of the mechanism, the difference is of the order of the step's error. If the step
   has ended in another assembly, the difference is larger, however smooth the independent coordinates are. If all
   coordinates are prescribed, this is the only error estimate. Where two assemblies come close to one another, a large
-  step may end in the wrong assembly with a small difference. But then det C_qd changes its sign, which along a motion
-  happens only at a singular position. So if the sign changes in a step, the prediction must be nearly exact, as in
-  short steps through a singular position.
-- `defect_ratio` is the defect of a Taylor step: the difference between the accelerations by the series and by the
-  equations at the same states. A series contains the forces at the beginning of the step, but no later sudden change.
-  So the equations are evaluated at the end of the step, and within it at times at most tolerances[DEFECT_GAP] apart.
+  step may end in the wrong assembly with a small difference. Then the sign of det C_qd changes, although a motion
+  changes it only at a singular position. So if the sign changes in a step, the prediction must be nearly exact, as it
+  is in short steps through a singular position.
+- `defect_ratio` is the defect of a Taylor step: the difference between accelerations by the series and accelerations by
+  the equations at the same states. A series contains the forces at the beginning of the step, but no later sudden
+  change. So the equations are evaluated at the end of the step and, if it is longer than DEFECT_GAP, also within it.
 """
 
 import numpy as np
@@ -37,13 +37,13 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-# methods with a trend keep the step size if it could grow by at most this factor: this saves a factorization
+# methods with a trend keep a step size that could grow by at most this factor, to save a factorization
 KEEP_BELOW_RATIO = 1.2
 
 
 @compiled
 def step_size_ratio(rule, past, h, error):
-    """Return the ratio of the next step size to h, by the step-size `rule`, from `error` (in tolerances) and `past`.
+    """Return the ratio of the next step size to h by the step-size `rule`, given this step's `error` in tolerances.
 
     `past` is the history of step-size control: size and error of the last accepted step.
     """
@@ -67,7 +67,7 @@ def record_accepted_step(rule, past, h, error):
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project (Q, V), a state near the constraints, in place, and store its accelerations in A; return a code."""
-    # PROJECT is the cheapest task of generated code, and in the fixed-order form the task EVALUATE does not project
+    # PROJECT is the cheapest task in generated code; and in the fixed-order form, the task EVALUATE does not project
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -85,8 +85,8 @@ EQUAL_SPACINGS = 4.0  # largest difference of times that count as equal, in spac
 def size_on_grid(clock, t, h, target, goal):
     """Return the size (s) of a step from t, the number of grid steps that it completes, and whether it reaches `goal`.
 
-    Grid times are T_START plus multiples of h. `target` is the next output time; if a grid time differs from `target`
-    by at most h / 10^6, both count as equal. `goal` is `target` or the time of an earlier jump of C_t or b.
+    Grid times are T_START plus multiples of h. `target` is the next output time; a grid time that differs from `target`
+    by at most h / 10^6 counts as equal. `goal` is `target`, or the time of a jump of C_t or b before `target`.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     margin = max(1e-6 * h, rounding)
@@ -116,7 +116,7 @@ def size_off_grid(control, t, h, left, crosses_jump):
     return size, reaches_goal
 
 
-H_LONG_DECAY = 0.98  # factor by which H_LONG, the longest of the last steps, decreases in each accepted step
+H_LONG_DECAY = 0.98  # each accepted step multiplies H_LONG, the longest of the last steps, by this factor
 
 
 @merged
@@ -130,7 +130,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     gap = size
     if w.defect >= 0.0:
         gap = min(size, tolerances[DEFECT_GAP])
-    elif is_beyond_gap(tolerances, size):  # a step longer than GAP has closely spaced stages
+    elif is_beyond_gap(tolerances, size):  # only methods with closely spaced stages take steps longer than GAP
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.widest_gap = max(w.widest_gap, gap)
     clock[at.H_LONG] = max(size, H_LONG_DECAY * clock[at.H_LONG])
@@ -146,13 +146,13 @@ def count_step(w, tolerances, control, clock, size, out_step):
 FRACTION_OF_MOTION = 0.1
 FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if the sign of det C_qd changes in the step
 LEAST = 1e-300  # lower bound of the allowed error, which avoids a division by zero
-# the part, in tolerances, of the allowed error of a predicted position that does not depend on the motion in the step
+# part of the allowed error of a predicted position, in tolerances, that does not depend on the motion in the step
 FIXED_FRACTION = 0.01
 
 
 @merged
 def store_prediction(w, q1):
-    """Store the dependent positions in q1 (n_q), which the formula of the method predicts, in w.predicted."""
+    """Store the dependent positions of q1 (n_q), as the formula of the method predicts them, in w.predicted."""
     for k in range(w.dependent.size):
         w.predicted[k] = q1[w.dependent[k]]
 
@@ -162,8 +162,8 @@ def prediction_error(w, tolerances, h, q, v, q1):
     """Return the largest error of the dependent positions that the formula predicts, divided by the allowed error.
 
     The error is the difference of w.predicted from the positions in q1, which satisfy the constraints. The allowed
-    error is the smaller of two: the tolerance, and about FRACTION_OF_MOTION times the motion of the step. The factors
-    of C_qd in `w` must belong to q1. With steps of fixed size the result is 0.
+    error is the smaller one of the tolerance and about FRACTION_OF_MOTION times the motion in the step. The factors
+    of C_qd in `w` must belong to q1. For steps of fixed size, return 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -198,8 +198,8 @@ def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the defect |predicted - a| at the end of a step of size h, relative to the largest allowed defect.
 
     The error that the defect causes in q and v must be below the tolerances. The defect of a series of order `order`
-    grows as the highest power of the time, so that its integral over the step is h / order times its value at the end.
-    The result is infinite if an acceleration is not finite.
+    grows as the highest power of time; so its integral over the step is h / order times its value at the end. If an
+    acceleration is not finite, the result is infinite.
     """
     rtol, duration, largest, ratio = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

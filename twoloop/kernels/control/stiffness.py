@@ -3,21 +3,21 @@
 The largest rate of the motion, rho, is the square root of the largest eigenvalue of dF/dq, or the largest eigenvalue of
 dF/dv, where F are the accelerations. From time to time a few power iterations, of one evaluation each, estimate rho. If
 h rho is well below the stability limit of the explicit method, the motion is not stiff. Near the limit, either
-stiffness or accuracy may determine the step size h. Then the implicit method is tried for a window of steps, in which
-errors count tenfold, and replaces the explicit method if it costs less per second of motion.
+stiffness or accuracy may determine the step size h. Then the implicit method is tried for some steps, with its errors
+multiplied by ten, and replaces the explicit method if it costs less per second of motion.
 
 A trial also begins at smaller h rho if
 
-- rho is far above the rates that the motion shows: the error of a component that decays at this rate may limit steps;
-- all components that could vibrate at the rate rho have velocities of a few tolerances: steps at the stability limit
+- rho is far above the rates of change in the motion: the error of a component that decays at this rate may limit steps;
+- any component that vibrates at the rate rho has velocities of a few tolerances at most: steps at the stability limit
   excite such components;
 - the whole run is expected to cost a thousand times as much as a trial.
 
-A trial that may not pay waits until the run has cost a few times as much as a trial, or is expected to cost ten times
+If a trial may not pay, it waits until the run has cost a few times as much as a trial, or is expected to cost ten times
 as much. Costs are counted in evaluations of the explicit method; with generated code, an evaluation of the implicit
 method counts several times. The explicit method is tried again if h rho is well below the limit, or if a second of
 motion costs more than it did with the explicit method. After an unsuccessful trial, the number of estimates before the
-next trial doubles.
+next trial doubles. In this module, `f` is the kit, and `w` the workspace.
 
 Kernels call both methods by their addresses, so that each method is compiled in its own module.
 """
@@ -51,46 +51,46 @@ from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, GAP, MAX_G
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# FIRST_ESTIMATE: number of evaluations before the first estimate of rho; BETWEEN_ESTIMATES: number between two
-# estimates, which take about eight evaluations each. For the explicit method, both are multiplied by COST_RATIO
+# number of evaluations before the first estimate of rho, and between two estimates, each of which takes about eight
+# evaluations. While the explicit method is active, both numbers are multiplied by COST_RATIO
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
-NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if the step size times the eigenvalue is smaller than this
+NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if the step size times the eigenvalue is below this number
 ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
 STABILITY_LIMIT = 3.0  # if h rho exceeds this multiple of LIMIT, stability must limit the step of the explicit method
 # if the Jacobian is computed by finite differences (about eight evaluations per coordinate), a trial that may not pay
-# begins only when the run has cost more than this number of evaluations per independent coordinate
+# also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-# a trial that may not pay begins only if the run so far has cost at least as much as this number of trials
+# a trial that may not pay begins only after the run has cost as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
-COUNTED_FRACTION_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
-# a trial begins whatever the rates are if the run has cost more than this multiple of MIN_COST_IN_TRIALS trials. After
-# k trials, the next one begins at k + 1 times this cost
+COUNTED_FRACTION_OF_RUN = 0.3  # from the beginning, this fraction of the expected cost of the whole run counts as spent
+# a trial begins, whatever the rates are, if the run has cost more than this multiple of MIN_COST_IN_TRIALS trials.
+# After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # rho is a hidden rate if it exceeds this multiple of the rate of the motion
+MIN_RATIO_TO_MOTION = 30.0  # rho is "hidden" if it exceeds this multiple of the rate of the motion
 QUIET_FACTOR = 10.0  # steps at the stability limit excite oscillations with velocities of up to this many tolerances
-# an implicit method may allow longer steps, because a hidden rate is damped, if h rho exceeds this multiple of LIMIT
+# with a hidden rate rho, an implicit method may allow longer steps if h rho exceeds this multiple of LIMIT
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # the explicit method is tried again if h rho is below this multiple of LIMIT
-# the implicit method has to meet a tenth of the tolerances during its trial: its order is lower, and it must not win by
-# errors that are larger than those of the explicit method
+# factor on errors of the implicit method during its trial: its order is lower than that of the explicit method, and it
+# must not win by larger errors
 TRIAL_ERROR_FACTOR = 10.0
-MEAN_WEIGHT = 0.8  # weight of the previous mean in the mean step size, which every step updates
+MEAN_WEIGHT = 0.8  # every step updates the mean step size: weight of the previous mean
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # a trial has succeeded if a second of motion cost at least this times as much before it
+MIN_GAIN = 1.2  # a trial succeeds if a second of motion cost at least this multiple before the trial
 N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
-# indices in `options`. In this order, `options` contains: the N_PAIR options of the pair; for each method its step-size
-# rule (see loop_state.py) and, at REUSE_OF, its value of REUSE; the options of the first method; those of the second.
-# LIMIT: value of h rho above which the implicit method is tried, if N_ESTIMATES estimates exceed LIMIT. MATRIX_COST:
-# cost of a Jacobian in evaluations. COST_RATIO: cost of an evaluation of the second method in evaluations of the first.
-# SIZE_1: number of options of the first method
+# indices in `options`, which contains in this order: the N_PAIR options of the pair; for each method its step-size rule
+# (see loop_state.py) and, at REUSE_OF, its value of REUSE; the options of the first and of the second method. LIMIT:
+# the implicit method is tried if h rho exceeds LIMIT in N_ESTIMATES estimates. MATRIX_COST: cost of a Jacobian in
+# evaluations. COST_RATIO: cost of an evaluation by the second method, in evaluations by the first. SIZE_1: number of
+# options of the first method
 LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
@@ -99,17 +99,17 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 (
     PHASE,  # EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps in this phase
-    MAY_ESTIMATE,  # 1: the last attempt was accepted, so that rho may be estimated
+    MAY_ESTIMATE,  # 1: rho may be estimated, because the last attempted step was accepted
     NEXT_ESTIMATE,  # number of evaluations since the start of the run at which rho is estimated again
     ESTIMATES_TO_WAIT,  # number of estimates before the next trial may begin
     WAIT,  # value of ESTIMATES_TO_WAIT after the last trial
     T_BEGIN,  # time from which the cost per second is measured, s
     COST_BEGIN,  # cost of the run at the time T_BEGIN, in evaluations
-    COST_PER_SECOND,  # cost of a second of motion by the method used before the trial, in evaluations
+    COST_PER_SECOND,  # cost of a second of motion, in evaluations, by the method used before the trial
     RATE,  # last estimate of rho, 1/s
     FIRST_MEMORY,  # number of entries of the memory of the first method
     H_MEAN,  # mean step size, s
-    HISTORY,  # first index of the history (2 numbers) of step-size control in this phase, see loop_state.py
+    HISTORY,  # index at which the history of step-size control in this phase begins: 2 numbers, see loop_state.py
     _HISTORY_ERROR,
     H_TRIED,  # size of the last attempted step, s
     ERROR_TRIED,  # error of the last attempted step, in tolerances
@@ -166,10 +166,10 @@ def _memory_views(memory, n):
 
 @compiled
 def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
-    """Multiply `direction` (n_q) by dF/dq, or dF/dv if `by_v`, and return the factor by which its largest entry grows.
+    """Multiply `direction` (n_q) by dF/dq, or dF/dv if `by_v`; return the factor by which its largest entry grows.
 
-    `direction` is then scaled to a largest component of 1. Only components of independent coordinates are used. The
-    result is 0, and `direction` unchanged, if the product cannot be evaluated. (Q, V, A) is scratch.
+    Then scale `direction` to a largest component of 1. Only components of independent coordinates are used. If the
+    product cannot be evaluated, return 0 and leave `direction` unchanged. (Q, V, A) is scratch.
     """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -203,7 +203,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     growth_by_q = growth_by_v = 0.0
-    # generated code does not use the partition, which may be so old that its independent coordinates hardly move
+    # generated code does not use the partition, which may therefore be old: its independent coordinates may hardly move
     is_explicit = memory[PHASE] == EXPLICIT
     if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -223,7 +223,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the larger relative rate of change (1/s) of velocities and of accelerations; infinity if it is unknown."""
+    """Return the relative rate of change (1/s) of velocities or of accelerations, whichever is larger; inf: unknown."""
     n = Q.size
     dt = DIFFERENCE_STEP / rate
     fastest = largest = change = 0.0
@@ -245,7 +245,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 def _has_small_vibrations(w, tolerances, state, rate):
     """Return whether vibrations with the present accelerations have velocities of at most QUIET_FACTOR tolerances.
 
-    `rate` is the angular frequency (1/s) of the vibrations.
+    `rate`: angular frequency (1/s) of these vibrations.
     """
     n = w.Q.size
     for i in w.independent_v:
@@ -276,7 +276,7 @@ def _evaluations_between_estimates(options, memory):
 
 @compiled
 def _begin_phase(w, options, memory, phase, t):
-    """Update `memory` for a `phase` that begins at t: no history of errors yet, and costs measured from t on."""
+    """Update `memory` for a `phase` that begins at t: clear the history of errors, and measure costs from t on."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0
@@ -302,7 +302,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate rho and decide whether to try the other method; return the phase of the trial, or -1 for no trial."""
+    """Estimate rho and decide whether to try the other method; return the phase that begins with a trial, or -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
@@ -315,7 +315,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
     # unless stability surely limits the steps, a trial begins only if it is cheap compared with the cost of the run so
-    # far, or with a part of that expected for the whole run; more so if the Jacobian needs finite differences
+    # far, or with a part of the expected cost of the whole run. Finite differences for the Jacobian raise this limit
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)
@@ -328,8 +328,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a run of high cost starts a trial whatever the rates are: friction is stiff only while it reverses, and few
-    # estimates fall into this time. `cost > min_cost`: short steps at the start say little about the cost of the run
+    # a costly run starts a trial whatever the rates are: friction is stiff only while it reverses, and few estimates
+    # fall into this time. `cost > min_cost`: short steps at the start say little about the cost of the whole run
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > STABILITY_LIMIT
@@ -337,7 +337,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         or is_costly
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # N_ABOVE_LIMIT is not reset while a trial is too expensive
+    if is_cheap and h_rho <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT is not reset
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than in the previous explicit phase
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
@@ -366,7 +366,7 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method, which is chosen anew if an estimate of rho or the end of a trial is due.
+    """Attempt a step by the active method; first choose this method anew if an estimate of rho, or a verdict, is due.
 
     The memory of a method is cleared when this method becomes active. The active method determines the step-size rule.
     """
@@ -394,7 +394,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: use the implicit method from now on
+        # if a step of fixed size does not converge, it cannot be shortened: use the implicit method from now on
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0

@@ -1,14 +1,14 @@
 """Layout of the memory of collocation steps, which generated code fills and steps/lobatto_step.py reads.
 
-An offset is the index of a number in this memory, which begins at an aligned address. "Lanes" are groups of eight
+An offset is the index of a number in this memory, which begins at an aligned address. A group of "lanes" is eight
 numbers: one number for each unknown node, or one for each of eight steps that are projected together.
 """
 
 LANES = 8  # number of lanes, that is, of numbers that are computed at once
 ORDER = 12.0  # the error estimate is proportional to this power of the step size
 MAX_ROUNDING = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
-# codes for the end of the iteration of the stages. REJECTED: the step is rejected. GUESSED: the step size was a guess,
-# and must be replaced by another guess. NOT_COMPUTED: accelerations at the nodes could not be computed
+# codes: how the iteration of the stages ended. REJECTED: the step is rejected. GUESSED: the step size was a guess, and
+# must be replaced by another guess. NOT_COMPUTED: accelerations at the nodes could not be computed
 CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
 
 (
@@ -17,20 +17,20 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     H_BEFORE,  # size of the step whose polynomial predicts the accelerations in this step, s
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: accelerations are predicted by a polynomial; 0: they are predicted to be constant
-    CURRENT,  # index (0 or 1) of the polynomial of the last accepted step
-    TRIED,  # 1: the polynomial that is not CURRENT belongs to the attempted step
+    CURRENT,  # 0 or 1: which of the two stored polynomials belongs to the last accepted step
+    TRIED,  # 1: the other polynomial belongs to the attempted step
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
-    OLD_DEGREE,  # value of DEGREE before a step was rejected, which a later step restores; 0: no step was rejected
+    OLD_DEGREE,  # value of DEGREE before a rejection, which a later step restores; 0: no step was rejected
     MAY_GUESS,  # 1: the step size is a guess, and is replaced if the contraction is far from its target
     N_MASS_FIRST,  # number of coming steps that use the elimination that begins with M
     N_GUESSES,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
-    LIMITED,  # number of steps whose size was limited by the convergence, minus the number of other steps; at least 0
+    LIMITED,  # number of steps whose size the convergence limited, minus the number of other steps; at least 0
     FAILURES,  # twice the number of steps that did not converge, minus the number of accepted steps; at least 0
     DEFECT,  # largest defect between nodes, relative to the allowed defect; -1: not evaluated
     RHO,  # contraction by a sweep: ratio of successive changes of the velocities
     SWEEPS,  # number of sweeps in the step
-    N_TARGET,  # number of sweeps for which the next step size is chosen
+    N_TARGET,  # number of sweeps that the next step should take: its size is chosen accordingly
     CHANGE,  # change of velocities by the last sweep, relative to the tolerances
     ERROR,  # error of the step, relative to the tolerances
     CURVATURE,  # largest Legendre coefficient of degree 5 or 6 of the accelerations, relative to the tolerances
@@ -39,7 +39,7 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
     ALLOWED_H,  # largest size that the error would have allowed for the last step, s
     SIZE,  # largest sum of a velocity and its change in the step, relative to the tolerances
-    STRICTER,  # ratio of the largest entry of WEIGHTS to the largest entry that belongs to an iterated coordinate
+    STRICTER,  # ratio of the largest of all WEIGHTS to the largest of those WEIGHTS that belong to iterated coordinates
 ) = range(28)
 # offsets of the arrays that follow the scalars
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE

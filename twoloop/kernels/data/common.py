@@ -1,7 +1,8 @@
 """Define what all kernels share: types, compiling decorators, the workspace, the table of callbacks, tolerances.
 
 Each kind of callback has a fixed signature, and writes its results into an argument. So the integrator is compiled
-once, and receives the functions of any mechanism and any method as arguments.
+once, and receives the functions of any mechanism and any method as arguments. In all kernels, `f` is the `Kit` of
+functions and data, `w` the workspace `Work`, `t` the time in s, and `h` a step size in s.
 """
 
 import hashlib
@@ -53,17 +54,17 @@ class Work(NamedTuple):
     MT: Any  # (n_q, n_dof) M T
     D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T; last row: dependent velocities for v_i = 0; columns in elimination order
     Gx: Any  # (n_c + n_a, n_q) C_q and A at a displaced position (for Gamma by differences); scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) value of G from which S and W were computed, for constant M; NaN: not computed yet
+    G_of_S: Any  # (n_c + n_a, n_q) the G that was used to compute S and W, for constant M; NaN: none yet
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of G that have been nonzero, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; empty without the augmented form
     places: Any  # (n_c + n_a + 1) index of the first entry of each row of G, then the columns of all entries
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the present time step, and with the previous one
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the present time step, and with the previous step
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b at later times, see discontinuities.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
-    C: Any  # (n_c) C(t, q); scratch for corrections
+    C: Any  # (n_c) C(t, q); also scratch for corrections
     Rate: Any  # (n_c + n_a) C_t and b
     Gamma: Any  # (n_c + n_a) right-hand side of G a = Gamma
     g: Any  # (n_c + n_a) scratch
@@ -83,8 +84,8 @@ class Work(NamedTuple):
     index_a: Any  # program that factors the augmented matrix; its SIZE is 0 until the program is written
     values_a: Any  # the factors of the augmented matrix; empty in other forms
     right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix, and scratch
-    order: Any  # (n_q) scratch: order of the columns in the full pivoting
-    row_order: Any  # (n_c + n_a) scratch: order of the rows in the full pivoting
+    order: Any  # (n_q) scratch: order of the columns in full pivoting
+    row_order: Any  # (n_c + n_a) scratch: order of the rows in full pivoting
     counters: Any  # (N_COUNTERS) numbers of steps, iterations and evaluations in the run, see indices.py
     lapack: Any  # addresses of band.ROUTINES; 0 where linear algebra is dense
     predicted: Any  # (r) dependent positions predicted by the integration formula, before they are projected
@@ -129,11 +130,11 @@ class Attempt(NamedTuple):
     """Result of an attempted step: its code, its error and the factor for the next step size.
 
     code : DONE, or the reason why the step failed.
-    error : error in units of the tolerances: the step is accepted if this is at most 1. If a step is longer than the
+    error : error in units of the tolerances: the step is accepted if it is at most 1. If a step is longer than the
         method allows, the step is not computed, and `error` is the ratio of its size to the allowed size.
-    factor : ratio of the next step size to this one; 0: the controller computes the ratio from the error. If both
-        factor and error exceed 1, the step size was a guess: the step was not completed, and has to be repeated with a
-        larger size.
+    factor : ratio of the next step size to the size of this step; 0: the controller computes the ratio from the error.
+        If both factor and error exceed 1, the step size was a guess: the step was not completed, and has to be repeated
+        with a larger size.
     """
 
     code: int
@@ -179,8 +180,8 @@ for _name in ("commit", "commit_first", "commit_second"):
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
-# functions generated for a mechanism, see generate/elimination.py and collocation_code.py. A boolean result is False if
-# the conditions of the generated code are not satisfied: results are then not written
+# functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Those with a boolean result
+# return False, and write no results, if a condition of the generated code is not satisfied
 OWN_FUNCTIONS = {
     # functions of a state, with arguments (t, q, v, numbers) and then arrays for the results. own_accelerate
     # stores a; own_correct_positions stores the correction and the corrected q; own_project stores a, the correction of
@@ -290,8 +291,8 @@ def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatch
 
 
 # forceinline is always set explicitly, because a callee inherits the flags of its caller: otherwise, all helpers that a
-# merged helper calls would be merged, too
-# keeps the order of floating-point operations of the source
+# merged helper calls would be merged, too.
+# exact: the order of floating-point operations stays as in the source
 exact = _helper_decorator(fastmath=False, forceinline=False)
 compiled = _helper_decorator(forceinline=False)  # compiled as one function, which LLVM inlines only if it is short
 inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
@@ -299,17 +300,17 @@ inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper 
 merged = _helper_decorator(forceinline=True)
 
 
-NO_NUMBERS = np.zeros(0)  # data of generated functions that read none
+NO_NUMBERS = np.zeros(0)  # data for generated functions that read no data
 
 
 class Kit:
     """Functions and data of a system and a method, passed to kernels as one reference.
 
     `functions` are the callbacks, `inner` is the inner loop, and `step` has the functions of the method, or None if no
-    kernel calls them. Kernels call inner loop and step by their addresses, without compiling them again. A pair of
-    methods calls its two methods as `first` and `second`. `own` are sets of functions generated for the mechanism: an
-    inner loop that calls these functions leaves other tasks to the inner loop `general`. `numbers` are the data of the
-    generated functions, and `own_numbers` the data of the collocation functions.
+    kernel calls them. Kernels call inner loop and step by their addresses, without compiling them again. `first` and
+    `second` are the methods of a pair of methods. `own` contains the functions generated for the mechanism; an inner
+    loop that calls them leaves tasks without such a function to `general`, the inner loop of any mechanism. `numbers`
+    are the data of the generated functions, and `own_numbers` the data of the collocation functions.
     """
 
     def __init__(
@@ -375,7 +376,7 @@ def finite(A):
 
 @compiled
 def not_finite(w, kind, t, q):
-    """Store t, and the kind of the callback whose value is not finite (-1 if q is not), in w; return a code."""
+    """Store t, and the kind of the callback whose value is not finite (-1: q is not finite), in w; return a code."""
     w.fault_kind = kind if finite_vector(q) else -1.0
     w.fault_time = t
     return NOT_FINITE
@@ -383,7 +384,7 @@ def not_finite(w, kind, t, q):
 
 @compiled
 def faulty_callback(w):
-    """Return the index in Functions of the callback due to which accelerations are not finite; -1: unknown."""
+    """Return the index in Functions of the callback that makes accelerations not finite; -1: unknown."""
     n_c = w.C.size
     if not finite_vector(w.Rate[:n_c]):
         return RATE
@@ -398,12 +399,12 @@ def faulty_callback(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-GAP_SLACK = 1e-9  # largest excess of a step size over GAP, relative to GAP, that counts as a rounding error
+GAP_SLACK = 1e-9  # a step size may exceed GAP by this fraction of GAP, which counts as a rounding error
 
 
 @merged
 def allowed_error(tolerances, m, x, x1):
-    """Return the allowed error of coordinate m, or of its velocity, in a step in which its value goes from x to x1."""
+    """Return the allowed error of coordinate m, or of its velocity, in a step that changes its value from x to x1."""
     return tolerances[ATOL + m] + tolerances[RTOL] * max(abs(x), abs(x1))
 
 

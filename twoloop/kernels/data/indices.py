@@ -53,8 +53,8 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
 
 # indices in Work.notes: values that one kernel stores for another
 (
-    SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
-    ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known yet
+    SENSITIVITY,  # max|C_qd^-1 C_qi| after the first step with this partition; 0: not known yet
+    ORIENTATION,  # sign of det C_qd at the last accepted state with this partition; 0: not known yet
     ORIENTATION_NEW,  # sign of det C_qd at the end of the attempted step; 0: not known yet
     FAULT_KIND,  # index in Functions of the callback that returned a value that is not finite; -1: none known
     FAULT_TIME,  # time at which a callback returned a value that is not finite, s
@@ -62,15 +62,15 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to largest_difference_step
     GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_STEP_RATIO was chosen
     GAMMA_SCALE,  # largest entry of Gamma so far
-    REUSE,  # largest last correction of positions after which the factors of C_qd are not renewed
-    ROUNDED,  # rounding error of positions: value of REUSE for states that may be accepted
+    REUSE,  # the factors of C_qd are not renewed if the last correction of positions is at most this
+    ROUNDED,  # rounding error of positions, which replaces REUSE for states that may be accepted
     GENERATION,  # number of partitions that have been chosen in the run
     RANK,  # rank of C_q, stored if it differs from the rank for which the workspace is allocated
     RANK_V,  # rank of C_q and A together, stored if it differs from the rank for which the workspace is allocated
-    CONTRADICTION,  # index of a violated row that counted as redundant
-    PIVOT,  # smallest pivot of the last full pivoting, with rows scaled to 1: small near a singular position
+    CONTRADICTION,  # index of a row that is violated although it counted as redundant
+    PIVOT,  # smallest pivot of the last full pivoting, for rows scaled to 1; small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check for singular positions
-    NEAR_NOW,  # 1: the last check found a singular position nearby; 2: the next check must renew the partition first
+    NEAR_NOW,  # 1: the last check found a singular position nearby; 2: the next check must first renew the partition
     MASS_SCALE,  # factor on M in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
     HAS_GAMMA,  # 1: the fused callback has computed w.Rate and w.Gamma[:n_c] for the current state
@@ -82,15 +82,15 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     WIDEST_GAP,  # longest time between two evaluations within accepted steps, s
     LAST_JUMP,  # time of the last known jump of C_t or b, s
     NEXT_JUMP,  # time of the next known jump of C_t or b, s
-    MAX_COEFFICIENT,  # largest coefficient of an independent row in a redundant row, when the partition was chosen
-    SMALLEST,  # fixed-order form: smallest squared sine of the angle of a row to previous rows, see sparse_ldl.py
+    MAX_COEFFICIENT,  # redundant rows are combinations of independent rows: largest coefficient, at the last partition
+    SMALLEST,  # fixed-order form: smallest squared sine of the angle from a row to previous rows, see sparse_ldl.py
     TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
     N_NOTES,
 ) = range(33)
 
 
 def _group(first: str, end: str) -> dict[str, int]:
-    """Return the indices above from the name `first` to the one before `end`, by names in lower case."""
+    """Return the indices above, by names in lower case, from the name `first` to the name before `end`."""
     names = list(globals())
     return {name.lower(): globals()[name] for name in names[names.index(first) : names.index(end)]}
 
@@ -112,16 +112,16 @@ MAX_GAP_RATIO = 0.01  # value of GAP, relative to the duration of the run
 REPORTED_ERROR = 30.0  # velocity errors of more tolerances than this are reported near a singular position
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
-# kinds of intervals between accepted states, for dense output; they tell which data the polynomials interpolate
+# kinds of intervals between accepted states, for dense output: which data do the polynomials interpolate?
 (
-    SEPARATE,  # q and v in one polynomial, v and a in another: errors of q and v are independent, and steps are small
+    SEPARATE,  # q and v in one polynomial, v and a in another: errors of q and v are independent, steps are small
     VELOCITIES,  # q and v in one polynomial and its derivative: a contains the noise of stiff modes
     ACCELERATIONS,  # q, v and a in one polynomial and its derivatives
-    ACROSS,  # as ACCELERATIONS, for a step across a singular position
+    ACROSS,  # same as ACCELERATIONS, for a step across a singular position
     JUMP,  # no polynomial: velocities jump within a few spacings of floating-point numbers
 ) = range(5)
 # columns of the table of intervals, which has one row for each interval that contains output times. FIRST_OWN and
 # LAST_OWN: indices of the states at the ends of the interval. KIND: kind of the interval. FIRST_TIME and END_TIME - 1:
 # indices of the first and last output time in the interval. LOW and HIGH: indices of the first and last state that the
-# polynomial may interpolate; beyond these states velocities jump
+# polynomial may interpolate, because velocities jump beyond these states
 FIRST_OWN, LAST_OWN, KIND, FIRST_TIME, END_TIME, LOW, HIGH, N_COLUMNS = range(8)
