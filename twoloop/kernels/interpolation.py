@@ -1,7 +1,7 @@
 """Interpolate states within steps by polynomials through neighbouring states, and project the results.
 
-Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. For methods that take long
-steps, `fill_intervals` first computes states within each interval, through which one polynomial passes.
+Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. For methods with long steps,
+`fill_intervals` first computes states in an interval, as nodes of its polynomial. `f`: the kit, `w`: the workspace.
 """
 
 import numpy as np
@@ -19,13 +19,13 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# v has a polynomial of its own if rounding of q over an interval exceeds this number of tolerances of v
+# v has a polynomial of its own if the rounding error of q, divided by the interval, exceeds this number of tolerances
 MAX_VELOCITY_ROUNDING = 10.0
-# a position is singular if its pivot is below this fraction of the larger pivot at the ends of its interval
+# a position counts as singular if its pivot is below this fraction of the larger pivot at the two ends of the interval
 SINGULAR_PIVOT_RATIO = 0.01
-SINGULAR_PIVOT = 1e-5  # any position is singular if its pivot is below this; see min_pivot_ratio in partition.py
-# a position with a pivot below WEAK_PIVOT is singular, too, if velocities of the polynomials violate the constraints by
-# at most MAX_VIOLATION tolerances; the violation is about the pivot times the change by the projection
+SINGULAR_PIVOT = 1e-5  # positions with a smaller pivot always count as singular; see min_pivot_ratio in partition.py
+# a position with a pivot below WEAK_PIVOT also counts as singular if velocities of the polynomials violate constraints
+# by at most MAX_VIOLATION tolerances; this violation is about the pivot times the change by the projection
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -33,9 +33,9 @@ MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 def _node_range(low, high, i, last):
     """Return the indices of the first and last state that the polynomial interpolates in an interval from i to `last`.
 
-    The states are centred at the interval, and between `low` and `high`.
+    These states are centred at the interval, and not outside `low` to `high`.
     """
-    if last > i + 1:  # the interval has interior states from `fill_intervals`, the only ones that are interpolated
+    if last > i + 1:  # the interval has interior states from `fill_intervals`: interpolate only these
         return i, last
     n_states = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - n_states // 2, high + 1 - n_states))
@@ -46,9 +46,9 @@ def _node_range(low, high, i, last):
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
     """Store nodes in z and coefficients in c of the Hermite polynomial through rows lo to hi; return their number.
 
-    The polynomial, in Newton's form, interpolates n columns of `states`, from index `column` on, minus their values in
-    row i. Its variable is (time - t[i]) / h. The next n columns are first derivatives, and the n columns after them
-    second derivatives: `order` of these three groups of columns are interpolated.
+    The polynomial, in Newton's form, has the variable (time - t[i]) / h. It interpolates n columns of `states`, from
+    index `column` on, minus their values in row i. The next two groups of n columns are the first and the second
+    derivatives; the polynomial interpolates `order` of these three groups.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order
@@ -74,8 +74,8 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
     """Store in q and v the values at t[i] + s h of the polynomials of an interval of duration h, by Horner's scheme.
 
-    (z, c, size) are the nodes, coefficients and number of coefficients for q; (z_v, c_v, size_v) are those for v if
-    `kind` is SEPARATE. Otherwise v is the derivative of q.
+    (z, c, size): nodes, coefficients and number of coefficients for q; (z_v, c_v, size_v): the same for v if `kind` is
+    SEPARATE. Otherwise v is the derivative of q.
     """
     n = q.size
     for m in range(n):
@@ -94,7 +94,7 @@ def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q
 
 @merged
 def _kind_by_duration(kind, tolerances, h, states, i):
-    """Return `kind`, or SEPARATE if the interval (duration h) is so short that rounding of q would spoil velocities."""
+    """Return `kind`, or SEPARATE if the duration h is so short that rounding errors of q would spoil velocities."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
@@ -105,10 +105,10 @@ def _kind_by_duration(kind, tolerances, h, states, i):
 
 @inlined
 def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
-    """Store the polynomials of an interval, a row of the table of intervals, in (z_q, c_q) and (z_v, c_v).
+    """Store the polynomials of an interval, given by a row of the table of intervals, in (z_q, c_q) and (z_v, c_v).
 
-    Returns kind and duration of the interval, first and last node, number of derivatives at a node, and the numbers of
-    coefficients of both polynomials.
+    Return kind and duration of the interval, first and last node, number of derivatives at a node, and the number of
+    coefficients of each polynomial.
     """
     i, last, kind = group[kinds.FIRST_OWN], group[kinds.LAST_OWN], group[kinds.KIND]
     h = t[last] - t[i]
@@ -126,16 +126,16 @@ def _velocity_change(tolerances, v_before, v):
     speed, largest = largest_of(v_before), 0.0
     for m in range(v.size):
         change = abs(v[m] - v_before[m]) / (tolerances[ATOL + m] + tolerances[RTOL] * speed)
-        if not change <= largest:  # NaN, too
+        if not change <= largest:  # also true for NaN
             largest = change
     return largest
 
 
 @compiled
 def _is_singular(f, w, t, states, i, last, time, q, change):
-    """Return whether q at `time` is so near a singular position that rounding errors explain a change of velocities.
+    """Return whether q at `time` is so near a singular position that rounding explains how the projection changed v.
 
-    `change`: change of velocities by the projection, in tolerances. i and `last`: indices of the states at the ends of
+    `change`: change of velocities by the projection, in tolerances. i, `last`: indices of the states at the ends of
     the interval. The pivot at q is compared with SINGULAR_PIVOT_RATIO and WEAK_PIVOT.
     """
     n, largest = w.Q.size, 0.0
@@ -151,7 +151,7 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
 def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z, coefficients, out):
     """Store [q, v] at times[p] in row p of `out`; return the number of failed projections.
 
-    A projection fails if dependent coordinates cannot be determined, or if rounding errors determine the projected
+    A projection fails if dependent coordinates cannot be determined, or if rounding errors dominate the projected
     velocities near a singular position. Row p then gets the values of the polynomials. `groups`: the table of intervals
     described in data/indices.py. `tolerance`: tolerance of the projection. `z`, `coefficients`: scratch.
     """
@@ -165,7 +165,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
         i, last = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN]
         fit = _fit_polynomials(tolerances, t, states, groups[g], z_q, c_q, z_v, c_v)
         kind, h, _, _, _, size, size_v = fit
-        # choose independent coordinates anew in each interval, so that results do not depend on other output times
+        # choose independent coordinates anew in each interval, so that a result does not depend on other output times
         has_partition = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]
@@ -205,7 +205,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest entry of scale_q |q - q_other| and scale_v |v - v_other|, in tolerances at state i."""
+    """Return the largest entry of scale_q |q - q_other| and scale_v |v - v_other|, over its tolerance at state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -247,12 +247,11 @@ def _has_similar_gaps(t, lo, hi):
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
     """Store in out[g] the estimated error of the polynomials of interval g of `groups`, relative to the tolerances.
 
-    The first of these estimates that applies is returned:
+    Of these estimates, the first one that applies is taken:
     - 0 for polynomials that do not interpolate accelerations (kinds SEPARATE and VELOCITIES), with more than two nodes
-    at
-      about equal distances, none of them inside the interval;
-    - the change by the last of more than two nodes, if it is at most 1 or the kind is VELOCITIES, because accelerations
-      then contain the noise of stiff modes;
+      at about equal distances, none of them inside the interval;
+    - how much the last of more than two nodes changes the polynomial, if this is at most 1, or if the kind is
+      VELOCITIES: then accelerations contain the noise of stiff modes;
     - the residual of the polynomials in the constraints and the equations of motion at CHECKED_FRACTIONS. A residual of
       accelerations, times h over the number of coefficients, counts as a residual of velocities.
     """
@@ -320,7 +319,7 @@ def fill_accelerations(f, w, times, states, out):
                 code = find_tangents(f, w, times[p], q)
         if code == DONE:
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
-        if code == GAMMA_INACCURATE:  # accept this, because no step depends on these accelerations
+        if code == GAMMA_INACCURATE:  # accepted here, because no step depends on these accelerations
             required = w.gamma_required
             w.gamma_required = np.inf
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
@@ -335,9 +334,9 @@ def fill_accelerations(f, w, times, states, out):
 def fill_intervals(f, w, options, memory, memory_0, tolerances, state, new_state, t, states, intervals, out_t, out):
     """Store states within intervals, computed by equal steps of the method; return the number of failed intervals.
 
-    `intervals` are the indices of the intervals. For each interval, `out_t` (times) and `out` (states) get equally many
-    rows: the first state, the interior states, and the last state. If an interval fails, its first time becomes NaN.
-    `memory_0` is the method's memory at the start of a run.
+    `intervals`: indices of the intervals. For each interval, `out_t` (times) and `out` (states) get the same number of
+    rows: the first state, the interior states, and the last state. If a step fails, the first time of its interval
+    becomes NaN. `memory_0`: the method's memory at the start of a run.
     """
     n = w.Q.size
     n_rows = out_t.size // intervals.size

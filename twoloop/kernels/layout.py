@@ -14,9 +14,9 @@ from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-# MAX_UNUSED: largest number of unused workspaces kept for later runs; MAX_UNUSED_SIZE: largest number of floats in each
+# largest number of unused workspaces that are kept for later runs, and of floats in such a workspace
 MAX_UNUSED, MAX_UNUSED_SIZE = 32, 100_000
-WORD, LINE = 8, 8  # WORD: bytes in a number; LINE: numbers in a cache line, at the start of which each array begins
+WORD, LINE = 8, 8  # bytes in a number; numbers in a cache line: each array begins at the start of a cache line
 
 
 class FixedOrderSizes(NamedTuple):
@@ -25,22 +25,22 @@ class FixedOrderSizes(NamedTuple):
     n_factors: int
     n_mass_values: int
     n_jacobian_values: int
-    dense_mass: bool  # whether a callback fills a full matrix with a varying M, from which the entries are copied
-    dense_jacobian: bool  # whether a callback fills a full matrix with C_q, from which the entries are copied
+    dense_mass: bool  # whether the entries of a varying M are copied from a full matrix, which a callback fills
+    dense_jacobian: bool  # whether the entries of C_q are copied from a full matrix, which a callback fills
 
 
-# arguments of _create_layout: n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T and the augmented matrix are
-# used, number of nodes of the traced programs, sizes of the fixed-order form (None: another form), length of `matrices`
+# arguments of _create_layout: n_q; n_c; n_a; ranks of C_q and of [C_q; A]; whether T^T M T is used, and whether the
+# augmented matrix; number of nodes of traced programs; sizes of the fixed-order form, or None; length of `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, FixedOrderSizes | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
 
 class Layout(NamedTuple):
-    """Offsets of the arrays of a workspace, whose floats are in one block of memory, and whose integers in another.
+    """Offsets of the arrays of a workspace, which consists of a block of floats and a block of integers.
 
     The table of addresses and shapes in a workspace is `table` + `of_numbers` * (address of the floats) + `of_integers`
     * (address of the integers). The first `n_lasting` floats and `n_lasting_integers` integers keep data from one step
-    to the next; a step fills all others before it reads them.
+    to the next; a step fills all other numbers before it reads them.
     """
 
     numbers: ArrayRanges
@@ -55,7 +55,7 @@ class Layout(NamedTuple):
 
 
 def empty_workspace(sizes: Sizes) -> Work:
-    """Return a workspace of `sizes` in its initial state: a workspace that is not in use, or a new one."""
+    """Return a workspace of `sizes` in its initial state: one that a previous run left, or a new one."""
     unused = _take_unused_workspace(sizes)
     return _allocate_workspace(sizes) if unused is None else reset_workspace(unused)
 
@@ -95,7 +95,7 @@ def _allocate_workspace(sizes: Sizes) -> Work:
 
 
 def keep_unused_workspace(work: Work) -> None:
-    """Keep an unused workspace for later runs of equal sizes, unless it is large; drop the oldest beyond MAX_UNUSED."""
+    """Keep an unused workspace, unless it is large, for later runs of equal sizes; keep at most MAX_UNUSED."""
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
@@ -129,8 +129,8 @@ def cached_run() -> Any:
 def _fixed_order_shapes(n_q: int, n_c: int, rank: int, form: FixedOrderSizes) -> tuple[dict[str, tuple[int, ...]], ...]:
     """Return the shapes, by name, of the arrays of floats and of integers that differ in the fixed-order form.
 
-    The fixed-order form has no partition: all coordinates count as independent, and also as dependent, because all
-    predicted positions are compared with the positions on the constraints.
+    The fixed-order form has no partition: all coordinates count as independent, and also as dependent, because steps
+    compare all predicted positions with the positions on the constraints.
     """
     n, n_redundant = n_q + n_c, n_c - rank
     n_rows = n_c if form.dense_jacobian else 0
@@ -212,7 +212,7 @@ def _create_layout(
         "nodes": (n_nodes,),
         **dict.fromkeys(("mass_values", "jacobian_values", "is_independent", "factors", "pivot_sizes"), (0,)),
         **dict.fromkeys(("unknowns", "solutions"), (0,)),
-        "matrices": (n_matrices,),  # must be the last array, as it keeps no data from one step to the next
+        "matrices": (n_matrices,),  # must be the last array, because it keeps no data from one step to the next
     }
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_rows + 1 + n_rows * n_q,),
@@ -223,7 +223,7 @@ def _create_layout(
         "row_order": (n_rows,),
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
-        "index": (index_size(r),),  # must be the last array, as its end keeps no data from one step to the next
+        "index": (index_size(r),),  # must be the last array: its end keeps no data from one step to the next
     }
     rows_of_G, mass_side = n_rows + 1, n_q
     if fixed_order is not None:
@@ -232,7 +232,7 @@ def _create_layout(
         integers |= fixed_order_shapes[1]
         rows_of_G, mass_side = (n_rows + 1) * fixed_order.dense_jacobian, n_q * fixed_order.dense_mass
         n_entries = rows_of_G * n_q
-    # names of arrays for positions that also serve for velocities if there are no non-holonomic constraints
+    # without non-holonomic constraints, these arrays for positions also serve for velocities
     of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
     for name in of_positions:
         del integers[f"{name}_v"]
@@ -242,7 +242,7 @@ def _create_layout(
     of_integers, n_integers = _array_ranges(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + mass_side * mass_side, (mass_side, mass_side)
-    # number of integers at the end of `index` that are used only to choose the order of elimination
+    # number of integers at the end of `index` that only the choice of an order of elimination uses
     n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if fixed_order is None else 0
     n_lasting = of_numbers["matrices"][0], of_integers["index"][1] - n_ordering
     if n_a == 0:

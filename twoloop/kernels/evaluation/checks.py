@@ -2,10 +2,10 @@
 
 If the evaluation finds nothing wrong, no other check needs to run. Units of rows and of coordinates are chosen so that
 the entries of C_q in these units have similar sizes. The linear range of a row of C_q is the distance over which the
-coordinates can move before the row changes much (checks/scales.py).
+coordinates can move before the row changes much (checks/scales.py). `f` is the kit, with the callbacks.
 
-Callbacks are also compared with their traces, see generate/traced_values.py. For each traced number, a bound on its
-rounding error is computed, in units of EPS: at least the sum of the absolute values of its terms.
+Callbacks are also compared with their traces, see generate/traced_values.py. For each traced number, a bound of its
+rounding error is computed, in units of EPS; it is at least the sum of the absolute values of the number's terms.
 """
 
 import math
@@ -17,9 +17,9 @@ from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.operations import result_of_operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
-NO_ENTRY = 1e-12  # largest entry of C_q, relative to the largest entry of its row, that counts as a rounding error
+NO_ENTRY = 1e-12  # entries of C_q up to this size, relative to the largest entry of the row, count as rounding errors
 MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares in column_units
-NEGLIGIBLE = 1e-6  # largest coordinate, relative to the largest one of its row, that linear_ranges leaves out
+NEGLIGIBLE = 1e-6  # linear_ranges leaves out coordinates up to this size, relative to the largest one of their row
 
 
 @exact
@@ -34,9 +34,9 @@ def _sort(values):
 
 @exact
 def _fit_column_units(rows, columns, mask, logs):
-    """Store in `columns` the logarithms of units of coordinates that best fit the units of the rows, given in `rows`.
+    """Store in `columns` the logarithms of the units of coordinates that best fit the units of the rows, `rows`.
 
-    `logs`: logarithms of |entries|; `mask`: 1 for each entry. Returns whether no unit changed.
+    `rows`, `logs`: logarithms of units, and of |entries|; `mask`: 1 for each entry. Return whether no unit changed.
     """
     is_unchanged = True
     for j in range(columns.size):
@@ -53,7 +53,7 @@ def _fit_column_units(rows, columns, mask, logs):
 
 @exact
 def _fit_row_units(columns, rows, mask, logs):
-    """Store in `rows` the logarithms of units of rows that best fit the units of coordinates, given in `columns`."""
+    """Store in `rows` the logarithms of the units of rows that best fit the units of coordinates, `columns`."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
@@ -67,9 +67,9 @@ def _fit_row_units(columns, rows, mask, logs):
 def column_units(matrix, typical, columns, mask, logs, rows, scratch):
     """Store in `columns` (n_q) the units of the coordinates in which the entries of C_q (`matrix`) have similar sizes.
 
-    The units minimize the sum over all entries of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2. Their
-    common factor is chosen so that the median ratio of the units to the units `typical` (n_q) is 1. Coordinates without
-    entries get their typical units. The last four arguments are scratch.
+    The units minimize the sum over all entries of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2. The
+    units have a common factor, so that their median ratio to `typical` (n_q) is 1. A coordinate without entries gets
+    its unit from `typical`. The last four arguments are scratch.
     """
     n_used, log_factor = 0, 0.0
     for i in range(rows.size):
@@ -104,9 +104,9 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
     """Store in `ranges` the distance over which each row of C_q changes little, in units of the coordinates.
 
     Row i of `coordinates_in_units` has the coordinates with an entry in row i, else 0. `radius`: norms of the rows,
-    divided by their change per unit displacement. The distance is the row's radius if this is at most 1, or at most the
-    largest coordinate in the row. Otherwise it is the lower median of the row's coordinates that are not NEGLIGIBLE, or
-    1 if none exceeds `negligible`.
+    divided by their change per unit displacement. The distance is the row's radius if this radius is at most 1, or at
+    most the largest coordinate in the row. Otherwise the distance is the lower median of the row's coordinates that are
+    not NEGLIGIBLE, or 1 if none exceeds `negligible`.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -125,12 +125,12 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 
 
 # flags that evaluate_start returns. WELL_FORMED: all values are finite, M is symmetric, no row is empty. CONSISTENT:
-# the state satisfies the constraints up to rounding. DEFINITE: M varies, and all its eigenvalues are above their limit
-# by EIGENVALUE_MARGIN. INDEFINITE: M varies, and an eigenvalue is below its limit by EIGENVALUE_MARGIN
+# the state satisfies the constraints up to rounding. DEFINITE: M varies, and all its eigenvalues exceed their limit by
+# the factor EIGENVALUE_MARGIN. INDEFINITE: M varies, and an eigenvalue is below its limit by this factor
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes apply up to this distance from their position, relative to these sizes
-ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
-EIGENVALUE_MARGIN = 2.0  # factor by which eigenvalues must differ from their limit, so that rounding does not decide
+MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position apply up to this distance from it, relative to these sizes
+ROUNDING_OF_ZERO = 2.0**-52  # coordinates up to this size, relative to the largest, may be rounding errors of zero
+EIGENVALUE_MARGIN = 2.0  # eigenvalues must differ from their limit by this factor, so that rounding does not decide
 
 
 def results_size(n: int, n_c: int, n_a: int) -> int:
@@ -173,7 +173,7 @@ def _is_symmetric(mass, tolerance):
 def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
     """Return whether the constraint `value` is a rounding error: at most `tolerance` times the sum of its |terms|.
 
-    The terms are `rate` and row[j] * state[j] for all j; |state[j]| counts as at least sizes[j] and `min_size`.
+    The terms are `rate` and row[j] * state[j] for all j; a smaller |state[j]| than sizes[j] or `min_size` is raised.
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):
@@ -204,7 +204,7 @@ def _has_same_entries(rows, entries):
 
 @exact
 def _index_of_near_position(q, rows, n_c, records):
-    """Return the index in `records`, see `evaluate_start`, where the record of a position near q begins; -1 if none."""
+    """Return the index in `records` (see `evaluate_start`) where the record of a position near q begins; -1: none."""
     n = q.size
     stride = 2 * n + n_c * n
     for k in range(0, records.size, stride):
@@ -220,8 +220,8 @@ def _is_consistent(C, rate, rows, q, v, records, tolerance):
     """Return whether (q, v) satisfies the constraints up to rounding; `rows`: C_q with A, `rate`: C_t with b.
 
     The size of a coordinate counts as at least its size in `records` (see `evaluate_start`), and at least the rounding
-    error of the largest coordinate. Otherwise a constraint whose coordinates are all rounding errors of zero, as out of
-    the plane of a planar motion, would not be small relative to its terms.
+    error of the largest coordinate. Otherwise a constraint whose coordinates are all rounding errors of zero, as they
+    are normal to the plane of a planar motion, would not be small relative to its terms.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _index_of_near_position(q, rows, C.size, records)
@@ -261,7 +261,7 @@ def _record_entries_at_displacements(f, t, q, shifts, position, rows, n_c, patte
 
 @exact
 def _is_definite(mass, min_eigenvalue, factors):
-    """Return whether all eigenvalues of M exceed `min_eigenvalue` times max|M|; `factors` is scratch."""
+    """Return whether all eigenvalues of M are larger than `min_eigenvalue` times max|M|; `factors` is scratch."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
@@ -276,18 +276,18 @@ def _is_definite(mass, min_eigenvalue, factors):
 def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, pattern, roundings):
     """Evaluate all callbacks at (t, q, v), and store their results; return the sum of the flags that apply.
 
-    Flags are WELL_FORMED to INDEFINITE. Arguments:
+    The flags are WELL_FORMED, CONSISTENT, DEFINITE and INDEFINITE. Arguments:
 
-    - roundings: allowed relative rounding errors of constraints, of the symmetry of M, and of its eigenvalues
+    - roundings: allowed relative rounding errors of constraints, of the symmetry of M, and of the eigenvalues of M
     - records: for each of several positions, the size of each coordinate, the position, and where C_q is nonzero (see
-      `keep` of checks/scales.py). Rounding errors of constraints near such a position are judged with |q_j| at least
-      equal to the recorded size of coordinate j
+      `keep` of checks/scales.py). Near such a position, a coordinate counts as at least its recorded size when rounding
+      errors of constraints are judged
     - shifts: displacements of q, relative to max|q|, at which nonzero entries of C_q and A are also recorded
     - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
     - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results, and scratch
     """
     n, n_c, n_rows = q.size, lam.size, rows.shape[0]
-    # ends of the force, of C, of the rates (C_t, b) and of Gamma in `results`
+    # indices in `results` at which the force, C, the rates (C_t, b) and Gamma end
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows
     f.mass(t, q, f.p, mass)
     f.force(t, q, v, f.p, results[:force])
@@ -329,7 +329,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
         result_flags = WELL_FORMED
         if _is_consistent(results[force:C], results[C:rate], rows, q, v, records, roundings[0]):
             result_flags |= CONSISTENT
-    if f.constant_mass == 0:  # neither DEFINITE nor INDEFINITE if the smallest eigenvalue is within the margin
+    if f.constant_mass == 0:  # if the smallest eigenvalue is within the margin, neither flag is set
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             result_flags |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
@@ -344,7 +344,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at_positions(f, t, positions, n_c, rows):
-    """Store in `rows`, zero on entry, C_q (n_c rows) and A at each of the `positions`, one position after another."""
+    """Store C_q (n_c rows) and A in `rows`, zero on entry, for each of the `positions`, one after another."""
     n_rows = len(rows) // len(positions)
     for k in range(len(positions)):
         begin = k * n_rows
@@ -451,7 +451,7 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
 
 @exact
 def _count_differences(called, traced, bounds):
-    """Return how many entries of `called` are not finite or differ from `traced`, by the limit of `compare_traces`."""
+    """Return how many entries of `called` are not finite, or differ from `traced` (limit: see `compare_traces`)."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0
@@ -474,8 +474,8 @@ def compare_traces(
 
     Two numbers differ if their difference exceeds MAX_DIFFERENCE times the largest value at these states, plus
     ROUNDING_FACTOR times the error bound of the traced number. `sizes`: n_q, n_c and n_a. `is_compared`: 1 for each of
-    KINDS in traced_values.py that has to be compared. Stores the values of the callbacks in `called` (zero on entry),
-    the values of the traces in `traced`, and their error bounds in `bounds`; `nodes` is scratch.
+    KINDS in traced_values.py that has to be compared. Store the values of callbacks in `called` (zero on entry), the
+    values of traces in `traced`, and the error bounds of the latter in `bounds`; `nodes` is scratch.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

@@ -2,8 +2,9 @@
 
 The first rows of G are C_q, from C(t, q) = 0; the other rows are A, from A(t, q) v + b(t, q) = 0.
 
-Gamma, the right-hand side of G a = Gamma, is a derivative along the motion: two central differences, with the steps e
-and 2 e (s), give it to order 4. Their disagreement estimates the error, and the step e is chosen by this estimate.
+Gamma, the right-hand side of G a = Gamma, is a derivative along the motion. Two central differences, with the steps e
+and 2 e (s), yield Gamma to order 4. Their disagreement estimates the error, by which the step e is chosen. `f` is the
+kit, and `w` the workspace.
 """
 
 import numpy as np
@@ -33,7 +34,7 @@ def _clear_recorded_entries(w):
 
 @merged
 def clear_rows(f, w):
-    """Set w.G to zero; in the augmented form only its recorded entries (the task VERIFY_PATTERN detects new ones)."""
+    """Set w.G to zero; in the augmented form, only its recorded entries: the task VERIFY_PATTERN detects new ones."""
     if f.form == AUGMENTED:
         _clear_recorded_entries(w)
     else:
@@ -42,7 +43,7 @@ def clear_rows(f, w):
 
 @merged
 def row_residual(w, v, rows):
-    """Store in w.z the residuals G v + (C_t, b) of the rows with the indices `rows`, from w.G and w.Rate."""
+    """Store the residuals G v + (C_t, b) of the rows with the indices `rows` in w.z, with G and rates in w."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -64,7 +65,7 @@ def constraint_rates(f, w, t, q, rate):
 
 @merged
 def kinematics(f, w, t, q, v):
-    """Store in w, by the fused callback, C, C_q with A, C_t with b, and Gamma of the rows of C_q, at (t, q, v)."""
+    """Store C, C_q with A, C_t with b, and Gamma of the rows of C_q in w, by the callback that computes all of them."""
     n_c, n_rows = w.C.size, w.Rate.size
     clear_rows(f, w)
     w.C[:] = 0.0
@@ -88,24 +89,24 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-# MAX_DIFFERENCE_STEP: largest step of a finite difference, s; also the largest change of q during this step, relative
-# to max|q|. MIN_STEP_RATIO: smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
+# largest step of a finite difference, s, which also limits the change of q during this step, relative to max|q|; and
+# smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
-N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
-ROUNDING_DISAGREEMENT = 1e-9  # rounding may make Gamma with the steps e and 2 e differ by up to this fraction
-# e is doubled, to reduce rounding, if Gamma with the steps e and 2 e differs by less than this fraction
+N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the previous step
+ROUNDING_DISAGREEMENT = 1e-9  # by rounding, Gamma with the steps e and 2 e may differ up to this fraction
+# if Gamma with the steps e and 2 e differs by less than this fraction, e is doubled, to reduce rounding errors
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # step of one-sided differences (order 2), relative to central differences (order 4)
-# rounding error of Gamma, relative to the largest term of G v divided by the largest step, if such terms cancel
+# if terms of G v cancel, rounding error of Gamma, relative to the largest term divided by the largest step
 ROUNDING_OF_TERMS = 1e-14
-CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this times the required accuracy
+CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this part of the required accuracy
 
 
 @exact
 def representable_step(t, h):
-    """Return (t + h) - t, the step nearest to h that floating-point times allow: multiples of 1.2e-7 s near 1e9 s."""
+    """Return (t + h) - t, the step nearest to h that floating-point times allow (multiples of 1.2e-7 s near 1e9 s)."""
     return (t + h) - t
 
 
@@ -113,7 +114,7 @@ def representable_step(t, h):
 def largest_difference_step(q, v):
     """Return the largest difference step e, s: MAX_DIFFERENCE_STEP, or less if the coordinates move fast.
 
-    During e, coordinates move by at most MAX_DIFFERENCE_STEP times max|q|, unless MIN_STEP_RATIO limits e from below.
+    In the time e, coordinates move by at most MAX_DIFFERENCE_STEP times max|q|, unless MIN_STEP_RATIO limits e.
     """
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:
@@ -123,7 +124,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return the side of t for differences: 1 (after t) or -1 if C_t or b jumps on the other side, else 0 (both)."""
+    """Return on which side of t to take differences: 1 (after) or -1 if C_t or b jumps on the other side; 0: both."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -134,8 +135,8 @@ def _difference_side(w, t, e):
 def _fill_gamma(f, w, t, q, v, e, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences with the steps e and 2 e; return three maxima.
 
-    These are max|Gamma|, the largest disagreement of the two differences, and the largest |term| in the sums G v. If
-    Gamma is not finite, the first two are NaN.
+    The maxima are max|Gamma|, the largest disagreement of the two differences, and the largest |term| in the sums G v.
+    If Gamma is not finite, the first two are NaN.
     """
     Gamma_coarse = w.Gamma_tried[0]
     side = _difference_side(w, t, e)
@@ -185,8 +186,8 @@ def _max_disagreement(w):
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences with the best of several steps; return a code.
 
-    Steps are divided by 4 until Gamma changes little. The step at which Gamma changes least is the best one, and is
-    stored as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if even this change is too large, else DONE.
+    Steps are divided by 4 until Gamma changes little. The best step is the one at which Gamma changes least; it is
+    stored as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if even this smallest change is too large, else DONE.
     """
     least_change = np.inf
     step_ratio = 1.0
@@ -220,15 +221,15 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
     Errors are relative to the largest entry of Gamma so far in this run. The step e is GAMMA_STEP_RATIO times
-    largest_difference_step. A new step is chosen if the differences with e and 2 e disagree, as for drives of several
-    kilohertz.
+    largest_difference_step. A new step is chosen if the differences with e and 2 e disagree, as they do for a drive of
+    several kilohertz.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.gamma_step_ratio * largest_step)
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
-            return DONE  # the caller reports values that are not finite; without a scale, errors cannot be judged
+            return DONE  # either Gamma is not finite, which the caller reports, or there is no scale to judge errors by
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
         if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:

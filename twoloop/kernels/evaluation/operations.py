@@ -1,19 +1,19 @@
 """Define the operations of traced programs and the layout of their tables, and run programs in compiled code.
 
 Programs compute C_q and Gamma if no callback computes them (generate/derived_callbacks.py), and forces, prescribed
-motions and constraint rows that the user of a model defines by functions (bodies/program_results.py). An exact
-derivative may overflow where the function does not, for example the derivative of tanh at large arguments.
+motions and constraint rows that the user of a model defines by functions (bodies/programs.py). An exact derivative may
+overflow where the function itself does not, for example the derivative of tanh at large arguments.
 """
 
 import math
 
 from twoloop.kernels.data.common import compiled, exact
 
-# kinds of operations. PENDING: product of two Taylor series, of which the second gets its coefficient of an order only
-# when the linear equations of this order are solved. RESULT: output of a program
+# kinds of operations. PENDING: product of two Taylor series; the coefficient of each order of the second series becomes
+# known only when the linear equations of this order are solved. RESULT: output of a program
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
-# columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of its result among
-# the nodes, or among the results for RESULT. FIRST to SECOND - 1 and SECOND to END - 1: terms of its two arguments
+# columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of the node (for
+# RESULT: of the output) that it computes. FIRST to SECOND - 1 and SECOND to END - 1: terms of its two arguments
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
 # A program is a vector of integers: N_SIZES sizes (at the indices below), the rows of the table, the node of each term,
 # and the index of each result in its array. Results are numbered after all other nodes
@@ -86,14 +86,14 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, the first node that is a result, and where the list of result indices begins."""
+    """Return the number of results, the first node that is a result, and the position of the list of result indices."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Store Gamma in w.Gamma by its traced program; return False if there is no program, or a value is not finite."""
+    """Store Gamma in w.Gamma by a traced program; return False if there is no program, or a value is not finite."""
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -108,7 +108,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in G (zero on entry) by its traced program; return False if there is none, or a value is not finite."""
+    """Store C_q in G (zero on entry) by a traced program; return False if there is none, or a value is not finite."""
     program = f.jacobian_program
     if program.size == 0:
         return False

@@ -1,7 +1,7 @@
 """Partition coordinates by LU: choose independent coordinates and rows, and compute the dependent coordinates.
 
-Dependent positions follow from Newton's method, the inner loop of the paper, dependent velocities from linear
-equations. Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-8.
+Dependent positions follow from Newton's method, the inner loop of the paper; dependent velocities follow from linear
+equations. The paper is Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-8. `f` is the kit, `w` the workspace.
 """
 
 import numpy as np
@@ -36,11 +36,11 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
-RANK_TOLERANCE = 1e-11  # a pivot counts as zero if it is at most this, for rows scaled to 1
-PARTITION_CHANGED = -1  # code returned instead of DONE if a new partition has been adopted
-# largest number of rows of G that min_pivot_ratio eliminates: with more rows, the elimination takes too long
+RANK_TOLERANCE = 1e-11  # pivots up to this size count as zero, for rows scaled to 1
+PARTITION_CHANGED = -1  # code that replaces DONE if a new partition was adopted
+# largest number of rows of G for which min_pivot_ratio does an elimination; with more rows, this would take too long
 MAX_ROWS_ELIMINATED = 200
-SENSITIVITY_GROWTH = 3.0  # a partition is poor if max|C_qd^-1 C_qi| has grown by more than this factor since its choice
+SENSITIVITY_GROWTH = 3.0  # a partition is poor once max|C_qd^-1 C_qi| has grown by more than this factor
 
 
 @compiled
@@ -67,8 +67,8 @@ def _max_abs_from_column(row, first):
 def full_pivoting(A, order, row_order, row_maxima, first, last, max_rank):
     """Do Gaussian elimination of A in place with full pivoting, from pivot `first` on; return the numerical rank.
 
-    Pivots are chosen in the rows before row `last`; there are at most `max_rank` pivots, including those before
-    `first`. `order` and `row_order` are permuted as the columns and rows of A; `row_maxima` is scratch.
+    Pivots are chosen in the rows before row `last`, at most `max_rank` in all, including the pivots before `first`.
+    `order` and `row_order` are permuted in the same way as columns and rows of A; `row_maxima` is scratch.
     """
     n_q = A.shape[1]
     k = first
@@ -109,8 +109,8 @@ def min_pivot_ratio(f, w, t, q):
     """Return the ratio of the smallest to the largest pivot of C_q and A at (t, q), without changing the partition.
 
     Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the
-    fixed-order form, or with more than MAX_ROWS_ELIMINATED rows, the result is the smallest pivot of the last choice of
-    a partition, w.pivot.
+    fixed-order form, or with more than MAX_ROWS_ELIMINATED rows, return w.pivot instead: the smallest pivot when the
+    last partition was chosen.
     """
     if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.pivot
@@ -151,7 +151,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # end of the rows to eliminate: rows of A replace the redundant rows of C_q, from row `rank` on
+    last = rank  # end of the rows to eliminate: from row `rank` on, rows of A replace the redundant rows of C_q
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -184,7 +184,7 @@ def _copy_in_ascending_order(source, target):
 
 @compiled
 def _adopt_pivot_order(w):
-    """Store the partition of w.row_order and w.order, and write its programs; return False if C_qd is singular."""
+    """Store the partition given by w.row_order and w.order; write its programs; return False if C_qd is singular."""
     rank, rank_v = w.rows.size, w.rows_v.size
     # indices are stored in ascending order, so that equal sets of coordinates are equal partitions
     _copy_in_ascending_order(w.row_order[:rank], w.rows)
@@ -232,7 +232,7 @@ def _record_columns_of_entries(w):
 
 @compiled
 def record_entries(w):
-    """Set w.pattern to 1 where w.G is not zero; return whether this changes w.pattern, so that programs are invalid."""
+    """Set w.pattern to 1 where w.G is not zero; return whether w.pattern changes, which makes programs invalid."""
     if not update_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -243,8 +243,8 @@ def record_entries(w):
 def choose_partition(f, w, t, q):
     """Choose and store the dependent and independent coordinates and the independent rows at (t, q); return a code.
 
-    The code is SINGULAR if the rank is less than the previous partition's. It is RANK_DIFFERS, with the ranks in
-    w, if this is the first partition and the workspace is allocated for other ranks.
+    The code is SINGULAR if the rank is lower than for the previous partition. For the first partition, the code is
+    RANK_DIFFERS, with the ranks stored in w, if the workspace is allocated for other ranks.
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
@@ -267,12 +267,12 @@ def choose_partition(f, w, t, q):
 def adopt_partition_of_midpoint(f, w, t_mid, state, new_state):
     """Adopt the partition that full pivoting chooses at the middle of a step; return a code.
 
-    The code is PARTITION_CHANGED, DONE or SINGULAR. The reversed step has the same middle, so that the partition is
-    symmetric in time, and with it a step by a symmetric tableau. A partition that is used until it is poor would depend
-    on the direction of time.
+    The code is PARTITION_CHANGED, DONE or SINGULAR. The same step backwards in time has the same middle and thus the
+    same partition, so that a step by a symmetric tableau is symmetric in time. If a partition were used until it is
+    poor, it would depend on the direction of time.
 
     The middle is the mean of `state` and `new_state`, the end of the attempt with the current partition. After the step
-    is repeated with the new partition, the choice is not checked again. So the reversed step may choose another
+    is repeated with the new partition, the choice is not checked again. So the step backwards may choose another
     partition if two partitions are equally good within the difference of the two attempts, O(h^(p+1)).
     """
     n = w.Q.size
@@ -318,7 +318,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| in w.minimum of an independent row in a redundant row, with rows scaled to 1."""
+    """Return the largest |coefficient| in w.minimum of an independent row in a redundant row, for rows scaled to 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
@@ -339,9 +339,9 @@ def partition_is_poor(w):
     """Return whether the dependent coordinates have become so sensitive that a new partition is needed.
 
     The sensitivity to the independent coordinates is max|C_qd^-1 C_qi|, from w.D. It is near 1 after full pivoting, and
-    grows without bound where the independent coordinates stop being valid. The largest coefficient of an independent
-    row in a redundant row is compared in the same way: it grows where the independent rows become dependent, although
-    the rank stays the same.
+    grows without bound where the independent coordinates stop being valid. A partition is also poor if the largest
+    coefficient of an independent row in a redundant row has grown: this coefficient grows where the independent rows
+    become dependent, although the rank stays the same.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
@@ -361,11 +361,11 @@ def partition_is_poor(w):
 
 MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # an iteration counts as convergent if each correction is at most this fraction of the previous one
-ROUNDING_OF_CORRECTIONS = 1e-12  # largest correction due to rounding alone, relative to the largest coordinate
+ROUNDING_OF_CORRECTIONS = 1e-12  # rounding may cause corrections up to this size, relative to the largest coordinate
 # factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding, because small parts amplify errors:
-# the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
+# the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, and a chain of 1,000 such rods by more
 AMPLIFICATION = 1e3
-ROUNDING_OF_ROWS = 2e-15  # largest |C_i| that counts as a rounding error, relative to the largest |G_ij q_j|
+ROUNDING_OF_ROWS = 2e-15  # |C_i| counts as a rounding error up to this fraction of the largest |G_ij q_j|
 MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.rounded, the rounding error of q
 MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
 
@@ -391,7 +391,7 @@ def factor_dependent_columns(w, t, q):
     if w.Rate.size > w.C.size:
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
         w.n_factorizations += 1
-    # the ratio may also be small because of NaN, or of an order of elimination that does not suit the values
+    # a small ratio may also be due to NaN, or to an order of elimination that does not suit the values
     return DONE if ratio > RANK_TOLERANCE else _factor_in_new_order(w, t, q)
 
 
@@ -427,9 +427,9 @@ def _is_on_constraints(w, q):
 def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve eq. (15) by Newton's method for the dependent positions in q; return a code.
 
-    The iteration ends after a correction of at most `tolerance`. On return, the rows and factors in w are those at q,
-    or, after a last correction of at most `reuse_limit`, at q before this correction. The fused callback also stores
-    w.Rate and w.Gamma.
+    The iteration ends after a correction of at most `tolerance`. On return, w has the rows and factors at q or, if the
+    last correction was at most `reuse_limit`, at q before this correction. The callback `kinematics`, if given, also
+    stores w.Rate and w.Gamma.
     """
     last_correction = np.inf
     has_converged = w.C.size == 0
@@ -471,7 +471,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
 
 @merged
 def find_null_space(f, w, t, q):
-    """Store in w.D the null space of G and the driven velocities (see Work), from the rows and factors in w."""
+    """Store the null space of G, and the velocities that drives prescribe, in w.D (see Work), with the factors in w."""
     if f.kinematics_given == 0 or w.has_gamma == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
@@ -483,8 +483,8 @@ def find_null_space(f, w, t, q):
 def restore_velocities(f, w, t, q, v, reuse_limit):
     """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, with rows and factors in w.
 
-    If no velocity changes by more than `reuse_limit`, HAS_GAMMA stays set: w.Gamma, by the fused callback, is still
-    valid.
+    If no velocity changes by more than `reuse_limit`, HAS_GAMMA stays set: w.Gamma, as computed by the callback
+    `kinematics`, is still valid.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size

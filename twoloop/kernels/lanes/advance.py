@@ -1,7 +1,7 @@
 """Integration loop of runs in lanes: each lane has its own step size, and starts a new run when its run has ended.
 
 If a condition of the generated code does not hold, or many successive steps are rejected, a run is removed from its
-lane, and repeated alone later. The function `step` of `CODE` takes the steps.
+lane, and repeated alone later. The method's function `code.step` takes the steps. For `work` see layout.py.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
     n_fresh, n_running = 0, 0
     for k in range(LANES):
         previous_run = int(work[at.RUN * LANES + k])
-        # the generated code of a series method clears RUNNING without storing a reason in `status`
+        # the generated code of a series method ends a run by RUNNING = 0, without storing a reason in `status`
         if work[at.RUNNING * LANES + k] == 0.0 and previous_run >= 0 and status[previous_run] == at.UNDECIDED:
             status[previous_run] = at.MANY_REJECTIONS if work[at.N_REJECTED * LANES + k] < np.inf else at.NO_VALUES
         work[at.ACTIVE * LANES + k] = work[at.IS_NEW * LANES + k] = 0.0
@@ -54,7 +54,7 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
 
 @compiled
 def _write_states_in_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
-    """Store the states at output times within accepted steps in out_q and out_v, or NaN where the projection fails."""
+    """Store the states at output times within accepted steps in out_q and out_v; NaN if the projection fails."""
     while True:
         n_requested = 0
         for k in range(LANES):
@@ -83,7 +83,7 @@ def _write_states_in_steps(code, settings, control, options, work, n, new, times
 
 @compiled
 def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
-    """End the runs whose accepted step ends at t1, output time `last`; copy their states to out_q, out_v and out_a."""
+    """End the runs whose accepted step ends at t1, the output time `last`; copy the final states to the outputs."""
     for k in range(LANES):
         if work[at.ACCEPTED * LANES + k] == 0.0 or work[at.H * LANES + k] != control[at.T1] - work[at.T * LANES + k]:
             continue
@@ -97,11 +97,11 @@ def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, ou
 
 @compiled
 def _count_evaluations(settings, work, n_evaluations):
-    """Add the number of evaluations in the last step to `n_evaluations` (n_runs) for the run of each lane."""
+    """For each lane, add the number of evaluations in the last step to the run's entry of `n_evaluations` (n_runs)."""
     for k in range(LANES):
         if work[at.RUNNING * LANES + k] == 1.0:
             n_within = settings[at.N_EVALUATIONS] + int(work[at.EVALUATED * LANES + k])
-            n_evaluations[int(work[at.RUN * LANES + k])] += n_within + 1  # one more at the end of the step
+            n_evaluations[int(work[at.RUN * LANES + k])] += n_within + 1  # 1: the evaluation at the end of the step
 
 
 @compiled

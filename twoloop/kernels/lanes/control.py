@@ -1,6 +1,6 @@
 """Steps of explicit methods in lanes, and step-size control of Runge-Kutta methods for each lane.
 
-As in `explicit_step`, the stages of DOP853 are not projected onto the constraints, only the end of the step is. The
+As in `explicit_step`, only the end of a step of DOP853 is projected onto the constraints, and its stages are not. The
 step-size control of Taylor series is part of the code generated for the mechanism, see generate/lane_code.py.
 """
 
@@ -20,17 +20,17 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, whose first N_RULE entries are the step-size rule. JUMP_RATIO: largest ratio of an error to its
+# indices in `options`, whose first N_RULE entries are the step-size rule. JUMP_RATIO: largest ratio of error to
 # estimate if a force jumps; FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest
-# tolerance of a coordinate. From N_HEAD on, `options` contains the options of the method for a single run
+# tolerance of a coordinate. From N_HEAD on, `options` contains the method's options for a single run
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-SUDDEN_ERROR = 10.0  # a force is assumed to jump in a rejected step with an error of more tolerances than this
-MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step, as in advance.py
-# a step ends at t1 if it is shorter than the time to t1 by at most this fraction, see `size_off_grid`
+SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
+MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to a rejected step size, as in advance.py
+# a step is lengthened to end at t1 if it is shorter than the time left by at most this fraction, see `size_off_grid`
 END_ROUNDING = 1e-10
 LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of the last failed step, as in `Plan`
-LIMIT_MEMORY = 10.0  # number of accepted steps after which H_LIMIT no longer applies, as in `Plan`
+LIMIT_MEMORY = 10.0  # number of accepted steps during which H_LIMIT applies, as in `Plan`
 LEAST_FIRST_STEP = 20.0 * at.SHORTEST  # lower bound of the first step size, relative to |t0|
 # number of successive rejected steps after which a run leaves its lane, because the motion may be stiff
 MAX_REJECTED = 30
@@ -64,7 +64,7 @@ def _first_step_size(options, control, work, n, state, a, k):
 
 @compiled
 def begin_control(options, control, work, n, state, a, start):
-    """Initialize step-size control, and copy the accelerations at offset `a` to `start`, in lanes with IS_NEW = 1."""
+    """In lanes with IS_NEW = 1, initialize step-size control, and copy accelerations from offset `a` to `start`."""
     for k in range(LANES):
         if work[at.IS_NEW * LANES + k] == 1.0:
             for j in range(n):
@@ -88,7 +88,7 @@ def choose_steps(work, control, status, n_steps):
             if h >= time_left * (1.0 - END_ROUNDING):
                 h = time_left
             elif h > 0.5 * time_left:
-                h = 0.5 * time_left  # two equal steps rather than a long and a tiny one
+                h = 0.5 * time_left  # take two equal steps instead of a long step and a tiny one
             if n_steps[int(work[at.RUN * LANES + k])] >= MAX_STEPS:
                 remove_run(work, status, k, at.MANY_STEPS)
             elif h > at.SHORTEST * max(abs(t), abs(t1)):
@@ -102,7 +102,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set T_NEW, the time of NEW, to T + X; to exactly t1 at the end of the run."""
+    """Set T_NEW, the time of the state NEW, to T + X, or to exactly t1 at the end of the run."""
     for k in range(LANES):
         t, x = work[at.T * LANES + k], work[at.X * LANES + k]
         work[at.T_NEW * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x
@@ -110,7 +110,7 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW onto the constraints; raise ERROR to the change by the projection, in tolerances, if that is larger.
+    """Project NEW onto the constraints; if its change, in tolerances, is larger than ERROR, store this change in ERROR.
 
     Velocities change by more than the tolerances if a drive jumps or bends between stages. `predicted_v` is scratch.
     """
@@ -140,7 +140,7 @@ def _accept_or_shorten(options, work, k):
         work[at.H_NEXT * LANES + k], work[at.H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[at.LIMIT_AGE * LANES + k] = 0.0
         return False
-    # where a force jumps, the error estimate may be small by chance: until JUMP_END, multiply the estimate by
+    # near a jump of a force, the error estimate may be small by chance: until JUMP_END, multiply the estimate by
     # JUMP_RATIO
     error_factor = options[JUMP_RATIO] if t < work[at.JUMP_END * LANES + k] else 1.0
     is_accepted = error * error_factor <= 1.0
@@ -163,7 +163,7 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED according to ERROR and ACTIVE; copy the final accelerations `a` of accepted steps to `start`."""
+    """Set ACCEPTED according to ERROR and ACTIVE; after accepted steps, copy the accelerations `a` to `start`."""
     for k in range(LANES):
         work[at.ACCEPTED * LANES + k] = 0.0
         if work[at.RUNNING * LANES + k] == 0.0:
@@ -185,9 +185,9 @@ def memory_size(s: int, n: int) -> int:
 
 @kernel(STEP)
 def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of DOP853, of size control[GAP] at most, in each lane.
+    """Take a step of DOP853 in each lane, at most as long as control[GAP].
 
-    With `within`, compute instead the states at the time X after the beginning of the last accepted step.
+    If `within`, take no step: compute the states at the time X after the beginning of the last accepted step.
     """
     n = settings[at.N]
     state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -206,9 +206,9 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 
 @kernel(STEP)
 def step_by_series(code, settings, control, options, work, status, n_steps, within):
-    """Take a step by the Taylor series about its beginning in each lane.
+    """Take a step in each lane, by the Taylor series about the beginning of the step.
 
-    With `within`, compute instead the states at the time X after the beginning of the last accepted step.
+    If `within`, take no step: compute the states at the time X after the beginning of the last accepted step.
     """
     order = settings[at.ORDER]
     if within:

@@ -1,9 +1,9 @@
 """Layout of the memory `work` of runs in lanes, operations on `work`, generated functions, and codes of ended runs.
 
-`work` consists of vectors with one number for each lane. Offsets in `work`, and distances between vectors, are counted
-in vectors; arguments such as `target` or `x` are offsets. The operations treat all lanes at once, for example the LU
-factorization of one matrix in each lane. The imaginary part of a complex number is `imaginary` vectors after the real
-part; if `imaginary` is 0, the number is real.
+`work` consists of vectors with one number for each lane (k: index of a lane). Offsets in `work`, and distances between
+vectors, are counted in vectors; arguments such as `target` or `x` are offsets. The operations treat all lanes at once:
+for example, they factor one matrix in each lane. The imaginary part of a complex number is `imaginary` vectors after
+the real part; if `imaginary` is 0, the number is real.
 """
 
 from typing import Any
@@ -16,8 +16,8 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, inlined, merged
 
-# status of a run: not ended, ended at t1, or (negative) the reason why the run has to be repeated outside the lanes,
-# for example CALLBACKS_DIFFER: callbacks disagree with the generated code
+# status of a run: not ended; ended at t1; or (negative) the reason why the run has to be repeated outside the lanes,
+# such as CALLBACKS_DIFFER: callbacks disagree with the generated code
 UNDECIDED, ENDED = 0, 1
 NO_START, NO_STATE, NO_VALUES, MANY_REJECTIONS, MANY_STEPS, CALLBACKS_DIFFER = range(-6, 0)
 
@@ -30,9 +30,9 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     UNIT,  # unit of time of a series, s
     H,  # size of the step, s
     X,  # time from the beginning of the step to the state to be computed, s
-    ACTIVE,  # 1 in lanes in which the next task has to run; the task sets it to 0 where it fails
+    ACTIVE,  # 1 in lanes in which the next task has to run; a task that fails in a lane sets 0 there
     DEFECT,  # defect at the end of the step, relative to the allowed defect
-    PREDICTION_ERROR,  # difference of predicted and projected positions, over the allowed one, see step_size.py
+    PREDICTION_ERROR,  # difference of predicted and projected positions, over its limit, see step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
     LONGEST,  # largest allowed step size, s
     REQUESTED,  # 1 in lanes that begin a run, or in which a state within the step is to be computed
@@ -50,7 +50,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     H_NEXT,  # size of the next step, s
     H_LIMIT,  # upper limit of step sizes after a failed step, s; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
-    JUMP_END,  # time at the end of the last step that was rejected with an error above SUDDEN_ERROR, s
+    JUMP_END,  # end of the last step that was rejected with an error above SUDDEN_ERROR, s
     SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
     EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
     PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
@@ -69,8 +69,8 @@ CODE = Reference("LaneKit", {})  # numba's type for objects of the class LaneKit
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # signature of a method's step, (code, settings, control, options, work, status, n_steps, within): in each lane with a
-# run, take a step H, set ACCEPTED, and compute NEW, A and LAM at its end. If `within`, instead compute the state NEW at
-# the time X after the beginning of the last accepted step, without a projection, in lanes with ACTIVE = 1
+# run, take a step H, set ACCEPTED, and compute NEW, A and LAM at the end of the step. If `within`, take no step: in
+# lanes with ACTIVE = 1, compute NEW at the time X after the beginning of the last accepted step, without a projection
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
@@ -104,7 +104,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 def array_offsets(n, n_rows, n_numbers):
     """Return the offsets in `work`, in vectors, of the arrays that follow its fields.
 
-    These are STATE and NEW (q, v), PREDICTED (q), SERIES_A (accelerations by a series), A, LAM, the data of the
+    The arrays are STATE and NEW (q, v), PREDICTED (q), SERIES_A (accelerations by a series), A, LAM, the data of the
     generated code (n_numbers), and the memory of the method.
     """
     state = N_FIELDS
@@ -129,20 +129,20 @@ def fill_field(work, field, value):
 
 @merged
 def remove_run(work, status, k, reason):
-    """Remove the run from lane k; store in `status` the `reason`, such as NO_VALUES, for which it is repeated alone."""
+    """Remove the run from lane k, to be repeated alone; store the `reason`, such as NO_VALUES, in `status`."""
     work[RUNNING * LANES + k] = 0.0
     status[int(work[RUN * LANES + k])] = reason
 
 
 @inlined
 def vector_range(work, begin, count):
-    """Return a flat view of `count` adjacent vectors of `work`, which begin at offset `begin`."""
+    """Return a flat view of `count` adjacent vectors of `work`, from the offset `begin` on."""
     return work[begin * LANES : (begin + count) * LANES]
 
 
 @inlined
 def matrix_view(work, begin, rows, count):
-    """Return a view (rows, count * LANES) of adjacent vectors of `work`, which begin at offset `begin`."""
+    """Return a view (rows, count * LANES) of adjacent vectors of `work`, from the offset `begin` on."""
     return work[begin * LANES : (begin + rows * count) * LANES].reshape((rows, count * LANES))
 
 
@@ -163,21 +163,21 @@ def _add_product_in_four_lanes(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign * x * y to the vector `target`, reading four lanes before writing any, because vectors might overlap."""
+    """Add sign * x * y to the vector `target`; read four lanes before writing any of them, as vectors might overlap."""
     for k in range(0, LANES, 4):
         _add_product_in_four_lanes(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return the value that `raise_to_ratio` stores in one lane; `target` to `after` are indices in `work`."""
+    """Return the value that `raise_to_ratio` stores in one lane; `target`, `error`, etc. are indices in `work`."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """Raise `target` to |error| * factor / (atol + rtol * max(|before|, |after|)) in lanes in which it is smaller."""
+    """Set `target` to |error| * factor / (atol + rtol * max(|before|, |after|)) in lanes where `target` is smaller."""
     for k in range(0, LANES, 4):
         m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k
         m0 = _raised_value(work, m, e, f, x, y, atol, rtol)
@@ -191,7 +191,7 @@ def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
 def _multiply_number(work, target, imaginary_target, x, imaginary):
     """Multiply the number `target` by x in each lane; if `imaginary` > 0, both numbers are complex.
 
-    Imaginary parts are `imaginary_target` vectors after the real part of `target`, and `imaginary` vectors after x.
+    The imaginary part is `imaginary_target` vectors after the real part of `target`, and `imaginary` vectors after x.
     """
     for k in range(LANES):
         t, p = target * LANES + k, x * LANES + k
@@ -207,7 +207,7 @@ def _multiply_number(work, target, imaginary_target, x, imaginary):
 def _subtract_product(work, target, x, y, imaginary, imaginary_y):
     """Subtract the product x * y from the number `target` in each lane; if `imaginary` > 0, all three are complex.
 
-    Imaginary parts are `imaginary` vectors after the real part of x, and `imaginary_y` after those of y and `target`.
+    The imaginary part is `imaginary` vectors after the real part of x, and `imaginary_y` after that of y and `target`.
     """
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:
@@ -232,7 +232,7 @@ def _pivot_magnitude(work, entry, imaginary, k):
 
 @compiled
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
-    """Exchange rows so that the pivot (c, c) is the largest entry of column c from row c on; replace it by its inverse.
+    """Exchange rows so that entry (c, c), the pivot, is the largest one from row c on in column c; store its inverse.
 
     Clear ACTIVE in lanes in which the pivot is zero.
     """

@@ -5,8 +5,8 @@ The unknowns are the accelerations a_j of all coordinates at the stages,
     F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
 where F are the accelerations at a state that is not projected: stages violate the constraints by the error of the
-formula, and only the end of the step is projected. In each step, the derivatives of F are computed anew, by
-differences, for all lanes at once. Offsets are those in `work`, see layout.py.
+formula, and only the end of the step is projected. In each step, the derivatives of F are computed anew, by finite
+differences, for all lanes at once. Offsets are positions in `work`, see layout.py.
 """
 
 import numpy as np
@@ -52,7 +52,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     SCALE_V,  # largest absolute velocity at the stages, at least 1
     LARGEST_Q,  # largest correction of positions, divided by the square of the step size
     LARGEST_V,  # largest correction of velocities, divided by the step size
-    H_PREVIOUS,  # size of the step with the accelerations PREVIOUS, s; 0 if there is no such step
+    H_PREVIOUS,  # size of the step whose accelerations are in PREVIOUS, s; 0: there is no such step
     CONSTANT,  # 1: the predicted accelerations of all stages equal the accelerations at the beginning; else 0
     DURATION,  # duration of an error of the velocities, s, see velocity_errors.py; 0: not known
     N_SINGLE_VECTORS,
@@ -77,10 +77,10 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     _IMAGINARY,
     N_VECTORS,
 ) = range(15)
-# indices of the blocks (s, n), which the weights (s, s) follow: accelerations of the stages and of the previous step's
-# stages, residuals, and corrections
+# indices of the blocks (s, n): accelerations of the stages, and of the stages of the previous step; residuals; and
+# corrections. The weights (s, s) follow the blocks
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
-# indices of the matrices (n, n), which the pivots follow; from SYSTEMS on, a real and an imaginary part for each system
+# indices of the matrices (n, n); from SYSTEMS on, a real and an imaginary part for each system. The pivots follow them
 DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
@@ -144,9 +144,9 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 
 @compiled
 def compute_derivatives(code, settings, control, c, work):
-    """Store the derivatives of the accelerations in the middle of the step by q and v, in lanes with ACTIVE = 1.
+    """Store the derivatives of accelerations by q and v, in the middle of the step, in lanes with ACTIVE = 1.
 
-    The middle is the time of a stage, because forces that act only between two stages must not affect the step.
+    "Middle" is the time of a stage, because forces that act only between two stages must not affect the step.
     """
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -169,7 +169,7 @@ def compute_derivatives(code, settings, control, c, work):
 
 @compiled
 def factor_systems_of_lanes(settings, method_options, s, work):
-    """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one l of each pair; X: step size."""
+    """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and one of each complex pair; X: step size."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_index(s)
@@ -196,7 +196,7 @@ def predict_stages(settings, c, work, begins):
     """Store predicted stage accelerations in STAGES: values of the polynomial through the accelerations in PREVIOUS.
 
     If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, the prediction is constant. `begins` is 1 if
-    PREVIOUS belongs to the last step, and 0 if it belongs to this step.
+    PREVIOUS belongs to the last step, and 0 if PREVIOUS belongs to this step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -228,7 +228,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations in STAGES; clear ACTIVE where values are invalid."""
+    """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations in STAGES; clear ACTIVE if a value is invalid."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -345,7 +345,7 @@ def _has_iteration_ended(options, work, memory, iteration, k):
 
 @compiled
 def solve_stages(code, settings, control, options, method_options, A, A2, c, work):
-    """Solve for STAGES of a step of size X, from the prediction, where ACTIVE is 1; clear ACTIVE on divergence."""
+    """Iterate the predicted STAGES of a step of size X in lanes with ACTIVE = 1; clear ACTIVE on divergence."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     iterating, done = memory + ITERATING, memory + DONE
@@ -390,7 +390,7 @@ def store_state_from_stages(settings, b, bA, work):
 
 @merged
 def _allowed_error(control, work, state, new, j, entry, k):
-    """Return the allowed error in lane k of entry number `entry` of a state [q, v], which belongs to coordinate j."""
+    """Return the allowed error, in lane k, of a state's entry with the index `entry`, which belongs to coordinate j."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[at.ATOL + j] + control[at.RTOL] * magnitude
 
@@ -441,7 +441,7 @@ def _filter_errors(settings, method_options, s, work, memory):
 
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
-    """Return the error, in tolerances, that the estimated velocity error causes in lane k, see velocity_errors.py."""
+    """Return the error, in tolerances, that the estimated velocity error in lane k causes, see velocity_errors.py."""
     raw, once, twice = (
         vector_offset(memory, n, UNFILTERED),
         vector_offset(memory, n, FILTERED_ONCE),
@@ -465,7 +465,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
 
 @compiled
 def _velocity_error(control, work, n, velocity_error, duration, state, new, k):
-    """Return the largest error, in tolerances, that a velocity error causes in `duration` (s) in lane k."""
+    """Return the largest error, in tolerances, that a velocity error in lane k causes within `duration` (s)."""
     error = 0.0
     for j in range(n):
         weight_q = duration / _allowed_error(control, work, state, new, j, j, k)
@@ -488,7 +488,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
-    """Raise ERROR to the error caused by the slowly changing part of E_V, if that is larger, see newton_step.py."""
+    """If the slowly changing part of E_V causes a larger error than ERROR, store it in ERROR; see newton_step.py."""
     n = settings[at.N]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
@@ -553,7 +553,7 @@ def _estimate_error(settings, control, method_options, A, work):
 
 @compiled
 def _store_stages(work, memory, n, s):
-    """Copy STAGES of accepted steps to PREVIOUS, the basis of predictions for the next step and within this step."""
+    """Copy STAGES of accepted steps to PREVIOUS, to predict stages of the next step, or of a state within this step."""
     stages, previous = block_offset(memory, n, s, STAGES), block_offset(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if work[at.ACCEPTED * LANES + k] == 1.0:
@@ -564,9 +564,9 @@ def _store_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of an implicit Runge-Kutta method, of size control[GAP] at most, in each lane.
+    """Take a step of an implicit Runge-Kutta method in each lane, at most as long as control[GAP].
 
-    With `within`, compute instead the states at the time X after the beginning of the last accepted step.
+    If `within`, take no step: compute the states at the time X after the beginning of the last accepted step.
     """
     n = settings[at.N]
     state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])

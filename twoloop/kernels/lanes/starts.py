@@ -1,9 +1,9 @@
 """Project initial states in lanes onto the constraints by the least change; check whether another assembly is as near.
 
 The least change follows from the Cholesky factor of G G^T, with the rows of G scaled to norm 1. Redundant rows are
-linearly dependent at positions that satisfy the constraints, and nearly so at others. The rows of Z are eigenvectors of
-G G^T: combinations of rows of G that vanish if the constraints hold. Components of right-hand sides along the rows of Z
-are removed, and Z^T Z is added to G G^T, so that the sum is not singular. Lanes are independent of one another.
+linearly dependent at positions that satisfy the constraints, and nearly dependent at others. The rows of Z are
+eigenvectors of G G^T: combinations of rows of G that vanish if the constraints hold. Components of right-hand sides
+along the rows of Z are removed, and Z^T Z is added to G G^T, so that the sum is not singular. Lanes are independent.
 
 `pattern` is the sparsity pattern of G. Its first n_rows + 1 entries are indices in `pattern`: the columns of row i are
 the entries from pattern[i] to pattern[i + 1] - 1. Matrices and vectors in `work` are given by offsets, in vectors.
@@ -22,15 +22,15 @@ from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # a combination of rows counts as redundant if its eigenvalue of G G^T is at most this
-# number of inverse iterations for each row of Z: few, because redundant combinations have much smaller eigenvalues
+# number of inverse iterations for each row of Z: few suffice, because redundant combinations have tiny eigenvalues
 N_REDUNDANT_ITERATIONS = 5
-# multiples of this number, modulo 1, are irregular start values of inverse iterations
+# inverse iterations start from irregular numbers: multiples of this number, modulo 1
 GOLDEN_SECTION = 0.6180339887498949
 
 
 @merged
 def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
-    """In four adjacent lanes, subtract from work[target] `count` products work[x] * work[y], x and y with strides."""
+    """In four adjacent lanes, subtract `count` products work[x] * work[y] from work[target]; x and y have strides."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -44,7 +44,7 @@ def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
 
 @compiled
 def subtract_products(work, target, x, x_stride, y, y_stride, count):
-    """Subtract from vector `target` the products of the vectors x + i * x_stride and y + i * y_stride, i < `count`.
+    """Subtract the products of the vectors x + i * x_stride and y + i * y_stride, i < `count`, from vector `target`.
 
     A vector has one number for each lane; `target`, x and y are numbers of vectors in `work`.
     """
@@ -125,7 +125,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store Z, eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one of these is too large."""
+    """Store Z, eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if an eigenvalue is too large."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -140,7 +140,7 @@ def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factor
             _remove_redundant_components(work, n_rows, w, Z, z, scratch)
         normalise_vector(work, z, n_rows, scratch)
         for k in range(LANES):
-            # `scratch` is now the eigenvalue plus ITERATION_SHIFT
+            # the vector `scratch` now contains the eigenvalue plus ITERATION_SHIFT
             if not work[scratch * LANES + k] < MAX_REDUNDANT_EIGENVALUE:
                 work[z * LANES + k] = np.nan
 
@@ -207,14 +207,14 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# no other assembly can be as near if the projection of displaced positions differs from its linear prediction by C_q by
-# at most this fraction of the displacement
+# no other assembly is as near as the guess if the projection of a displaced position differs from its linear prediction
+# by C_q by at most this fraction of the displacement
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # rows of norm 1 count as independent if all eigenvalues of G G^T are at least this
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
-N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
-# displacements of other guesses from the projected positions, as two factors: on the change from the first guess to the
-# projected positions, and on the weakest direction
+N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; `settings` of runs has N_EVALUATIONS there
+# other guesses are displaced from the projected positions by a sum of two vectors; these are the factors on the change
+# from the first guess to the projected positions, and on the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
@@ -223,9 +223,9 @@ def offsets_in_memory(memory, n, n_rows, n_entries, n_redundant):
 
     The memory begins with C and C_t (n_rows each), and the entries of G; the generated code writes these parts. The
     other parts are a right-hand side x (n_rows); a change of positions or velocities, the projected positions, the
-    change from the guess to these, the weakest direction, the displacement of another guess, and a row of G (n each);
-    and the results of `factor_gram` at the projected positions, and at NEW. The weakest direction is the direction that
-    the rows of G determine least.
+    change from the guess to the projected positions, the weakest direction, the displacement of another guess, and a
+    row of G (n each); the results of `factor_gram` at the projected positions; and its results at NEW. The weakest
+    direction is the direction that the rows of G determine least.
     """
     G = memory + 2 * n_rows
     x = G + n_entries
@@ -303,7 +303,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # the last change is applied, too, so that the result is as accurate as possible
+            # even if the constraints already hold, the last change is applied, for the best accuracy
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[at.UNCONVERGED * LANES + k] = 0.0
             else:
@@ -317,7 +317,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _project_velocities(code, settings, control, pattern, moves, work):
-    """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at its positions."""
+    """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at NEW."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     n_entries = pattern[n_rows] - pattern[0]
@@ -351,7 +351,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
     normalise_vector(work, x, n_rows, scratch)
     min_eigenvalue = MIN_EIGENVALUE if n_redundant == 0 else MAX_REDUNDANT_EIGENVALUE * n_rows
     for k in range(LANES):
-        if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` is now the smallest eigenvalue
+        if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` now contains the smallest eigenvalue
             work[at.RUNNING * LANES + k] = 0.0
         factor = _largest_value(work, correction, n, k) / max(_largest_value(work, weakest, n, k), DIAGONAL_SHIFT)
         for j in range(n):
@@ -360,7 +360,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
 
 @compiled
 def _check_nearby_guesses(code, settings, control, pattern, moves, work):
-    """Clear RUNNING in lanes in which another guess has a projection far from its linear prediction by C_q."""
+    """Clear RUNNING in lanes in which the projection of another guess is far from its linear prediction by C_q."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     _, x, change, nearest, correction, weakest, displacement, _, factors, _, _ = _memory_offsets(
@@ -447,8 +447,8 @@ def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states
 
     The equations are C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q. The limit is `rtol` times the
     terms of the equation, and for constraints also the effect of errors `atol` of coordinates and velocities.
-    sizes : n, n_c and the first index in p of the parameters; runs : (n_rows,) index of the run of each row, or -1 to
-    omit the row; parameters : (n_runs, n_p); states_q, states_v : (n_rows, n, n_t), where the last time is the end;
+    sizes : n, n_c and the index in p of the first parameter; runs : (n_rows,) index of the run of each row, or -1 to
+    omit the row; parameters : (n_runs, n_p); states_q, states_v : (n_rows, n, n_t), with the end as the last time;
     ends : (n_rows, n + n_c) a and lam at the end; scratch : (n (n + 3) + n_c (n + 3),) overwritten.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]

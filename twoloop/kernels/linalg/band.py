@@ -3,9 +3,9 @@
 In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of a C-ordered array, with top = b for the
 upper triangle of M, and top = 2 b for an LU, whose row exchanges fill another b diagonals (b: bandwidth).
 
-The LAPACK library is that of SciPy. The addresses of its routines differ from process to process, and kernels are
-stored on disk, so that addresses cannot be compiled in: a run stores `lapack_addresses` in its workspace, and
-`call_lapack` gets one of these addresses. (Numba calls LAPACK only for dense matrices, and allocates memory.)
+The LAPACK library comes with SciPy. Kernels are stored on disk, but addresses of LAPACK routines differ from process to
+process, and must not be part of compiled code. So a run stores `lapack_addresses` in its workspace, and passes one of
+them to `call_lapack`. (Numba calls LAPACK only for dense matrices, and allocates memory.)
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ from twoloop.kernels.data.indices import DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
 # names of LAPACK routines, and their indices in `lapack_addresses`: Cholesky factorization of a banded matrix (dpbtrf),
-# solution with this factor (dpbtrs); LU factorization and solution of real matrices (dgb), and of complex ones (zgb)
+# solution with this factor (dpbtrs); LU factorization and solution of real (dgb) and of complex (zgb) banded matrices
 ROUTINES = ("dpbtrf", "dpbtrs", "dgbtrf", "dgbtrs", "zgbtrf", "zgbtrs")
 DPBTRF, DPBTRS, DGBTRF, DGBTRS, ZGBTRF, ZGBTRS, N_ROUTINES = range(7)
 
@@ -44,7 +44,7 @@ def call_lapack(typing_context, address, arguments):
     """Call the LAPACK routine at `address` with `arguments` and Fortran's last argument `info`; return `info`.
 
     `arguments` is a tuple of arrays and integers. An array is passed as the address of its first element, an integer as
-    the address of a 32-bit copy. The copy also serves as a character, because all machines of numba are little-endian.
+    the address of a 32-bit copy. The copy can also be read as a character, because numba's machines are little-endian.
     """
 
     def emit_call(context, builder, signature, values):
@@ -66,9 +66,9 @@ def call_lapack(typing_context, address, arguments):
     return types.int64(address, arguments), emit_call
 
 
-# smallest number of coordinates for which Newton steps by banded algebra count as faster than by dense algebra. The
-# limit measured on chains of bandwidth 1 to 11, and on beams, is 36 to 75. Single evaluations, as in a fixed-point
-# iteration, are faster only above about 150 coordinates; with 56 coordinates they take a third longer
+# number of coordinates from which on Newton steps are assumed to be faster with banded than with dense algebra. For
+# chains of bandwidth 1 to 11, and for beams, 36 to 75 were measured. Single evaluations, as in a fixed-point iteration,
+# are faster only above about 150 coordinates; with 56 coordinates they take a third longer
 MIN_BANDED_SIZE = 56
 
 
@@ -92,7 +92,7 @@ def _mass_band(w, b):
 
 @inlined
 def _mass_diagonals(w, b):
-    """Return a view of w.L behind the Cholesky factor for the diagonals of M: entry (i, i + k) of M is at [k, i]."""
+    """Return the view of w.L, behind the Cholesky factor, of the diagonals of M: entry (i, i + k) of M is at [k, i]."""
     n = w.Q.size
     return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
 
@@ -123,7 +123,7 @@ def solve_banded_mass(f, w, x):
 
 @compiled
 def add_banded_mass_times(f, w, x, y):
-    """Add M x to y in place, diagonal by diagonal, because rows within the band are too short for fast loops."""
+    """Add M x to y in place, diagonal by diagonal, because loops over the short rows of the band would be slow."""
     n = w.Q.size
     for i in range(n):
         y[i] += w.M[i, i] * x[i]

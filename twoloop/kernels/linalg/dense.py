@@ -57,7 +57,7 @@ def contains(numbers, number):
 
 @merged
 def _magnitude(x):
-    """Return |x| of a real number, or |Re x| + |Im x| of a complex one, which needs no square root (as in LAPACK)."""
+    """Return |x| of a real number, or |Re x| + |Im x| of a complex number: LAPACK, too, avoids the square root."""
     return abs(x.real) + abs(x.imag)
 
 
@@ -206,7 +206,7 @@ def ldl_solve_rows(A, B):
 def has_new_entries(G, pattern):
     """Return whether G has a nonzero entry where `pattern` is 0."""
     entries, recorded = G.reshape(G.size), pattern.reshape(pattern.size)
-    sum_of_new_entries = 0.0  # sum of the new |entries|: a sum needs no branch, and new entries are rare
+    sum_of_new_entries = 0.0  # sum of the new |entries|: summing needs no branch, and new entries are rare
     for i in range(recorded.size):
         sum_of_new_entries += abs(entries[i]) * (1.0 - recorded[i])
     return sum_of_new_entries != 0.0  # also true for NaN

@@ -1,13 +1,13 @@
 """Choose dependent coordinates for generated code, as pivots in rows of G, in blocks of one or two rows.
 
 Constant pivots are chosen first: they need no division and do not change. Among varying entries that are large enough,
-those that cause the least fill-in are chosen, not the largest ones, so that nearby positions mostly have equal pivots.
+not the largest is chosen but the one that causes the least fill-in: so nearby positions mostly have the same pivots.
 """
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel, merged
 
 NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries of G: always zero, constant, varying
-ROWS_SEARCHED = 4  # pivot blocks are sought only in this number of rows, those with the fewest entries, to save time
+ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows: those with the fewest entries
 # limits of a pivot block, in three tiers, which are tried in this order
 # - MAX_SQUARES: largest sum of squares of the changes of the block's coordinates if each other coordinate moves by 1
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
@@ -16,7 +16,7 @@ ROWS_SEARCHED = 4  # pivot blocks are sought only in this number of rows, those 
 # last tier is well above MIN_PIVOT_SQUARE of generate/null_space.py, so that a choice stays valid for some motion
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 MIN_CONSTANT_PIVOT = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
-CANCELLATION = 1e-12  # largest |a - b| of two constants that counts as zero, relative to |b|
+CANCELLATION = 1e-12  # the difference a - b of two constants counts as zero up to this fraction of |b|
 
 
 def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
@@ -26,7 +26,7 @@ def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
 
 @compiled
 def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
-    """Return n * row + column of the constant entry that causes the least fill-in as a pivot; -1 if there is none."""
+    """Return n * row + column of the constant entry that, as a pivot, causes the least fill-in; -1: no such entry."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_active[i]:
@@ -132,7 +132,7 @@ def _append_entry(K, columns, row_sizes, i, j):
 
 @compiled
 def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
-    """Subtract from row r the multiple of row i that removes its entry in column j; entry (i, j) is 1."""
+    """Subtract from row r the multiple of row i that makes entry (r, j) zero; entry (i, j) is 1."""
     factor, kind = R[r, j], K[r, j]
     R[r, j], K[r, j] = 0.0, NONE
     n = _merge_columns(columns, row_sizes, r, i, union)
@@ -151,7 +151,7 @@ def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
 
 @compiled
 def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
-    """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate these columns."""
+    """Solve row i for column j (if i == k) or rows i and k for columns j and l; then eliminate these columns."""
     row_active[i] = row_active[k] = 0
     n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]

@@ -7,8 +7,8 @@ elimination become large, another order is chosen. If the program is nearly as l
 factors replace the sparse ones.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
-lists that it changes. So the work is proportional to the number of rows times the number of entries, instead of to the
-third power of the number of rows.
+lists that it changes. So the work grows as the number of rows times the number of entries, and not as the third power
+of the number of rows.
 
 The factors of a matrix are two arrays: `index`, the program, and `values`. Right-hand sides and solutions are in the
 order of elimination: entry k of a right-hand side belongs to row rows_of(index)[k] of the Jacobian, and entry k of a
@@ -19,15 +19,15 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
 MIN_PIVOT_RATIO = 0.1  # smallest pivot, relative to the largest entry in its column
-MAX_SPARSE_RATIO = 0.5  # largest number of subtractions of sparse factors, relative to that of dense factors
-MAX_SPARSE_ROWS = 3  # with at most this number of rows, factors are sparse whatever the number of subtractions
-ZERO_PIVOT = 1e-11  # largest pivot that counts as zero, relative to the largest pivot so far
-# a program of r rows has at most MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r subtractions, for which memory is
-# allocated; if more are needed, factors are dense
+MAX_SPARSE_RATIO = 0.5  # sparse factors are used if they need at most this share of the subtractions of dense factors
+MAX_SPARSE_ROWS = 3  # up to this number of rows, factors are sparse whatever the number of subtractions
+ZERO_PIVOT = 1e-11  # pivots count as zero up to this fraction of the largest pivot so far
+# memory is allocated for MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r subtractions in a program of r rows; if more are
+# needed, factors are dense
 MIN_SUBTRACTIONS, SUBTRACTIONS_PER_ROW = 2000, 100
 MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or column of sparse factors; with more, they are dense
 
-ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last: use dense factors
+ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last means: use dense factors
 
 # indices in `index`. SIZE: number of rows r. DENSE: 1 if the factors are dense. SIGN: sign of the permutations (1, -1).
 # N_SLOTS: number of entries of the factors. FIRST_LOWER: first entry of L. WIDTH: number of columns of the Jacobian.
@@ -80,19 +80,19 @@ def row_exchanges_of(index):
 
 @merged
 def index_of_upper_begins(r):
-    """Return the position in `index` of the list that has the first entry of each row of U."""
+    """Return the position in `index` of the list that tells the first entry of each row of U."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return the position in `index` of the list that has the end of each row of U."""
+    """Return the position in `index` of the list that tells the end of each row of U."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return the position in `index` of the list that has the first entry of each row of L, and the end of L."""
+    """Return the position in `index` of the list that tells the first entry of each row of L, and the end of L."""
     return N_HEAD + 5 * r
 
 
@@ -104,7 +104,7 @@ def index_of_entries(r):
 
 @inlined
 def views_of_lists(index, values):
-    """Return views of both arrays for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
+    """Return three views, to choose an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
 
     w is the largest number of entries in a row or column.
     """
@@ -143,8 +143,8 @@ def put_entry(matrix, i, j, number, source):
 def _choose_pivot(matrix, rows, columns, k):
     """Return row and column of pivot k; (-1, -1) if no entry is large enough.
 
-    Among the entries that are large enough, see MIN_PIVOT_RATIO, the pivot causes the least fill-in. Of entries with
-    equal fill-in, the largest is chosen; of equally large entries, the first in the order so far.
+    Among the entries that are large enough, see MIN_PIVOT_RATIO, the pivot causes the least fill-in. If several cause
+    equal fill-in, the largest of them is chosen; among equally large ones, the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -184,8 +184,8 @@ def _exchange(order, position, k, chosen):
 def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
     """Subtract from column j the multiple of the pivot column that removes entry (row, j).
 
-    `row` and `column` are the pivot row and the pivot column, `pivot` is the entry there. Fill-in entries get the
-    source `zero_source`. Returns False if there is no space for a fill-in entry.
+    `row` and `column` are the pivot row and the pivot column, `pivot` is the entry in both. Fill-in entries get the
+    source `zero_source`. Return False if there is no space for a fill-in entry.
     """
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
@@ -214,9 +214,9 @@ def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
 def choose_order(index, matrix, zero_source, zero_ratio):
     """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a code.
 
-    Fill-in entries get the source `zero_source`, the index of a zero. A pivot of at most `zero_ratio` times the largest
-    one so far counts as zero. The code is ORDER_CHOSEN, SINGULAR_MATRIX or TOO_MANY_ENTRIES; only with ORDER_CHOSEN,
-    `index` is complete.
+    Fill-in entries get the source `zero_source`, the index of a zero. A pivot counts as zero up to `zero_ratio` times
+    the largest pivot so far. The code is ORDER_CHOSEN, SINGULAR_MATRIX or TOO_MANY_ENTRIES; `index` is complete only
+    if it is ORDER_CHOSEN.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
@@ -260,7 +260,7 @@ def _sort_row(columns, sources, size, position):
 def _sort_and_count(rows, counts, lists):
     """Sort the lists of the rows by the order of elimination; return the numbers of entries and of subtractions.
 
-    In counts[ACTIVE_ROW_SIZE], stores the number of entries of each row of U, in the order of elimination.
+    Store in counts[ACTIVE_ROW_SIZE] the number of entries of each row of U, in the order of elimination.
     """
     position = counts[COLUMN_POSITION]
     entries, subtractions = 0, 0
@@ -278,7 +278,7 @@ def _sort_and_count(rows, counts, lists):
 
 @compiled
 def _store_program(index, counts, lists):
-    """Store the program in `index` and return True; store nothing and return False if dense factors are faster."""
+    """Store the program in `index` and return True; or, if dense factors are faster, store nothing and return False."""
     r = index[SIZE]
     rows = rows_of(index)
     n_slots, subtractions = _sort_and_count(rows, counts, lists)
@@ -319,7 +319,7 @@ def _store_program(index, counts, lists):
     return True
 
 
-# largest |multiplier| of an accurate elimination; beyond this limit, another order of elimination is chosen
+# largest |multiplier| of an accurate elimination; above this limit, another order of elimination is chosen
 MAX_MULTIPLIER = 1e3
 
 
@@ -357,8 +357,8 @@ def make_program(G, pattern, rows, columns, index, values):
 def factor(entries, index, values):
     """Store in `values` the factors of G[rows][:, columns], 1/pivot on the diagonal; return min|pivot| / max|pivot|.
 
-    `entries` is G, with a last row of zeros, as a vector. A negative result (0 from dense factors) means that a pivot
-    is zero or not finite, or that a multiplier exceeds MAX_MULTIPLIER: another order of elimination must be chosen.
+    `entries` is G, with a last row of zeros, as a vector. If a pivot is zero or not finite, or if a multiplier exceeds
+    MAX_MULTIPLIER, the result is negative (0 for dense factors): then another order of elimination must be chosen.
     """
     r = index[SIZE]
     if index[DENSE] == 1:
@@ -423,7 +423,7 @@ def determinant_sign(index, values):
 
 @merged
 def solve(index, values, x):
-    """Replace x, the right-hand side in the order of rows_of, by the solution, in the order of columns_of."""
+    """Replace the right-hand side x, in the order of rows_of, by the solution, in the order of columns_of."""
     r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), row_exchanges_of(index), x)
@@ -446,7 +446,7 @@ def solve_rows(index, values, X, n):
 
 @merged
 def solve_transposed(index, values, x):
-    """Replace x, a right-hand side in the order of columns_of, by the solution with the transposed matrix."""
+    """Replace x, a right-hand side in the order of columns_of, by the solution for the transposed matrix."""
     r = index[SIZE]
     if index[DENSE] == 1:
         A, pivots = values[: r * r].reshape((r, r)), row_exchanges_of(index)

@@ -9,14 +9,14 @@ from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ld
 
 # rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# a row is orthogonalised again if the squared norm of its orthogonal part is below this fraction of that of the row
+# a row is orthogonalised again if the squared norm of its orthogonal part is below this fraction of its squared norm
 REORTHOGONALISE_BELOW = 0.5
 
 
 @compiled
 def _dot(x, y):
     whole = x.size - x.size % 4
-    a = b = c = d = 0.0  # four sums, so that an addition need not wait for the one before
+    a = b = c = d = 0.0  # four sums, so that an addition need not wait for the previous one
     for j in range(0, whole, 4):
         a += x[j] * y[j]
         b += x[j + 1] * y[j + 1]
@@ -31,7 +31,7 @@ def _dot(x, y):
 def _orthogonalise(basis, n, remainder, components):
     """Subtract from `remainder` its components along the first n rows of `basis`; return |remainder|^2.
 
-    The rows of `basis` are orthonormal. Adds the components to `components`.
+    The rows of `basis` are orthonormal. Add these components to `components`.
     """
     for i in range(n):
         component = _dot(basis[i], remainder)
@@ -48,8 +48,8 @@ def select_rows(G, min_sine, basis, factors, kept):
 
     A row is independent if the sine of its angle to the selected rows exceeds `min_sine`. Its orthogonal part is
     computed by Gram-Schmidt orthogonalisation, which is repeated if most of the row is lost. On return, the rows of
-    `basis` are orthonormal, and the selected rows are the lower triangle `factors` times `basis`. Both arrays have as
-    many rows as can be independent, and one more for scratch.
+    `basis` are orthonormal, and the selected rows are the lower triangle `factors` times `basis`. Both arrays have one
+    row for each row that may be independent, and one more for scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -75,7 +75,7 @@ def select_rows(G, min_sine, basis, factors, kept):
 
 @kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
 def independent_rows(G, min_sine, basis, factors, kept):
-    """Return the result of `select_rows`, as a kernel that Python can call."""
+    """Return the result of `select_rows`; this kernel exists because Python cannot call `select_rows` itself."""
     return select_rows(G, min_sine, basis, factors, kept)
 
 
@@ -132,7 +132,7 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
 def singular_values_exceed(rows, ratio, gram):
     """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one, s.
 
-    They do if rows rows^T - (ratio s)^2 I is definite, with the Frobenius norm as a bound of s. `gram` is scratch.
+    This is so if rows rows^T - (ratio s)^2 I is definite; the Frobenius norm, a bound of s, is used. `gram`: scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
@@ -144,23 +144,23 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # largest rounding error of a pivot, relative to the bound with which it is compared
+BOUND_ROUNDING = 1e-12  # largest rounding error of a pivot, relative to the bound that the pivot is compared with
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
-# SIMILAR_EIGENVALUES: ratio of the smallest to the largest eigenvalue of M above which no row is added to M, and the
-# pivots of S = G M^-1 G^T decide which rows are independent. If a pivot is above INDEPENDENT, the part of the row that
-# is orthogonal to the rows before it is at least 3e-9 of the row; for a dependent row, this part must be at most
+# if the ratio of the smallest to the largest eigenvalue of M exceeds SIMILAR_EIGENVALUES, no row is added to M, and the
+# pivots of S = G M^-1 G^T decide which rows are independent. If a pivot exceeds INDEPENDENT, the part of the row that
+# is orthogonal to the previous rows is at least 3e-9 of the row; for a dependent row, this part must be at most
 # DEPENDENT
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
-# an independent row and a redundant row, both scaled to norm 1, are exchanged if the coefficient of the first in the
-# second exceeds this. If a coefficient passes through zero during the motion, the independent rows become dependent, as
-# at each dead centre of the slider-crank with two rods: rows with large coefficients should be independent. The limit
-# exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
+# a redundant row is a combination of independent rows; an independent row is exchanged with it if its coefficient (rows
+# scaled to norm 1) exceeds this limit. Where a coefficient passes through zero, the independent rows become dependent,
+# as at each dead centre of the slider-crank with two rods; so rows with large coefficients should be independent. The
+# limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
 MAX_COEFFICIENT = 1.5
-# if the ratio of two coefficients is at most this, they count as equal, and the first row is chosen: in symmetrical
-# mechanisms, rounding would choose among many equal coefficients, differently at each start
+# up to this ratio, two coefficients count as equal, and the first row is chosen: in symmetrical mechanisms, rounding
+# would choose among many equal coefficients, differently at each start
 TIE_RATIO = 1.01
-# largest entry of a row, relative to its largest entry, that counts as zero: rounding of a start leaves such entries
+# entries count as zero up to this fraction of the largest entry of their row: rounding of a start leaves such entries
 ZERO_ENTRY = 1e-12
 
 
@@ -190,7 +190,7 @@ def _factor_and_count_negative(A):
 
 @compiled
 def _eigenvalue_bounds(mass):
-    """Return bounds of the eigenvalues of M, below the smallest and above the largest, by Gershgorin's circles."""
+    """Return a lower and an upper bound of the eigenvalues of M, by Gershgorin's circles."""
     smallest, largest = math.inf, 0.0
     for i in range(len(mass)):
         row_sum = 0.0
@@ -215,7 +215,7 @@ def _count_weak_eigenvalues(mass, weak_ratio, A):
 
 @merged
 def _scale_of_added_rows(mass, G):
-    """Return the power of two s for which the largest entries of s G^T G and M are about equal."""
+    """Return the power of two s that makes the largest entries of s G^T G and M about equal."""
     largest, largest_of_rows = largest_of(mass.reshape(mass.size)), largest_of(G.reshape(G.size))
     return 2.0 ** math.floor(math.log2(largest / (largest_of_rows * largest_of_rows)) + 0.5)
 
@@ -235,7 +235,7 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return whether adding scale g g^T to the matrix with the factors A reduces its number of negative eigenvalues.
+    """Return whether adding scale g g^T to a matrix with the factors A reduces its number of negative eigenvalues.
 
     This is so if the determinant changes its sign. `x` is scratch.
     """
@@ -253,8 +253,8 @@ def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
     """Add scale g g^T to M in place, for rows g of G, until all eigenvalues of M are large enough.
 
     An eigenvalue is too small if it is less than `weak_ratio` times the largest one. Rows are tried in the sequence
-    `order`; the index of an added row is replaced by -1. Stores the indices of the added rows in `added`; returns their
-    number, or STAYS_SINGULAR.
+    `order`, in which -1 replaces the index of an added row. Store the indices of the added rows in `added`; return
+    their number, or STAYS_SINGULAR.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
@@ -291,7 +291,7 @@ def _exchange_rows(C, is_kept, kept):
 
     C[i, k] is the coefficient of the independent row k in the redundant row i, all rows scaled to norm 1; `is_kept` is
     1 for independent rows. Each exchange multiplies the volume that the independent rows span by the coefficient.
-    Stores the indices of the independent rows in `kept`, and returns their number.
+    Store the indices of the independent rows in `kept`, and return their number.
     """
     n = len(C)
     n_kept = _list_rows(is_kept, kept)
@@ -306,7 +306,7 @@ def _exchange_rows(C, is_kept, kept):
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
             break
-        # solve the equation of the entering row for the leaving row, and insert it into the other redundant rows
+        # solve the equation of the entering row for the leaving row; insert the result into the other redundant rows
         inverse = 1.0 / C[entering, leaving]
         is_kept[leaving], is_kept[entering] = 0, 1
         for k in range(n):
@@ -351,9 +351,9 @@ def _fill_scaled_products(mass, G, factors, solved, S, sizes):
 
 @compiled
 def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
-    """Set `is_kept` to 0 for each row that depends on the rows before it, else to 1; return the largest 1 / pivot.
+    """Set `is_kept` to 0 for each row that depends on previous rows, else to 1; return the largest 1 / pivot.
 
-    Returns 0 if a row is neither dependent nor independent beyond doubt.
+    Return 0 if it is uncertain whether a row is dependent or independent.
     For S and `sizes` see `_fill_scaled_products`. C[i, k] receives the coefficient of row k in a dependent row i, both
     scaled to norm 1. U and `remainder` are scratch.
     """
@@ -402,11 +402,11 @@ def _fill_shifted(S, kept, shift, shifted):
 
 @compiled
 def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch):
-    """Return the index of the first entry of `bounds` below all pivots of the rows `kept`; bounds.size if none is.
+    """Return the index of the first of `bounds` that is below all pivots of the rows `kept`; bounds.size if none is.
 
     Pivots are relative to the diagonal entries of G M^-1 G^T. No pivot is below the smallest eigenvalue of S, which is
-    scaled to a diagonal of 1, and this eigenvalue exceeds a bound b if S - b I is positive definite. It is at most the
-    smallest pivot of S, 1 / `largest_inverse` (0: unknown): larger bounds need no test.
+    scaled to a diagonal of 1; and this eigenvalue exceeds a bound b if S - b I is positive definite. The eigenvalue is
+    at most the smallest pivot of S, 1 / `largest_inverse` (0: unknown), so that larger bounds need no test.
     """
     shifted = scratch[: n_kept * n_kept].reshape((n_kept, n_kept))
     if largest_inverse == 0.0:
@@ -448,10 +448,10 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
     """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; return an index or a code.
 
     Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Rows are added to
-    M if it has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: no rows are added. `chosen`, of
+    M if M has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: no rows are added. `chosen`, of
     2 + 3 n_rows numbers, receives the number of independent rows, the number of added rows, and the indices of both in
     two lists of length n_rows. `workspace` is scratch, but workspace[0] receives the factor s of the added s g g^T.
-    Returns the result of `_first_bound_below_pivots`, or STAYS_SINGULAR. See generate/elimination.py.
+    Return the result of `_first_bound_below_pivots`, or STAYS_SINGULAR. See generate/elimination.py.
     """
     n_rows, n = G.shape
     n_max = min(n_rows, n) + 1
@@ -473,9 +473,9 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
         largest_inverse = _find_dependent_rows(S, G, sizes, U, C, x, order)
     if largest_inverse > 0.0:
         chosen[0] = n_kept = _exchange_rows(C, order, kept)
-        largest_inverse = largest_inverse if n_kept == n_rows else 0.0  # unknown if rows were exchanged
+        largest_inverse = largest_inverse if n_kept == n_rows else 0.0  # 0: unknown, because rows may be exchanged
         first_bound = _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
-        if first_bound < bounds.size:  # the chosen rows are independent beyond doubt
+        if first_bound < bounds.size:  # the chosen rows are certainly independent
             return first_bound
     _select_dependent_rows(G, min_sine, basis, factors, sizes, C, kept, order)
     chosen[0] = n_kept = _exchange_rows(C, order, kept)

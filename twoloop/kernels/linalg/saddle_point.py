@@ -5,6 +5,7 @@
   (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
 - MULTIPLIERS: by the Schur complement G M^-1 G^T.
 - AUGMENTED: by sparse factors of the augmented matrix [M G^T; G 0], in which M is multiplied by w.mass_scale.
+
 """
 
 import numpy as np
@@ -49,7 +50,7 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 @compiled
 def find_null_space(w):
-    """Store the null space of G in w.D, from the rows and factors in w; leave the last row of w.D, see Work."""
+    """Store the null space of G in w.D, computed from rows and factors in w; keep the last row of w.D, see Work."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -116,7 +117,7 @@ def solve_by_reduced_mass(f, w, r, c, a):
         z[k] = c[rows[k]]
     solve_dependent(w.index_v, w.values_v, z)
     copy(r, a)
-    # `a` becomes r - M g, where g has the dependent entries z, and zero independent entries
+    # `a` becomes r - M g; dependent entries of g are z, independent entries are 0
     for k in range(columns.size):
         column = columns[k]
         if f.diagonal_mass == 1:
@@ -141,7 +142,7 @@ def solve_by_reduced_mass(f, w, r, c, a):
 
 @merged
 def multipliers_by_elimination(f, w, r, a, lam):
-    """Store the multipliers of the independent rows in lam, from G^T lam = r - M a in the dependent columns."""
+    """Store the multipliers of the independent rows in lam, by solving the dependent columns of G^T lam = r - M a."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         column = columns[k]
@@ -172,13 +173,13 @@ def factor_mass(f, w):
 
 @merged
 def _apply_inverse_mass(f, w, x, y):
-    """Store M^-1 x in y, by w.L; x and y may be the same array unless M is constant, dense and not diagonal."""
+    """Store M^-1 x in y, by w.L; unless M is constant, dense and not diagonal, x and y may be the same array."""
     n = x.size
     if f.diagonal_mass == 1:
         for i in range(n):
             y[i] = x[i] * w.L[i, i]
     elif f.constant_mass == 1 and not has_banded_mass(f):
-        sum_rows(x, w.L, y)  # the inverse is symmetric, and sums of rows are vectorised, unlike sums over j
+        sum_rows(x, w.L, y)  # the inverse is symmetric; sums of rows are vectorised, sums of products would not be
     else:
         copy(x, y)
         if has_banded_mass(f):
@@ -238,7 +239,7 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-MIN_ROWS = 8  # the augmented form is fastest if there are at least this many rows and degrees of freedom (measured: 7)
+MIN_ROWS = 8  # the augmented form is fastest from this number of rows, and of degrees of freedom, on (measured: 7)
 # from this number of coordinates on, the augmented form is always fastest, unless M is diagonal (measured: about 30)
 MIN_COORDINATES = 32
 
@@ -259,7 +260,7 @@ def _largest_entry(A):
 
 @compiled
 def _write_augmented_program(w):
-    """Store in w.index_a the program that factors the augmented matrix [M G^T; G 0]; return choose_order's code."""
+    """Store the program that factors the augmented matrix [M G^T; G 0] in w.index_a; return a code of choose_order."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     update_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
@@ -282,7 +283,7 @@ def _write_augmented_program(w):
 
 @compiled
 def _run_augmented_program(w):
-    """Store the factors of the augmented matrix in w.values_a; return False if the program does not suit it."""
+    """Store the factors of the augmented matrix in w.values_a; return False if the program does not suit the matrix."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.mass_scale, w.entries.size
     source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
