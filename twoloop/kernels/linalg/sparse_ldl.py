@@ -1,15 +1,15 @@
 """Factor and solve the matrix [M G^T; G 0] of a large system by a program, see symbolic_factorization.py.
 
 An independent row of G has a negative pivot: minus the squared norm of the part of the row that is orthogonal to
-previous rows, in the metric of M^-1. The squared norm of the row is the sum of the contributions of the bodies. The
-ratio of these two squared norms is the squared sine of the angle between the row and the previous rows. For a redundant
+previous rows, in the metric of M^-1. The squared norm of the row itself is the sum of contributions of the bodies. The
+ratio of the two squared norms is the squared sine of the angle between the row and the previous rows. For a redundant
 row, 0 replaces 1 / pivot, which removes the row from the solution without another program. If the smallest squared sine
 is 10^-k, solutions lose k digits, which refinement with M and G recovers.
 
-If a body's M is singular, as with four Euler parameters, rows g that involve this body alone stiffen M: M + s g g^T
+If a body's M is singular, as it is with four Euler parameters, rows g of this body alone stiffen M: M + s g g^T
 replaces M. This does not change accelerations, because g a is prescribed; the multiplier of g decreases by s g a. So M
-need only be positive definite on the velocities that these rows allow. A redundant row, as in loops through a hub,
-stiffens M, too; then s g^T (g a) is added to the right-hand side.
+need only be positive definite on the velocities that these rows allow. A redundant row, as it occurs in loops through a
+hub, may stiffen M, too; then s g^T (g a) is added to the right-hand side.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -24,12 +24,12 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     update_runs_of,
 )
 
-NOT_DEFINITE = -1.0  # value that `factor` returns instead of the smallest squared sine if a pivot of M is not positive
+NOT_DEFINITE = -1.0  # `factor` returns this in place of the smallest squared sine if a pivot of M is not positive
 
 
 @compiled
 def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Store in `stiffness`, for each row g that stiffens M, s = m / |g|^2; m: largest M_jj of the columns j of g."""
+    """Store s = m / |g|^2 in `stiffness` for each row g that stiffens M; m: largest M_jj of the columns j of g."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -55,7 +55,7 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def load_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store the entries of G and the stiffened M in the slots in `values`; `scratch` has one number per pivot."""
+    """Store the entries of G and of the stiffened M in their slots in `values`; `scratch` has one number per pivot."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_entries_of(program)
@@ -75,9 +75,9 @@ def load_matrix(program, mass, jacobian, values, stiffness, scratch):
 def factor(program, is_independent, values, sizes, min_sine_square):
     """Replace the matrix in `values` by its factors, with 1/pivot on the diagonal; return the smallest squared sine.
 
-    The squared sine of a row is minus its pivot over its squared norm, stored in `sizes`. `is_independent` is 0
-    for redundant rows, and is set to 0 for rows with a squared sine up to `min_sine_square`; these rows do not affect
-    the result. Returns NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
+    The squared sine of a row is minus its pivot over its squared norm, which is stored in `sizes`. `is_independent` is
+    0 for redundant rows, and becomes 0 for rows with a squared sine up to `min_sine_square`; these rows do not affect
+    the result. Return NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)
@@ -128,8 +128,8 @@ def factor(program, is_independent, values, sizes, min_sine_square):
 def solve(program, values, stiffness, x, y):
     """Replace the right-hand side x = [r, c] by the solution [a, lam], with the factors `values`; y is scratch."""
     n, order, n_q = program[N_PIVOTS], pivot_order_of(program), program[N_COORDINATES]
-    # with M + s g g^T in place of M, the right-hand side should be r + s g c. With r alone, accelerations are the same,
-    # because g a = c, but the multiplier of g is smaller by s c; the last loop adds s c
+    # with M + s g g^T in place of M, r should become r + s g c. If r stays the same, so do accelerations, because
+    # g a = c, but the multiplier of g is smaller by s c; the last loop adds s c
     begin, row_of = factor_columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -161,7 +161,7 @@ def add_redundant_stiffness(program, jacobian, is_independent, stiffness, c, rig
 
 @compiled
 def subtract_product(program, mass, jacobian, is_independent, x, b):
-    """Subtract [M x_q + G^T x_c, G x_q], for x = [x_q, x_c], from b in place; set b to zero in redundant rows."""
+    """Subtract [M x_q + G^T x_c, G x_q], where x = [x_q, x_c], from b in place; set b to zero in redundant rows."""
     n_q = program[N_COORDINATES]
     rows, columns, _ = mass_entries_of(program)
     for k in range(rows.size):
@@ -180,7 +180,7 @@ def subtract_product(program, mass, jacobian, is_independent, x, b):
 def solve_refined(program, mass, jacobian, is_independent, values, stiffness, x, n_corrections, right, residual, y):
     """Replace the right-hand side x = [r, c] by the solution [a, lam], corrected `n_corrections` times by refinement.
 
-    Returns max|a| of the last correction over max|a|; 0 without corrections. The last three arguments are scratch.
+    Return the last correction of a, relative to max|a|; 0: no corrections. The last three arguments are scratch.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):

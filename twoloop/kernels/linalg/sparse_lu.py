@@ -3,10 +3,10 @@
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
 
-The order of elimination is chosen by symbolic_factorization.py with couplings; pivots are single entries, chosen by the
-pattern alone. The program lists the entries of M, then of K and D. It ends with groups of columns of K and
-D: no two columns of a group have an entry in the same row, so that one displacement gives all columns of the group by
-differences (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
+symbolic_factorization.py chooses the order of elimination, by the pattern alone; its argument `couplings` contains the
+entries of K and D. Pivots are single entries. The program lists the entries of M, then of K and D, and ends with groups
+of columns of K and D: no two columns of a group have an entry in the same row, so that one displacement yields all
+columns of the group by differences (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,7 +32,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     update_runs_of,
 )
 
-MIN_PIVOT = 1e-11  # smaller pivots, relative to the sum of their |terms|, may be rounding errors of zero
+MIN_PIVOT = 1e-11  # pivots below this fraction of the sum of their |terms| may be rounding errors of zero
 
 
 def newton_program(
@@ -46,7 +46,7 @@ def newton_program(
 ) -> NDArray[np.int32] | None:
     """Return the program that factors Newton's matrix; None if the program would have too many updates.
 
-    `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`.
+    `tangents`: the entries of K and D, both triangles, in the order of `grouped_entries`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
     group_begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
@@ -63,12 +63,12 @@ def grouped_entries(tangents: Entries, n_q: int) -> Entries:
 
 
 def column_groups(entries: Entries, n_q: int) -> Integers:
-    """Return the index of the group of each column (n_q); the columns of a group have no entry in the same row."""
+    """Return the index of the group of each column (n_q); no two columns of a group have an entry in the same row."""
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
     for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
     groups = np.zeros(n_q, dtype=np.int64)
-    # groups of the columns with an entry in each row
+    # for each row: the groups that already have a column with an entry in this row
     groups_by_row: list[set[int]] = [set() for _ in range(n_q)]
     for j, rows in enumerate(rows_of):
         groups_in_rows = set().union(*(groups_by_row[i] for i in rows))
@@ -82,7 +82,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 def tangent_entries_of(program):
     """Return the rows and the columns of the entries of K and D, and the index of the first entry of each column group.
 
-    The columns of a group are differenced together. The last index is the number of entries.
+    One displacement yields all columns of a group. The last index is the number of entries.
     """
     group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
@@ -92,7 +92,7 @@ def tangent_entries_of(program):
 
 @compiled
 def load_matrix(program, mass, jacobian, K, D, z, stiffness, values):
-    """Store Newton's matrix for z (real or complex) in the slots in `values`, from the entries of M, G, K and D."""
+    """Store Newton's matrix for z (real or complex) in its slots in `values`, from the entries of M, G, K and D."""
     for s in range(values.size):
         values[s] = 0.0
     n_off = program[N_OFF_DIAGONAL]

@@ -4,15 +4,15 @@
     [G   0 ]  = L D L^T
 
 is factored in an order of elimination that is chosen once, by the pattern of entries alone. Pivots are single entries:
-see sparse_ldl.py and sparse_lu.py. A slot is the index of a number of the factors: the pivots come first, in their
+see sparse_ldl.py and sparse_lu.py. A "slot" is the index of a number of the factors: the pivots come first, in their
 order, then the columns of L, each downwards.
 
 Coordinates that M couples, or that the system declares as a group, form a body; the rows that involve the same bodies
 form a joint. Bodies with few joints are eliminated first. G M^-1 G^T remains, which is positive definite, so that any
 order of its joints is stable. A body with more joints, a hub, would couple all these joints, and is ordered among the
-joints, by constrained minimum degree. Before a hub, a joint that involves the hub directly or through eliminated joints
-may be eliminated only if its rows are independent without the motion of the hub: one of its bodies must have no support
-yet. A support of a body is the ground or a hub to which eliminated joints connect the body.
+joints, by constrained minimum degree. A joint may involve a hub, directly or through eliminated joints. It may be
+eliminated before this hub only if its rows are independent without the motion of the hub: one of its bodies must have
+no support yet. A support of a body is the ground, or a hub, to which eliminated joints connect the body.
 """
 
 import heapq
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MAX_JOINTS = 4  # largest number of joints of a body that is eliminated before its joints; with more, it is a hub
+MAX_JOINTS = 4  # a body with at most this number of joints is eliminated before its joints; with more, it is a hub
 
 Integers = NDArray[np.int64]
 
@@ -50,11 +50,11 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Supports (ground, hubs not eliminated yet) of each part, that is, of bodies connected by eliminated joints."""
+    """Supports (ground, hubs not eliminated yet) of each part: a set of bodies that eliminated joints connect."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        # bodies with a single coordinate: a joint with one of these may fix a part to the ground
+        # bodies with a single coordinate, to which a joint may fix a part as to the ground
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
@@ -63,7 +63,7 @@ class _PartSupports:
         self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def can_eliminate(self, joint: int) -> bool:
-        """Return whether a joint may be eliminated next: its rows must be independent, see the module's docstring."""
+        """Return whether a joint may be eliminated next, see the module's docstring."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone_bodies and any(not self.is_grounded[p] and not self.hubs_by_part[p] for p in parts):
@@ -87,7 +87,7 @@ class _PartSupports:
     def _merge_parts(self, bodies: Iterable[int], is_grounded: bool, hubs: AbstractSet[int]) -> None:
         """Merge the parts (bodies connected by eliminated joints) that contain `bodies`.
 
-        The merged part is also supported by `hubs`, and by the ground if `is_grounded`.
+        The `hubs` also support the merged part, and so does the ground if `is_grounded`.
         """
         first, *others = bodies
         part = self.parts.find(first)
@@ -122,8 +122,8 @@ def elimination_order(
     body_groups : iterable of sequence of int
         Groups of coordinates that form one body each, even if M does not couple them.
     early_rows : sequence of int
-        Rows of single bodies. Unless the body is a hub, they are eliminated before all joints, so that no dependence on
-        other rows makes their pivots small.
+        Rows of single bodies. Unless the body is a hub, its rows are eliminated before all joints, so that a dependence
+        on other rows cannot make their pivots small.
     couplings : (rows, columns), optional
         Entries of K and D, which couple bodies as springs do. All bodies are then hubs, each with its `early_rows`.
     """
@@ -192,8 +192,8 @@ def _minimum_degree_order(
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    Of the joints and hubs that may be eliminated, the one with the fewest rows and coordinates in its neighbours is
-    next. `pairs`: pairs of hubs that are coupled other than by joints. `lone_bodies`: see `_PartSupports`.
+    Among the joints and hubs that may be eliminated, the next is the one whose neighbours have the fewest rows and
+    coordinates. `pairs`: pairs of hubs with another coupling than a joint. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -222,9 +222,9 @@ def _minimum_degree_order(
     while heap:
         degree_on_heap, node = heapq.heappop(heap)
         if is_eliminated[node] or degree_on_heap != degree(node):
-            continue  # a newer entry of the heap replaces this one
+            continue  # this entry of the heap is outdated: a newer one replaces it
         if node < n_joints and not supports.can_eliminate(node):
-            continue  # a hub that supports its parts is a neighbour, and pushes the joint again when it is eliminated
+            continue  # a hub must be eliminated first; its elimination puts this joint, a neighbour, on the heap again
         is_eliminated[node] = True
         order.append(node)
         affected_nodes = neighbours[node]
@@ -242,12 +242,12 @@ def _minimum_degree_order(
 
 Entries = tuple[Integers, Integers]  # row indices and column indices of the nonzero entries of a matrix
 
-# indices of the sizes with which a program begins; functions at the end of this module return its other sections
+# a program begins with sizes, which have these indices; functions at the end of this module return its other sections
 N_COORDINATES, N_PIVOTS, N_OFF_DIAGONAL, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
-ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program with at most this many updates (multiplications) is always written
-# longer programs have at most this many updates per n^3, for n pivots: with more, dense factors are faster
+ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program with at most this number of updates (multiplications) is always written
+# a longer program is written if it has at most MAX_UPDATE_RATIO n^3 updates for n pivots: else dense factors are faster
 MAX_UPDATE_RATIO = 1e-3
-MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer one takes too much memory
+MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer program takes too much memory
 
 
 def factorization_program(
@@ -260,7 +260,7 @@ def factorization_program(
 ) -> NDArray[np.int32] | None:
     """Return the program that factors M and G; None if the program would have too many updates.
 
-    mass, jacobian : entries of M, both triangles, and of G. If an entry occurs more than once, its numbers are added.
+    mass, jacobian : entries of M, both triangles, and of G. If an entry is listed repeatedly, its numbers are added.
     body_groups : groups of coordinates that form one body each, even if M does not couple them.
     stiff_rows : rows g along which M is to be stiffened by a multiple of g g^T; M must have the entries of g g^T.
     """
@@ -273,7 +273,7 @@ def program_in_order(
 ) -> NDArray[np.int32] | None:
     """Return the program for an order of elimination; None if the program would have too many updates.
 
-    `unsymmetric`: factors also contain U; its entry (i, j) has the slot of (j, i) of L plus program[N_OFF_DIAGONAL].
+    `unsymmetric`: factors also contain U; entry (i, j) of U has the slot of (j, i) of L, plus program[N_OFF_DIAGONAL].
     """
     n = len(order)
     position = np.empty(n, dtype=np.int64)
@@ -318,7 +318,7 @@ def program_in_order(
 
 
 def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Return [length, first target] of each run: off-diagonal updates whose target slots follow one another.
+    """Return [length, first target] of each "run" of off-diagonal updates with consecutive target slots.
 
     The rows of a joint are adjacent in all columns, so that runs are long: the numbers of a run are read and written as
     vectors, and the program is a tenth as long as a list of all targets.
@@ -330,7 +330,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return, for each product of two entries of one of the rows `chosen`, the row and the indices of both entries."""
+    """Return, for all products of two entries of a row in `chosen`, the rows and the indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
@@ -386,7 +386,7 @@ def pivot_order_of(program):
 
 @inlined
 def factor_columns_of(program):
-    """Return the index of the first entry of each column of L, with the end as last index, and the row of each entry.
+    """Return the index of the first entry of each column of L (and, last, of the end), and the row of each entry.
 
     Rows are numbered in the order of elimination.
     """
@@ -397,7 +397,7 @@ def factor_columns_of(program):
 
 @inlined
 def update_runs_of(program):
-    """Return [length, first slot] of the runs of off-diagonal updates, in the order in which `factor` uses them."""
+    """Return [length, first slot] of the runs of off-diagonal updates, in the order of their use by `factor`."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
     return program[begin : begin + program[N_RUNS]]
 

@@ -1,8 +1,9 @@
 """Attempt steps by backward differentiation formulas of orders 1 to 5 for (q_i, v_i), with a fixed-point outer loop.
 
 The history consists of modified divided differences (Krogh), scaled to the step size as in DASSL and IDA (fixed leading
-coefficient), so that the step size can change in every step. With equal steps they are backward differences. They are
-stored for all coordinates (q, v), including the dependent ones, so that a new partition needs no conversion.
+coefficient), so that the step size can change in every step. With equal steps, they are backward differences. They are
+stored for all coordinates (q, v), including dependent ones, so that a new partition needs no conversion. `f` is the
+kit, `w` the workspace.
 """
 
 from typing import Any
@@ -22,12 +23,12 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-SAFETY = 0.9  # safety factor on the step size after a rejected step, and smallest ratio after an accepted step
+SAFETY = 0.9  # safety factor on the step size after a rejected step, and smallest size ratio after an accepted step
 MIN_STEP_FACTOR = 0.2  # smallest step-size ratio after a rejected step, or after a step far from its prediction
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
-STEP_SIZE_FACTOR = 6.0  # additional factor on the error that determines the next step size, to avoid rejections (VODE)
+STEP_SIZE_FACTOR = 6.0  # further factor on the error in the choice of the next step size, to avoid rejections (VODE)
 ORDER_FACTOR = 1.4  # factor on the error estimates of other orders, so that the order rarely changes to and fro
-MIN_INCREASE = 1.2  # smallest increase of the step size, as a ratio; if it would be smaller, the step size is kept
+MIN_INCREASE = 1.2  # the step size is kept if it could grow by less than this factor
 MAX_INCREASE = 2.0  # largest ratio of successive step sizes
 
 # indices in `options` of the scalars, which precede the options of the Gauss steps
@@ -36,14 +37,14 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
 (
     HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
     ORDER,
-    DEPTH,  # order of the highest difference in the history
+    DEPTH,  # highest order of a difference in the history
     AGE,  # number of accepted steps since the last change of order or the last rejected step
     NEXT_ORDER,
     NEXT_DEPTH,
     N_MEMORY_SCALARS,
 ) = range(7)
 # indices of rows of coefficients. SPANS: times (s) from earlier points of the history to its last point. NEW_SPANS:
-# times (s) from all points of the history to the end of the step. ERROR_CONSTANTS: error constants of orders 0, 1, ...
+# times (s) from all points of the history to the end of the step. ERROR_CONSTANTS: for the orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -83,7 +84,7 @@ def _history_views(memory, n):
 
 @kernel(COMMIT)
 def commit_bdf(f, w, options, memory, tolerances, accepted):
-    """Set ORDER to NEXT_ORDER; if the attempt was accepted, also replace the history by the trial differences."""
+    """Set ORDER to NEXT_ORDER; if the attempted step was accepted, the trial differences become the history."""
     differences, trial, _, _, _ = _history_views(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -147,7 +148,7 @@ def _predict_state(memory, differences, trial, h, prediction, rate):
 
 @merged
 def _corrector_coefficient(h, k):
-    """Return the coefficient c = h / (1 + 1/2 + ... + 1/k), s, of the corrector of order k, see `_correct_state`."""
+    """Return the coefficient c = h / (1 + 1/2 + ... + 1/k) (in s) of the corrector of order k, see `_correct_state`."""
     harmonic_sum = 0.0
     for j in range(k):
         harmonic_sum += 1.0 / (j + 1.0)
@@ -163,7 +164,7 @@ def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    copy(prediction, new_state[: 2 * n])  # entries of dependent coordinates: start values of Newton's method
+    copy(prediction, new_state[: 2 * n])  # for dependent coordinates, these are start values of Newton's method
     copy(rate[n:], a1)
     last_change = np.inf
     for iteration in range(MAX_ITERATIONS):
@@ -180,7 +181,7 @@ def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
             change = max(change, difference / max(abs(v1[m]), 1.0))
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        # the first iteration only evaluates the prediction, which is never accepted: extrapolation alone is unstable
+        # the first iteration only evaluates the prediction, which must not be accepted: extrapolation alone is unstable
         if iteration > 0 and (change <= options[OUTER_TOL] or (change >= last_change and change <= rounding_floor(q1))):
             for k in range(w.dependent.size):
                 m = w.dependent[k]
@@ -205,11 +206,11 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error, in tolerances, and the ratio of the next step size; d: y1 - prediction."""
+    """Store NEXT_ORDER; return the error, in tolerances, and the next step-size ratio; d: y1 minus its prediction."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
-    # with unequal steps, the interpolation of the history has an error, too; as in DASSL, the larger error counts
+    # with unequal steps, interpolation of the history also causes an error; as in DASSL, the larger error counts
     interpolation_error = spans[0] / spans[k]
     for j in range(k):
         interpolation_error += spans[0] / spans[j] - 1.0 / (j + 1.0)
@@ -244,7 +245,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _update_differences(memory, trial, y1, d):
-    """Replace the scaled differences in `trial` by the differences at the end of the step, y1 = prediction + d."""
+    """Replace the scaled differences in `trial` by those at the end of the step, where y1 = prediction + d."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:

@@ -1,4 +1,4 @@
-"""Attempt implicit Runge-Kutta steps with a fixed-point outer loop: twoloop's iteration, or the paper's."""
+"""Attempt implicit Runge-Kutta steps with a fixed-point outer loop: twoloop's iteration, or that of the paper."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(COMMIT)
 def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """Store the stage accelerations and the rounding errors of an accepted step; nothing if `accepted` is false."""
+    """If `accepted`, store the stage accelerations and the rounding errors of the attempted step."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = memory_block(memory, s, n, at.A_PREVIOUS), memory_block(memory, s, n, at.A_TRIAL)
@@ -48,10 +48,10 @@ def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by fixed-point iteration; estimate its error by a step of size h and two steps of size h/2.
 
-    The new state is the end of the second half step. With EXTRAPOLATION = 1 / (2^order - 1), the new state is
-    extrapolated by means of the whole step, and projected onto the constraints. The polynomial through the stage
-    accelerations of the last accepted step predicts the stages of the whole step; the polynomial of the whole step
-    predicts the stages of the half steps. With fixed step size, the new state is the end of the whole step.
+    The new state is the end of the second half step. With EXTRAPOLATION = 1 / (2^order - 1), this state is extrapolated
+    with the end of the whole step, and projected onto the constraints. The polynomial through the stage accelerations
+    of the last accepted step predicts the stages of the whole step; the polynomial of the whole step predicts the
+    stages of the half steps. If the step size is fixed, the new state is the end of the whole step.
     """
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
@@ -93,7 +93,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         prediction_error = max(
             prediction_error, prediction_error_mid
-        )  # the next step starts from the end of the half steps
+        )  # the next step begins at the end of the second half step
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
         )
@@ -110,12 +110,12 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # limit of END_ERROR_WEIGHT * estimate_end_error in accepted steps; the paper has no such limit
+SUDDEN_ERROR = 10.0  # accepted steps have END_ERROR_WEIGHT * estimate_end_error up to this; the paper has no limit
 
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step as in Sects. 3.1-3.3 of the paper; estimate its error by a step of h and two steps of h/2."""
+    """Attempt a step as in Sects. 3.1-3.3 of the paper; a step of size h and two steps of h/2 yield the error."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

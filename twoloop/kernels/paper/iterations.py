@@ -1,8 +1,8 @@
 """Solve for the stages of implicit Runge-Kutta steps by one of two fixed-point iterations, the outer loops.
 
-`iterate_accelerations` iterates on the stage accelerations (the tableau applied twice to q'' = a).
+`iterate_accelerations` iterates on the stage accelerations (the tableau is applied twice to q'' = a).
 `iterate_first_order` is the loop of the paper on y_i = [v_i, q_i]. Both are compiled as parts of the steps in
-fixed_point_step.py. Equation numbers refer to the paper.
+fixed_point_step.py. Equation numbers refer to the paper; `f` is the kit, `w` the workspace.
 
 Richardson's error estimate is the difference between a step and two half steps; it also allows extrapolation.
 """
@@ -16,12 +16,12 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints,
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
-# number of vectors of rounding errors of compensated sums, for steps of fixed size: two for q and v of the last
-# accepted step, two for q and v of this attempt. Without compensation, the energy of symmetric methods drifts
+# number of vectors with rounding errors of compensated sums, for steps of fixed size: for q and v, after the last
+# accepted step and after this attempt. Without compensation, the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# indices in `memory`: first of scalars; then of blocks (s, n_q), one row for each stage, such as accelerations A; then
-# of vectors (n_q), such as positions Q and velocities V; ROUNDING is the first of N_ROUNDING vectors of rounding errors
+# indices in `memory`: first of scalars; then of blocks (s, n_q), with a row for each stage, such as accelerations A;
+# then of vectors (n_q), such as positions Q and velocities V. ROUNDING: first of N_ROUNDING vectors of rounding errors
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
 A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
@@ -63,7 +63,7 @@ def step_views(memory, s, n):
 
 @inlined
 def rounding_errors_of(memory, s, n, tolerances):
-    """Return a view (N_ROUNDING, n) of the rounding errors in `memory`; with step-size control, an empty one (0, n)."""
+    """Return a view of the rounding errors in `memory`: (N_ROUNDING, n), or with step-size control empty, (0, n)."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + ROUNDING) * n, N_ROUNDING if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
@@ -80,7 +80,7 @@ MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_or
 # an iteration diverges if a change exceeds the first change by more than this factor; changes may grow at first,
 # because the iteration matrix is not normal
 MAX_GROWTH = 1e3
-MIN_ITERATIONS = 8  # number of iterations after which a change that exceeds the previous change means divergence
+MIN_ITERATIONS = 8  # after this number of iterations, a change that exceeds the previous change means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
@@ -88,7 +88,7 @@ UNDECIDED, CONVERGED, DIVERGED = range(3)
 def _test_convergence(change, last_change, first_change, iteration, tolerance, q):
     """Return UNDECIDED, CONVERGED or DIVERGED, from the current, the previous and the first change of the stages.
 
-    An iteration has converged if changes are at most `tolerance`, or do not decrease because of rounding errors of q.
+    An iteration has converged if the change is at most `tolerance`, or if rounding errors of q keep it from decreasing.
     """
     if change <= tolerance:
         return CONVERGED
@@ -112,7 +112,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set the rounding errors of this attempt to zero for `coordinates`: dependent ones, which no sum updates."""
+    """Set the rounding errors of this attempt to zero for dependent `coordinates`, which no sum updates."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0
@@ -124,8 +124,8 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
     the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
-    then satisfy (17). For undamped systems, an iteration reduces errors as much as two first-order
-    iterations. Sums are compensated if `rounding` has rows. The error is `prediction_error` (step_size.py).
+    then satisfy (17). For undamped systems, one iteration reduces errors as much as two iterations of first order. Sums
+    are compensated if `rounding` has rows. The error is the result of `prediction_error` (step_size.py).
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -141,7 +141,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     convergence = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.n_outer += 1
-        # all stages are computed before any is evaluated: in Gauss-Seidel order, convergence requires a smaller h
+        # compute all stages before evaluating one of them: in Gauss-Seidel order, convergence would require a smaller h
         for j in range(s):
             for m in w.independent:
                 sum_q = 0.0
@@ -199,9 +199,9 @@ def _largest_change(coordinates, q, v, q_old, v_old):
 def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
     """Compute a step of size h by the paper's outer loop on y_i = [v_i, q_i]; return a code.
 
-    The loop starts from an Euler step, and ends by the tests (32) and (33). `a` are the accelerations at (t, q, v). Row
-    j of A_stage and row j of V_stage are a_j and v_j in K_j = [a_j; v_j]. An iteration updates one stage after another
-    with the latest K (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints.
+    The loop starts from an Euler step, and ends by the tests (32) and (33). `a`: accelerations at (t, q, v). Row j of
+    A_stage and row j of V_stage form K_j = [a_j; v_j]. An iteration updates one stage after another, each with the
+    latest K (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size

@@ -9,12 +9,12 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# _motion_rate assumes a start from rest at the origin if the largest |coordinate| grows by more than this factor
+# if the largest |coordinate| grows by more than this factor, _motion_rate assumes a start from rest at the origin
 GROWTH_AFTER_REST = 2.0
-TINY = 1e-300  # added to the tolerance, which is zero for a mechanism at rest at the origin
+TINY = 1e-300  # added to the tolerance, which would be zero for a mechanism at rest at the origin
 
-# indices in `memory` of the largest |coordinate|, |velocity| and |acceleration| so far; after these scalars, `memory`
-# contains the new accelerations (n_q)
+# indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. After these scalars, `memory` has the
+# new accelerations (n_q)
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
 # indices in `options` of newmark_step
@@ -34,8 +34,8 @@ def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
     """Return the rate of the motion, 1/s: the reciprocal of the time in which the largest |coordinate| can double.
 
     The time follows from the largest |coordinate|, |velocity| and |acceleration| so far, because all coordinates may be
-    near zero at a single time, depending on the origin. The time is at least `gap` (s) if the largest |coordinate|
-    arises mainly in this step, as after rest at the origin.
+    near zero at a single time, depending on the origin. If the largest |coordinate| arises mainly in this step, as it
+    does after rest at the origin, the time is at least `gap` (s).
     """
     memory[SIZE] = _largest_abs(q, memory[SIZE])
     memory[SPEED] = _largest_abs(v, memory[SPEED])
@@ -52,7 +52,7 @@ def _estimated_error(options, tolerances, rate, h, q, v, a, a1):
     """Return the estimated error of a step, in units of the tolerances.
 
     The leading local error of q for gamma = 1/2 is e = |beta - 1/6| h^2 |a1 - a|. The result is the largest component
-    of (e / h) / (rate atol + rtol |v|). This error per unit step is of order h^2, as is the error of the run. If
+    of (e / h) / (rate atol + rtol |v|). This error per unit time is of order h^2, like the error of the run. If
     ERROR_TOL > 0, the result is the 2-norm of e divided by ERROR_TOL (err_out in the paper).
     """
     factor = abs(options[BETA] - 1.0 / 6.0) * h
@@ -96,7 +96,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
                 error = _estimated_error(options, tolerances, rate, h, q, v, a, a1)
-                if options[ERROR_TOL] == 0.0:  # the paper does not have the estimate `prediction_error`
+                if options[ERROR_TOL] == 0.0:  # otherwise follow the paper, which has no estimate `prediction_error`
                     for k in range(w.dependent.size):
                         m = w.dependent[k]
                         w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])

@@ -2,15 +2,15 @@
 
 Order and step size are variable. The history consists of modified divided differences phi_i of the accelerations, as in
 Krogh's DVDQ and Shampine and Gordon's STEP, here for second-order equations: velocities are the integral of the
-polynomial through the accelerations, positions its double integral. The first evaluation is at the prediction, which
-violates the constraints by its error; the second is at the corrected state, projected onto the constraints. Differences
-of all coordinates are stored, so that a new partition needs no conversion.
+polynomial through the accelerations, and positions are its double integral. The first evaluation is at the predicted
+state, which violates the constraints by the error of the prediction; the second is at the corrected state, projected
+onto the constraints. Differences of all coordinates are stored, so that a new partition needs no conversion.
 
 Notation: t_n are the times of accepted steps, psi_i(n) = t_n - t_{n-i}, psi_0 = 0, and i counts from 1 as in the
 literature; beta_i = prod_{j<i} psi_j(n+1) / psi_j(n). In the step, for s from 0 to 1, the polynomial through the last k
 accelerations is sum_i c_i(s) beta_i phi_i(n), with c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1).
-g_i = int c_i ds is the coefficient for velocities, G_i = int (1 - s) c_i ds that for positions. All factors in these
-integrals are positive.
+g_i = int c_i ds is the coefficient for velocities, G_i = int (1 - s) c_i ds is the coefficient for positions. All
+factors in these integrals are positive.
 """
 
 import numpy as np
@@ -23,10 +23,10 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, p
 HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES is exact up to order 13
 N_TERMS = HIGHEST + 2  # number of stored differences phi_i, of coefficients g_i and of coefficients G_i
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
-SAFETY = 0.8  # factor on the step size for which the estimated error would equal the tolerance
+SAFETY = 0.8  # safety factor: ratio of the next step size to the size for which the error would equal the tolerance
 GROWTH, SHRINKAGE = 1.2, 0.5  # largest and smallest ratio of successive step sizes
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
-LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes that an error of predicted positions can cause
+LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes after an error of predicted positions
 RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
 
 # eight Gauss nodes on [0, 1] and their weights: exact for c_i and (1 - s) c_i up to i = 15
@@ -37,7 +37,7 @@ POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values c_i at NODES
 def _error_constants():
     """Return |g_k - g_{k+1}| at equal steps for each order k from 0 to HIGHEST.
 
-    The error of velocities is estimated as h |g_k - g_{k+1}| d, where d is the error of the predicted accelerations.
+    The estimate of the velocity error is h |g_k - g_{k+1}| d, where d is the error of the predicted accelerations.
     """
     coefficients = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
@@ -45,11 +45,11 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants for equal steps, used as lower bounds of the constants for the actual steps. After a decrease of h,
-# the actual constants are smaller, and would underestimate the error if the force jumps
+# error constants for equal steps, which are lower bounds of the constants that are used. After a decrease of h, the
+# constants for the actual steps are smaller, and would underestimate the error if the force jumps
 ERROR_CONSTANTS = _error_constants()
 
-# indices in `options`. THETA: a projection has converged when its last correction is at most THETA, see `project`
+# indices in `options`. THETA: a projection has converged if its last correction is at most THETA, see `project`
 THETA, N_OPTIONS = range(2)
 # indices of the scalars in `memory`. After the scalars, `memory` contains N_ROWS rows of coefficients, two tables of
 # differences, and two scratch rows, see _coefficient_row, _difference_table and _scratch_rows
@@ -63,7 +63,7 @@ THETA, N_OPTIONS = range(2)
     NEXT_ORDER,  # order chosen at the end of an attempt for the next one
     N_SCALARS,
 ) = range(8)
-# indices of the rows of coefficients: psi(n), psi(n+1), beta, g, G, and c_i at NODES
+# indices of the rows of coefficients: psi(n), psi(n+1), beta, g, G, and the values of c_i at NODES
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
@@ -86,7 +86,7 @@ def _row(memory, index):
 
 @inlined
 def _difference_table(memory, n, index):
-    """Return a view of table number `index` of differences, N_TERMS + 1 rows of n entries, padded.
+    """Return a view of the table of differences with the index `index`: N_TERMS + 1 rows of n entries, padded.
 
     The difference phi_i is row i - 1 plus the last row.
     """
@@ -97,7 +97,7 @@ def _difference_table(memory, n, index):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return two scratch rows (n, padded) of `memory`, for v and q: mean accelerations, later reciprocal tolerances."""
+    """Return two scratch rows (n, padded), for v and for q: mean accelerations, and later reciprocals of tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -153,7 +153,7 @@ def _compute_coefficients(memory, h, k):
         beta[i + 1] *= beta[i]
     for m in range(8):
         c[m] = 1.0
-    previous_psi = 0.0  # psi_i(n), at first psi_0 = 0
+    previous_psi = 0.0  # psi_i(n); at first i = 0, and psi_0 = 0
     for i in range(k + 2):
         velocity_integral = 0.0
         position_integral = 0.0
@@ -227,7 +227,7 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
 def _estimate_error(g, G, h, order, largest_v, largest_q):
     """Return the estimated error of a step at `order`, in units of the tolerances.
 
-    `largest_v`, `largest_q`: largest component of phi_{order+1}, divided by the tolerances of velocities, of positions.
+    `largest_v`, `largest_q`: largest component of phi_{order+1} over the tolerances of velocities, and of positions.
     """
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 
@@ -237,7 +237,7 @@ def _choose_order(memory, h, k, table, d, n):
     """Store NEXT_ORDER; return the error, in units of the tolerances, and the ratio of the next step size to h.
 
     The rules are those of Shampine and Gordon's STEP. The order decreases if the error at lower orders is not larger.
-    It increases after k + 1 steps at order k if the error at order k + 1 is smaller; while STARTING is 1, at each step.
+    It increases if k + 1 steps had the order k and the error at order k + 1 is smaller; while STARTING is 1, always.
     """
     g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     weight_v, weight_q = _scratch_rows(memory, n)
@@ -293,7 +293,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     old, new = _difference_table(memory, n, memory[CURRENT]), _difference_table(memory, n, 1.0 - memory[CURRENT])
     _compute_coefficients(memory, h, k)
     _predict_state(memory, h, k, old, new, state, q1, v1, n)
-    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # the order of the next attempt if an evaluation fails in this attempt
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # order of the next attempt if an evaluation fails in this attempt
     code = evaluate_without_projection(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

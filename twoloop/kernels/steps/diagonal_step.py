@@ -8,16 +8,16 @@ coordinates, with z = gamma h and sums over the stages k < j:
 
 The corrections d solve (I - z^2 J_q - z J_v) d = F - a, where J_q and J_v are the derivatives of F. If the system
 provides tangents, the derivatives are computed in every iteration: stiff directions turn with the bodies, and if they
-turn much in a step, the iteration with older derivatives does not converge. Methods whose stages are solved together,
-as in newton_step.py, use one set of derivatives for all stages.
+turn much in a step, the iteration with older derivatives does not converge. Methods that solve all stages together, as
+in newton_step.py, use one set of derivatives for all stages.
 
 If the system provides tangents K and D, the dense matrix T^T (M - z^2 K - z D) T of an iteration is factored directly.
-newton_systems.py first multiplies the derivatives by the inverse of T^T M T, to use them in several systems. Direct
-factorization takes half the work if each matrix is used in one iteration only.
+(newton_systems.py first multiplies the derivatives by the inverse of T^T M T, to use them in several systems. Direct
+factorization takes half the work if each matrix is used in one iteration only.)
 
-Under step-size control, TR-BDF2 continues from the embedded formula of order 3; the difference of the two formulas is
-filtered three times, which keeps the method L-stable. Then the errors of many short steps add up to the tolerance, not
-to the tolerance times the number of steps.
+Under step-size control, a step of TR-BDF2 ends at the result of the embedded formula of order 3; the difference of the
+two formulas is filtered three times, which keeps the method L-stable. Then the errors of many short steps add up to the
+tolerance, not to the tolerance times the number of steps. `f` is the kit, and `w` the workspace.
 """
 
 import numpy as np
@@ -93,7 +93,7 @@ def factor_newton_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        # L D L^T fails, and overwrites the matrix, if it is indefinite, as for a compressed beam: use L U instead
+        # L D L^T fails for an indefinite matrix, as of a compressed beam, and overwrites it: fill it again, and use L U
         _fill_newton_matrix(w, memory, n, m, z, storage)
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
@@ -175,10 +175,10 @@ def filter_dense_error(w, memory, z, e_q, e_v):
 
 MAX_ITERATIONS = 8  # largest number of Newton iterations of a stage: if they do not converge, the step fails
 DIVERGENCE_RATIO = 2.0  # Newton's method has diverged if a correction exceeds this multiple of the previous one
-LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences, with which convergence is linear
+LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences, because convergence is then linear
 # derivatives by differences are renewed if a correction exceeds this fraction of the previous one
 MAX_CONTRACTION = 0.1
-VELOCITY_WEIGHT = 0.1  # weight in the convergence test of the position error caused by a correction of velocities
+VELOCITY_WEIGHT = 0.1  # weight, in the convergence test, of the position error that a correction of velocities causes
 
 
 @inlined
@@ -194,14 +194,14 @@ def stage_views(memory, s, n):
 
 @merged
 def gamma_of(options):
-    """Return gamma, the diagonal entry of A (s, s) in all rows but the first."""
+    """Return gamma: all diagonal entries of A (s, s) except the first are equal to gamma."""
     s = int(options[at.DIAGONAL_OFFSET])
     return options[at.DIAGONAL_OFFSET + s * s]
 
 
 @merged
 def _set_stage_state(z, q_bar, v_bar, a, Q, V):
-    """Store the stage state V = v_bar + z a, Q = q_bar + z V (n_q); its dependent entries are only start values."""
+    """Store the stage state V = v_bar + z a, Q = q_bar + z V (n_q); dependent entries of Q and V are start values."""
     for m in range(Q.size):
         V[m] = v_bar[m] + z * a[m]
         Q[m] = q_bar[m] + z * V[m]
@@ -209,19 +209,19 @@ def _set_stage_state(z, q_bar, v_bar, a, Q, V):
 
 @merged
 def has_dense_tangents(f, w):
-    """Return whether every iteration of Newton's method factors a new dense matrix T^T (M - z^2 K - z D) T."""
+    """Return whether each iteration of Newton's method factors a new dense matrix T^T (M - z^2 K - z D) T."""
     return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != FIXED_ORDER
 
 
 @merged
 def stages_at_once(options):
-    """Return the number of stages solved at once, 1; for a literal 1, numba would compile newton_systems.py again."""
+    """Return 1, the number of stages solved at once; for a literal 1, numba would compile newton_systems.py again."""
     return int(options[at.STAGES])
 
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
-    """Update the derivatives at (t, Q, V), with accelerations F, and the factors, unless still valid; return a code."""
+    """Update derivatives at (t, Q, V), where accelerations are F, and factors, unless still valid; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -264,7 +264,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         for m in w.independent:
             scale_q = max(scale_q, abs(Q[m]))
             scale_v = max(scale_v, abs(V[m]))
-        if f.form != FIXED_ORDER:  # in the fixed-order form no coordinate is dependent
+        if f.form != FIXED_ORDER:  # in the fixed-order form, no coordinate is dependent
             for m in w.dependent:
                 a[m] = F[m]
         code = _update_derivatives(f, w, options, memory, t, h, Q, V, F)
@@ -304,18 +304,18 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# number of filters applied to the difference of the two formulas before it is subtracted from the result; with fewer,
-# the method is unstable for vibrations, see tests/kernels/test_diagonal.py
+# the difference of the two formulas is filtered this number of times before it is subtracted from the result; with
+# fewer filters, the method is unstable for vibrations, see tests/kernels/test_diagonal.py
 N_FILTERS = 3
 
-# largest ratio of |sum_k jump_weights[k] a_k| to the range of the stage accelerations a_k that a single jump can cause;
-# if the ratio is smaller, `_error_at_jumps` reduces its estimate in proportion to it
+# a single jump can cause at most this ratio of |sum_k jump_weights[k] a_k| to the range of the stage accelerations a_k;
+# if the ratio is smaller, `_error_at_jumps` reduces its estimate in proportion
 MAX_RATIO_BY_ONE_JUMP = 0.174
 
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, with the factors computed last.
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma and the factors that were computed last.
 
     J is the Jacobian of (v, F) by (q_i, v_i). Only the first n_dof numbers of e_q and e_v (n_q) are read and changed.
     """
@@ -378,9 +378,9 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
 def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
     """Return the largest component of the error estimate of `_store_weighted_sums`, in units of the tolerances.
 
-    The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If the derivatives are
-    so outdated that the filter is wrong, they are computed anew. On return, the vectors E_Q and E_V of `memory` contain
-    the estimate, filtered twice.
+    The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If outdated derivatives
+    make the filter wrong, the derivatives are computed anew. On return, the vectors E_Q and E_V of `memory` contain the
+    estimate, filtered twice.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
@@ -436,7 +436,7 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     """Return the effect, in units of the tolerances, of the velocity error E_V in slow directions, see newton_step.py.
 
-    The result is 0 if all of E_V has an effect of at most 1. E_Q, E_V and the factors are overwritten.
+    If the whole of E_V has an effect of at most 1, return 0. E_Q, E_V and the factors are overwritten.
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
@@ -451,7 +451,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     h_longer = STEPS_TO_DECAY * h / gamma_of(options)
     if _factor_filter(f, w, options, memory, h_longer) == DONE:
         _filter_errors(f, w, options, memory, h_longer, e_q, e_v)
-        # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
+        # in unstable motion, the filter may be nearly singular, and the filtered error too large
         error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     memory[at.H_FACTORED] = 0.0
     return error
@@ -462,9 +462,9 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
     """Return a second error estimate, in units of the tolerances, for accelerations that jump within the step.
 
     The first estimate has small weights in the first half of the step, and hardly shows a jump there. `jump_weights`
-    (s) are those of another embedded formula. The sum of jump_weights[k] A_stage[k] is zero if the accelerations are
+    (s) belong to another embedded formula. The sum of jump_weights[k] A_stage[k] is zero if the accelerations are
     quadratic in time, small relative to their range if they are smooth, and large if they jump. The second estimate
-    contains the ratio of this sum to the range as a factor, so that its order is higher.
+    contains the ratio of this sum to the range as a factor, which makes its order higher.
     """
     n = w.Q.size
     deviation, widest = 0.0, 0.0
@@ -492,7 +492,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[at.DIAGONAL_OFFSET])
         _, A_stage, a_end = stage_views(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # not F at the last stage, which contains Newton's residual times the stiffness
+        copy(A_stage[s - 1], a_end)  # F at the last stage would contain Newton's residual times the stiffness
         memory[at.IS_FRESH] = 0.0
 
 

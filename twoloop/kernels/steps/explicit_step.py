@@ -1,9 +1,9 @@
 """Step of an explicit Runge-Kutta method for (q_i, v_i): each stage is one evaluation, and there is no outer loop.
 
 The first stage is the state at the beginning of the step, and two embedded formulas estimate the error. By default, the
-inner loop computes the dependent coordinates of every stage, so that all stages satisfy the constraints. With FREE,
+inner loop computes the dependent coordinates of every stage, so that all stages satisfy the constraints. With FREE = 1,
 unlike in the paper, the method integrates dependent coordinates, too: stages violate the constraints by the error of
-the formula, and only the end of the step is projected.
+the formula, and only the end of the step is projected. `f` is the kit, and `w` the workspace.
 """
 
 import numpy as np
@@ -15,15 +15,15 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
 from twoloop.kernels.linalg.dense import copy, sum_rows
 
-# indices of the scalars in `options`, for arguments of options_array. After the scalars, `options` contains A (s, s),
-# b (s), c (s) and the weights of the two error estimates (s each). FREE: 1 if stages are not projected
+# indices of the scalars in `options`, which are arguments of options_array. After the scalars, `options` contains
+# A (s, s), b (s), c (s) and the weights of the two error estimates (s each). FREE: 1 if stages are not projected
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
-# indices of the vectors in `memory`, after which come the slopes [v, a] of the s stages. A vector or slope has 2 n_q
-# numbers, padded to a multiple of BLOCK_SIZE
+# indices of the vectors in `memory`; the slopes [v, a] of the s stages follow. A vector or slope has 2 n_q numbers,
+# padded to a multiple of BLOCK_SIZE
 STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
 BLOCK_SIZE = 8  # vectors are padded to a multiple of this size, so that loops over them have no remainder
-# STRICT: factor on the error estimate after a run has come near a singular position, because phase errors grow at each
-# such position. It decreases to 1 as the smallest tolerance falls from STRICT * LEAST_STRICT to LEAST_STRICT
+# STRICT: factor on the error estimate once a run has come near a singular position, because phase errors grow at each
+# such position. The factor decreases to 1 as the smallest tolerance falls from STRICT * LEAST_STRICT to LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -87,7 +87,7 @@ def _slope_views(memory, s, n):
 
 @compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
-    """Set y1 to y + h * sum_k weights[k] * slopes[k]; `total` is scratch. Adding y last avoids rounding errors."""
+    """Set y1 to y + h * sum_k weights[k] * slopes[k], adding y last to avoid rounding errors; `total` is scratch."""
     sum_rows(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -98,9 +98,9 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
     """Return the error e^2 / sqrt(e^2 + d^2) of a step from y to y1 (2 n each), in units of the tolerances.
 
     e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
-    velocities), relative to atol + rtol |y|. If the formula were applied to each component, it would give e, of low
-    order, where d of this component passes through zero, and cost up to 30 % more evaluations. If `strict`, the error
-    is e^(3/2) / (e^2 + d^2)^(1/4), because terms of high order are not small near a singular position.
+    velocities), relative to atol + rtol |y|. The formula is not applied to single components: where d of a component
+    passes through zero, it would yield e, of low order, at the cost of up to 30 % more evaluations. If `strict`, the
+    error is e^(3/2) / (e^2 + d^2)^(1/4), because terms of high order are not small near a singular position.
     """
     n = fine_error.size // 2
     rtol = tolerances[RTOL]
@@ -142,8 +142,8 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         _vector_view(memory, n, COARSE_ERROR),
     )
     slopes = _slope_views(memory, s, n)
-    # near a singular position all stages are projected: it matters on which side of the position a stage lies, and how
-    # accurate its velocities are
+    # near a singular position, all stages are projected, because it matters on which side of the position a stage lies,
+    # and how accurate its velocities are
     is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
     is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)
@@ -152,7 +152,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.n_outer += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # entries of dependent coordinates are start values
+        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # start values, for dependent coordinates
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if is_free:

@@ -4,11 +4,11 @@ The unknowns are the stage accelerations a_j of the independent coordinates, as 
 
     r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
-where F is the two-loop right-hand side. J_q and J_v are its derivatives by q_i and v_i at a single state (simplified
-Newton's method). The corrections d solve (I - h^2 A A x J_q - h A x J_v) d = r, x being the Kronecker product. In the
-eigenvectors of A this splits into systems (n_dof, n_dof) I - (h l)^2 J_q - h l J_v: a real one for each real eigenvalue
-l of A, and a complex one for each pair. These have half the size of the systems of a first-order form (Hairer & Wanner,
-Solving ODEs II, IV.8, for Radau IIA). In stiff problems, a fixed-point iteration would need tiny steps.
+where F are the accelerations that the inner loop returns. J_q and J_v are the derivatives of F by q_i and v_i at a
+single state (simplified Newton's method). The corrections d solve (I - h^2 A A x J_q - h A x J_v) d = r, where x is the
+Kronecker product. In the eigenvectors of A, this splits into systems (n_dof, n_dof) I - (h l)^2 J_q - h l J_v: a real
+system for each real eigenvalue l of A, and a complex one for each pair. They have half the size of the systems of a
+first-order form (Hairer & Wanner, Solving ODEs II, IV.8, for Radau IIA). Fixed-point iteration would need tiny steps.
 """
 
 import numpy as np
@@ -43,7 +43,7 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
-# the next step computes new derivatives if the ratio of the last two Newton corrections is larger than this
+# the next step computes new derivatives if the ratio of the last two Newton corrections is above this
 SLOW_CONTRACTION = 0.05
 # largest Newton correction, relative to max(1, |value|), that counts as a rounding error in steps of fixed size
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
@@ -81,7 +81,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return code
             for m in range(n):
                 residual[j, m] = a_new[m] - A_stage[j, m]
-            if f.form != FIXED_ORDER:  # in the fixed-order form no coordinate is dependent
+            if f.form != FIXED_ORDER:  # in the fixed-order form, no coordinate is dependent
                 for m in w.dependent:
                     A_stage[j, m] = a_new[m]
         scale_q, scale_v = 1.0, 1.0
@@ -113,7 +113,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return DONE if change <= max_rounding else OUTER_DIVERGED
             if contraction / (1.0 - contraction) * change <= options[OUTER_TOL]:
                 return DONE
-            # fail early if the corrections cannot fall to the tolerance in the remaining iterations
+            # stop early if the corrections cannot fall to the tolerance in the remaining iterations
             n_left = MAX_ITERATIONS - 1 - iteration
             if change * contraction**n_left / (1.0 - contraction) > max(options[OUTER_TOL], max_rounding):
                 return OUTER_DIVERGED
@@ -185,8 +185,8 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     """Return the effect, in tolerances, of the slowly changing part of the velocity error E_V, see `velocity_error`.
 
     In `filtered_velocity_error`, errors last as long as their fastest component. Here, a filter keeps the component
-    that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. The result is 0 if all of E_V
-    has an effect of at most 1. E_Q, E_V and the factors of the filter are overwritten.
+    that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. If the whole of E_V has an
+    effect of at most 1, return 0. E_Q, E_V and the factors of the filter are overwritten.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]
@@ -199,7 +199,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
         e_q[i] = 0.0
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
-        # if the motion is unstable, the filter may be nearly singular, and the filtered error too large
+        # in unstable motion, the filter may be nearly singular, and the filtered error too large
         error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
@@ -238,8 +238,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage, where stiff directions differ least from all other stages. At a
-            # time between the stages, a force might act that acts at no stage
+            # compute derivatives at the middle stage, where stiff directions differ least from those at other stages.
+            # Between the stages, a force might act that acts at no stage
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])
@@ -270,8 +270,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the state extrapolated to the middle stage, and with it derivatives such as those of friction, may be wrong:
-        # repeat with derivatives at the beginning of the step
+        # the extrapolated state of the middle stage may be wrong, and so may its derivatives, such as of friction: the
+        # step is repeated with derivatives at its beginning
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

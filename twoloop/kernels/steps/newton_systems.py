@@ -1,15 +1,15 @@
 """Linear algebra of Newton's method in implicit steps: one system, I - z^2 J_q - z J_v with z = h l, per eigenvalue l.
 
-J_q and J_v are the derivatives of the two-loop right-hand side by the independent positions and velocities. The
-corrections x of the independent accelerations solve (I - z^2 J_q - z J_v) x = r. The velocities that the constraints
-allow are v = T v_i, T = [I; -Cqd^-1 Cqi]. Multiplied by T^T M T, the system becomes
+J_q and J_v are the derivatives of the accelerations by the independent positions and velocities. The corrections x of
+the independent accelerations solve (I - z^2 J_q - z J_v) x = r. The velocities that the constraints allow are
+v = T v_i, T = [I; -Cqd^-1 Cqi]. Multiplied by T^T M T, the system becomes
 
     T^T (M - z^2 K - z D) T x = T^T M T r.
 
 K and D are the derivatives of Q - Cq^T lam by q and v, at constant lam. This omits the dependence of T and M on q, and
 of Q_d on v. The omitted terms are not stiff, and are zero for linear constraints, so that a simplified Newton's method
-does not need them. Under step-size control the steps are the same without them. Fixed steps in which a body turns by
-some 0.4 rad may fail without them, and converge with differences of the right-hand side.
+does not need them. Under step-size control, steps are as long without them. Fixed steps in which a body turns by some
+0.4 rad may fail without them, but converge with differences of the accelerations.
 
 X = T x also solves a system with a bordered matrix,
 
@@ -18,14 +18,14 @@ X = T x also solves a system with a bordered matrix,
 There are three kinds of storage:
 
 - dense: J_q and J_v (n_dof, n_dof), from the tangents K and D if the system provides them, otherwise by differences of
-  the right-hand side;
+  the accelerations;
 - banded, if the system has a bandwidth b: K, D and the border, at a cost proportional to n_q. Without tangents, K and D
   are computed by differences, in 2 b + 1 groups of columns without common rows (Curtis, Powell and Reid 1974, doi
   10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
 - sparse, for large systems: all coordinates are treated as independent, and the bordered matrix, with the right-hand
   side [M r; G r], has a fixed sparsity pattern. K and D are computed by differences in groups of columns. Then all
-  coordinates are displaced at once, and the change of the residual is compared with that predicted by K and D. If they
-  deviate, entries are missing, which were zero when the pattern was recorded: other storage is then needed.
+  coordinates are displaced at once; if the residual does not change as K and D predict, the pattern lacks entries that
+  were zero when it was recorded, and other storage is needed.
 """
 
 import numpy as np
@@ -72,7 +72,7 @@ from twoloop.kernels.steps.stages import (
 )
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
-EQUAL_STEP_TOLERANCE = 1e-9  # step sizes with this relative difference count as equal: rounding of times changes them
+EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative difference, caused by rounding of times
 # largest Newton correction, relative to the smallest tolerance, that counts as a rounding error if it does not decrease
 MAX_ROUNDING_CORRECTION = 0.1
 
@@ -112,7 +112,7 @@ def _check_band_finite(A, b):
 
 @compiled
 def _has_jacobian_changed(f, w, t, q):
-    """Store C_q at (t, q) in w.Gx; return whether this differs from the C_q in w.G."""
+    """Store C_q at (t, q) in w.Gx; return whether it differs from the C_q in w.G."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -208,7 +208,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
-    # the storage of earlier factors, which are no longer needed, receives K (later D), T^T M T and products A T
+    # earlier factors are no longer needed: their storage receives K (later D), T^T M T and products A T
     K, R = as_matrix(matrix_storage(w, n, at.FILTER), n), as_matrix(matrix_storage(w, n, at.SYSTEMS), n)
     code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
@@ -234,7 +234,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store J_q, or J_v if `by_v`, in J, at (t, q, v) with accelerations a; return a code. Other arrays are scratch."""
+    """Store J_q, or J_v if `by_v`, in J, at (t, q, v) with accelerations a; return a code. The rest is scratch."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     for column in range(w.independent.size):
         j = w.independent[column]
@@ -253,7 +253,7 @@ def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_ne
 
 @compiled
 def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v at (t, q, v) in w.matrices; return a code. a: accelerations at (t, q, v), evaluated last."""
+    """Store J_q and J_v at (t, q, v), the last evaluated state, with accelerations a, in w.matrices; return a code."""
     if f.force_by_q_given == 1 and w.Rate.size == w.C.size:
         return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
@@ -325,8 +325,8 @@ def _band_view(numbers, n, b):
 def _border_views(w, n, r, b):
     """Return views of three arrays stored after K: independent rows of C_q (r, n), D (n - r + 1, r), and indices (r).
 
-    C_q and D, a copy of w.D, belong to the state at which K was computed; the columns of D belong to the dependent
-    coordinates with these indices.
+    C_q and D, a copy of w.D, belong to the state at which K was computed. The indices are those of the dependent
+    coordinates, to which the columns of D belong.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -402,7 +402,7 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_tangents(f, w, memory, s, t, q, v):
-    """Store the bands of K and D at (t, q, v), evaluated last, and the border in w.matrices; return a code."""
+    """Store the bands of K and D at (t, q, v), the last evaluated state, and the border as matrices; return a code."""
     n = q.size
     b = f.bandwidth
     w.n_jacobians += 1
@@ -471,7 +471,7 @@ def _multiply_by_T(w, b, x, X):
 
 @compiled
 def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system for x (n_q); store the independent part in x[:n_dof]; the other entries are scratch."""
+    """Solve the bordered system for x (n_q); store independent entries in x[:n_dof]; the other entries are scratch."""
     Cq, _, _ = _border_views(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # in ascending order, no entry is overwritten before it is read
@@ -510,8 +510,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# the sparsity pattern is complete if the change of the residual differs from the predicted change by at most this
-# fraction of the sum of the absolute terms of the prediction
+# the sparsity pattern is complete if the change of the residual differs from its prediction by at most this fraction of
+# the sum of the absolute terms of the prediction
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
@@ -576,7 +576,7 @@ def _sparse_factor_view(f, w, k):
 def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
     """Store Q - G^T w.lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
 
-    The entries of G are w.jacobian_values; if `renews_G` is true, w.jacobian_values are first evaluated at (t, q).
+    The entries of G are in w.jacobian_values; if `renews_G`, first evaluate them at (t, q).
     """
     w.n_evaluations += 1
     out[:] = 0.0
@@ -694,7 +694,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store [M r; G r], the right-hand side of the bordered system, in `right`; redundant rows add stiffness to M."""
+    """Store [M r; G r], the right-hand side of the bordered system, in `right`; redundant rows may stiffen M."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -760,7 +760,7 @@ def factor_systems(f, w, options, memory, s, h):
     code = factor_filter(f, w, options, memory, s, h)
     offset += at.N_EIGEN_SCALARS + s
     for k in range(n_systems):
-        # if the first eigenvalue is real, it is gamma0, for which `factor_filter` has computed the factors
+        # if the first eigenvalue is real, it is gamma0, and `factor_filter` has already computed its factors
         if code == DONE and (k > 0 or n_real == 0):
             z = h * complex(options[offset], options[offset + 1])
             if f.form == FIXED_ORDER:
@@ -842,7 +842,7 @@ def correct_stages(f, w, options, memory, s, residual, A_stage):
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)
     offset += at.N_EIGEN_SCALARS + s
-    corrections = block(memory, s, n, at.Q_STAGE)  # used as scratch: stage positions are computed anew before their use
+    corrections = block(memory, s, n, at.Q_STAGE)  # scratch, because stage positions are computed anew before their use
     corrections[:, :] = 0.0
     for k in range(n_systems):
         begin_row = offset + 2

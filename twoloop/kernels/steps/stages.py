@@ -13,13 +13,13 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-MAX_STEP_RATIO = 3.0  # up to this ratio to the previous step size, that step's polynomial predicts the stages
-# factor on the result of `estimate_end_error` in methods with Richardson's estimate, which misses only jumps of the
-# force between an end of the step and the nearest stage
+MAX_STEP_RATIO = 3.0  # the previous step's polynomial predicts the stages of a step at most this multiple as long
+# factor on the result of `estimate_end_error` in methods with Richardson's estimate: this estimate misses only jumps of
+# the force between an end of the step and the nearest stage
 END_ERROR_WEIGHT = 0.01
 
 # indices of the scalars in `options`. After the scalars, `options` contains A and A @ A (s, s each), b, b @ A and c (s
-# each), and the weights (s) that extrapolate from the nodes to 0 and to 1. EXTRAPOLATION: 1 / (2^order - 1), or 0 for
+# each), and the weights (s each) that extrapolate from the nodes to 0 and to 1. EXTRAPOLATION: 1 / (2^order - 1), or 0:
 # no extrapolation; OUTER_TEST: argument `outer_test` of options_array; POWER: order - 1
 STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
 
@@ -36,7 +36,7 @@ def options_array(
 ) -> NDArray[np.float64]:
     """Return the array `options` of an implicit Runge-Kutta method with the tableau A, b, c.
 
-    `outer_test`: 1 if test (32) of the paper also covers dependent coordinates; `extrapolation`, `power`: see STAGES.
+    `outer_test`: 1 if test (32) of the paper also covers dependent coordinates; `extrapolation`, `power`: see above.
     """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
@@ -64,7 +64,7 @@ def tableau_of(options):
 
 @merged
 def middle_node(c):
-    """Return the entry of c (s) that is nearest to 1/2."""
+    """Return the node of a tableau, an entry of c (s), that is nearest to 1/2."""
     nearest = 0
     for j in range(c.size):
         if abs(c[j] - 0.5) < abs(c[nearest] - 0.5):
@@ -97,8 +97,8 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     differs from the accelerations by e, of order h^s. If terms of successive orders decrease by a constant factor f,
     then e = w f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, even between an end of
     the step and the nearest stage, the terms do not decrease, and the estimate is h w: steps then shrink until the jump
-    no longer matters. A second estimate is needed, too, because e may pass through zero: the errors of single steps of
-    pendulums were then as large as 100 tolerances.
+    no longer matters. Methods need a second estimate, too, because e may pass through zero: single steps of pendulums
+    then had errors of up to 100 tolerances.
     """
     s, n = A_stage.shape
     offset = N_SCALARS + 2 * s * s + 3 * s
@@ -125,25 +125,25 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 
 
 # indices of the scalars that newton_options adds to `options`, counted from `newton_options_index`. N_REAL, N_PAIRS:
-# numbers of real eigenvalues of A and of complex pairs; GAMMA0: first real eigenvalue, or if there is none, smallest
-# absolute value of an eigenvalue; TESTS_VELOCITIES: 1 if the error of velocities is tested, too. After the scalars,
+# number of real eigenvalues of A, and of complex pairs; GAMMA0: first real eigenvalue or, if there is none, smallest
+# absolute value of an eigenvalue; TESTS_VELOCITIES: 1 if the error test includes velocities. After the scalars,
 # `options` contains the weights e (s) of the error estimate, and for each eigenvalue its real and imaginary part, its
 # row of T^-1 and its column of T (for both s real parts, then s imaginary parts); T contains the eigenvectors of A
 N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # indices of the scalars in `memory`
 (
-    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt; diagonal_step.py: an attempt was made
+    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt (in diagonal_step.py: there was one)
     H_TRIAL,  # step size of the last attempt, s
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step, s
     HAS_JACOBIAN,  # 1: the stored derivatives may be used
-    IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at this step's end
-    PARTITION_NUMBER,  # value of GENERATION, see data/indices.py, of the partition of the stored derivatives
+    IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at the step's end
+    PARTITION_NUMBER,  # number (GENERATION in data/indices.py) of the partition that the stored derivatives belong to
     H_FACTORED,  # step size for which the systems are factored, s; 0: none
     CONTRACTION,  # ratio of the last two corrections of Newton's method
     HAS_DAMPING,  # 1: forces depend on v; 0: J_v and D are zero
-    IS_SYMMETRIC,  # kind of factors in diagonal_step.py: 1: L D L^T of a symmetric matrix; 0: L U
+    IS_SYMMETRIC,  # kind of factors in diagonal_step.py. 1: L D L^T of a symmetric matrix; 0: L U
     ERROR_DURATION,  # duration (s) of an error of the velocities, see velocity_errors.py; 0: unknown
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
@@ -157,17 +157,17 @@ A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # indices of the parts of w.matrices, n_q^2 entries each, in dense and banded storage; for J_q, K, T etc. see
 # newton_systems.py. DERIVATIVE_Q: in dense storage J_q, or T^T K T if diagonal_step.py factors its own matrices; in
 # banded storage the band of K, followed by the independent rows of C_q and by w.D. DERIVATIVE_V: J_v, or T^T D T, or
-# the band of D. FILTER: factors of the real matrix that filters errors. From SYSTEMS on, two parts for each eigenvalue
-# of A: the factors of its complex matrix (in diagonal_step.py T^T M T)
+# the band of D. FILTER: factors of the real matrix that filters errors. From SYSTEMS on: for each eigenvalue of A, two
+# parts with the factors of its complex matrix (in diagonal_step.py: T^T M T)
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], tests_velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the entries of `options` for Newton's method, which follow the entries by `options_array`; see N_REAL.
+    """Return the entries of `options` for Newton's method, to be appended to the result of `options_array`; see N_REAL.
 
-    A must be diagonalizable. `tests_velocities`: whether the error of velocities is tested, too.
+    A must be diagonalizable. `tests_velocities`: whether the error test includes velocities.
     """
     values, T = np.linalg.eig(A)
     inverse = np.linalg.inv(T)
@@ -184,8 +184,8 @@ def newton_options(
 def _error_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
     """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)) with stage values Y_j.
 
-    The estimate is the difference of an embedded quadrature of order s and the method (Hairer & Wanner II, (IV.8.16)).
-    If c_1 = 0, f(Y_1) is f(y_n), and the embedded quadrature omits the last stage.
+    The estimate is the difference between an embedded quadrature of order s and the method (Hairer & Wanner II,
+    (IV.8.16)). If c_1 = 0, f(Y_1) is f(y_n), and the embedded quadrature omits the last stage.
     """
     s = len(b)
     moments = 1.0 / np.arange(1.0, s + 1.0)
@@ -211,7 +211,7 @@ def n_matrices(n_systems: int) -> int:
 
 # `options` of a diagonally implicit method begin with the options of Newton's method for one stage, A = [[gamma]], in
 # which N_REAL has the index NEWTON_OFFSET. From DIAGONAL_OFFSET on, they contain the number of stages, A, c, b - b^,
-# the jump weights, and 1 if steps with an error estimate continue from the embedded formula, otherwise 0
+# the jump weights, and 1 if steps with an error estimate end at the result of the embedded formula, otherwise 0
 NEWTON_OFFSET = N_SCALARS + 2 + 5
 DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 
@@ -230,7 +230,7 @@ def diagonal_options(
 
     The first row of A is zero, the other diagonal entries are gamma, and the last row is b. `weights` (s): b - b^,
     where b^ are the weights of the embedded formula. `jump_weights` (s): weights of the error estimate for
-    accelerations that jump. `embedded`: whether steps continue from the embedded formula, if its order is higher.
+    accelerations that jump. `embedded`: whether steps end at the result of the embedded formula, of higher order.
     """
     A, c, weights, jump_weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, jump_weights))
     gamma = A[-1, -1]
@@ -250,7 +250,7 @@ def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
 
 @merged
 def newton_options_index(s):
-    """Return where the entries made by `newton_options` begin in `options`: the index of N_REAL, for s stages."""
+    """Return the index in `options` at which the entries by `newton_options` begin (that of N_REAL), for s stages."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
@@ -296,14 +296,14 @@ def system_storage(w, n, k):
 
 @inlined
 def _storage_after_vectors(memory, s, n, k):
-    """Return a view (2 n) of `memory` that begins k * n entries after the end of the vectors."""
+    """Return a view (2 n) of `memory` that begins k * n entries behind the vectors."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view (n) of `memory`: pivot indices of the filter matrix (k = 0), or for eigenvalue k - 1 (k > 0)."""
+    """Return a view (n) of `memory`: pivot indices of the filter matrix (k = 0) or of eigenvalue k - 1 (k > 0)."""
     return _storage_after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 
@@ -315,7 +315,7 @@ def complex_vector(memory, s, n, n_systems, index):
 
 @kernel(ATTEMPT)
 def request_loading(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Return an attempt with the code NOT_LOADED, so that the caller of the kernel loads the code of the step."""
+    """Return an attempt with the code NOT_LOADED, so that the caller of the kernel loads the step, and tries again."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
@@ -323,7 +323,7 @@ PLACEHOLDER_STEP = Step(request_loading, commit_nothing)
 
 
 class LazyStep(NamedTuple):
-    """Name of a Step and of its module in twoloop.kernels, such as "steps.newton_step", which is imported if needed."""
+    """Name of a Step and of its module in twoloop.kernels, such as "steps.newton_step", to be imported when needed."""
 
     module: str
     name: str
@@ -340,5 +340,5 @@ def load_step(step: Any) -> Any:
 
 
 def step_if_loaded(step: Any) -> Any:
-    """Return `step`; for a LazyStep, return the Step in its module, or PLACEHOLDER_STEP if that is not imported yet."""
+    """Return `step`; for a LazyStep, return the Step in its module, or PLACEHOLDER_STEP before this is imported."""
     return LOADED_STEPS.get(step, PLACEHOLDER_STEP) if isinstance(step, LazyStep) else step

@@ -14,7 +14,7 @@ The order of the series depends on the tolerance. The step size is such that the
 tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). The unit of time is the previous step size,
 so that no power of a short time underflows. The end of the step is projected onto the constraints.
 
-If there is no generated code, the program of the series is interpreted, order by order.
+If there is no generated code, the program of the series is interpreted, order by order. `f`: kit, `w`: workspace.
 """
 
 import numpy as np
@@ -39,15 +39,15 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 
-# indices of the scalars in `options`. ORDER: order of the series of q; THETA: largest last correction of a projection;
+# indices of the scalars in `options`. ORDER: order of the series of q; THETA: limit of a projection's last correction;
 # N_NODES: number of quantities of the program; EARLY_WIDTH, LATE_WIDTH: numbers of early and late operations, padded;
 # KEEP: 1 if consecutive steps evaluate the series about the first state, to interpolate within a step. After the
 # scalars, `options` contains the offsets of the program's arrays, then these arrays, with integers as bit patterns
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
-# indices of the arrays of OperationGroups, and of Sums, see twoloop.generate.series
+# indices of the arrays of a table (OperationGroups) and of a list of sums (Sums), see twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # position, after the arrays of a list of sums, of the array that tells where sums are stored
+SUM_INDICES = N_SUMS  # index of an additional array of a list of sums: it tells where each sum is stored
 # positions, among the program's arrays, at which the two tables and the two lists of sums begin
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
@@ -57,19 +57,19 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
 # arrays of `array_views`
 (
     HAS_SERIES,  # 1: the current series has been computed
-    CURRENT,  # index, 0 or 1, of the current series: the one about the beginning of the step
+    CURRENT,  # index, 0 or 1, of the current series: the series about the beginning of the step
     UNIT,  # unit of time of the current series, s
     NEXT_UNIT,  # unit of time of the series about the end of the last attempt, s
     ALLOWED_SIZE,  # step size that the current series allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
-    TRIED,  # 1: the last attempt has computed the series about its end, the current series if the attempt is accepted
+    TRIED,  # 1: the last attempt has computed the series about its end, which becomes the current one if it is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
     TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
-    # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown yet
+    # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts, which determines the times within a step at which the defect is evaluated
-    SUSPECTED,  # 1: the run has not passed the time SUSPECT yet, at which the defect of a rejected step was too large
-    SUSPECT,  # time at which the defect was too large, s
+    SUSPECTED,  # 1: the run has not passed the time SUSPECT yet
+    SUSPECT,  # time within a rejected step at which the defect was too large, s
     N_MEMORY_SCALARS,
 ) = range(14)
 
@@ -83,7 +83,7 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 @inlined
 def series_accelerations(memory, n):
-    """Return a view of the last n entries of `memory`, which store accelerations computed from the series."""
+    """Return a view of the last n entries of `memory`, which contain accelerations computed from the series."""
     return memory[memory.size - n :]
 
 
@@ -100,14 +100,14 @@ def _floats(options, index):
 
 @inlined
 def series_view(memory, order, n, index):
-    """Return a flat view of series number `index` (0 or 1) of q, row by row: a matrix would cost a function call."""
+    """Return a flat view of series `index` (0 or 1) of q, row by row: a view as a matrix would cost a function call."""
     begin = N_MEMORY_SCALARS + int(index) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
 
 @merged
 def sum_of_products(X, Y, K, total):
-    """Store the sum of X[j, m] * Y[K - j, m] over 0 < j < K in total[m], for eight indices m at a time."""
+    """Store sums of X[j, m] * Y[K - j, m] over all j with 0 < j < K in total[m], for eight indices m at a time."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for j in range(1, K):
@@ -132,7 +132,7 @@ def sum_of_products(X, Y, K, total):
 
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
-    """Store the arguments of the operations of group g, sums of `values` without their constants, in `out`."""
+    """Store the arguments of the operations in group g (sums of `values`, without their constants) in `out`."""
     column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
@@ -144,7 +144,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """For each item of `sums`, store `scale` times its sum of `values`, without its constant, in `out`."""
+    """Store each of the `sums` of `values`, multiplied by `scale` and without its constant, in `out`."""
     column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -197,8 +197,8 @@ def start_operations(options, table, values, z, x, y):
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
     """Store the Taylor coefficients of order K > 0 of the results z and arguments x and y of a table of operations.
 
-    x0 and y0 are the coefficients of order 0; `total` is the result of `sum_of_products` for order K. Coefficient K of
-    a pending product's second factor is not yet known: the term with this coefficient is left out.
+    x0 and y0 are the coefficients of order 0; `total` is the result of `sum_of_products` for order K. The second factor
+    of a pending product has no coefficient of order K yet: the term with this coefficient is left out.
     """
     groups = _integer_array(options, table + GROUPS)
     inverse = 1.0 / K
@@ -240,7 +240,7 @@ def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
 
 @merged
 def _fill_second_factors(options, table, values, y):
-    """Store the second factors of pending products in y; they are sums of `values`, which include accelerations."""
+    """Store the second factors of pending products in y: sums of `values`, which include accelerations."""
     groups = _integer_array(options, table + GROUPS)
     _fill_arguments(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
 
@@ -275,7 +275,7 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Store the coefficients of t and q to order 1, of v and early operations to order 0; set r and c to zero."""
+    """Store coefficients: of t and q up to order 1, of v and early operations of order 0; set r and c to zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -288,7 +288,7 @@ def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
 
 @merged
 def integrate_coefficients(K, unit, N, series, a):
-    """Store in N and `series` coefficients K of v and K + 1 of q, the integrals of coefficient K - 1, a (n)."""
+    """Store coefficients K of v and K + 1 of q in N and `series`: integrals of a (n), coefficient K - 1."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
     for j in range(n):
@@ -310,7 +310,7 @@ def finish_series(w, order, series):
 
 @compiled
 def compute_coefficients(f, w, options, memory, t, state, unit):
-    """Store the series with index TARGET about `state` at t, in the unit of time `unit` (s); return a code.
+    """Compute the series about `state` at t, in the unit of time `unit` (s), as series TARGET; return a code.
 
     The linear equations of each order are solved with the factors in w.
     """
@@ -352,25 +352,25 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-# step sizes are chosen for this distance from the constraints before projection, relative to the allowed distance
+# ends of steps should have this distance from the constraints, before projection, relative to the allowed distance
 TARGET_PREDICTION_ERROR = 0.3
 # a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
 # times the defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
-# places where the defect is checked shift by this fraction of their spacing at each attempt: multiples of the golden
-# section have evenly distributed fractional parts, so that no place is missed for long
+# the times at which the defect is checked shift by this fraction of their spacing at each attempt: multiples of the
+# golden section have evenly distributed fractional parts, so that no time within a step is missed for long
 GOLDEN_SECTION = 0.6180339887498949
-MAX_DEFECT = 1e300  # replaces an infinite defect, which is returned if a function has no finite value within the step
-MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
+MAX_DEFECT = 1e300  # replaces an infinite defect, which means that a function has no finite value within the step
+MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
-TOO_SHORT = 2.0  # error returned to reject a first step because the series allows a much longer step
+TOO_SHORT = 2.0  # error that rejects a first step because the series allows a much longer step
 
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, index):
-    """Store series `index` about `state`, the result of the last projection, at t in `memory`; return a code."""
+    """Compute the series about `state` at t, the result of the last projection, as series `index`; return a code."""
     n = w.Q.size
     memory[TARGET] = index
     if f.is_generated == 1 and w.used_general == 0.0:  # generated code leaves no factors in w
@@ -383,7 +383,7 @@ def _compute_series(f, w, options, memory, t, state, unit, index):
 
 @merged
 def _max_step(tolerances, series, unit, order, n):
-    """Return the step size, in units of `unit` (s), up to which the last two terms are within the tolerances."""
+    """Return the largest step size, in units of `unit` (s), with which the last two terms are within the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -488,7 +488,7 @@ def _factor_after_large_defect(defect, order):
 
 @kernel(COMMIT)
 def commit_taylor(f, w, options, memory, tolerances, accepted):
-    """Make the series about the end of an accepted step the current one, from which the next step is computed."""
+    """After an accepted step, make the series about its end the current series, by which the next step is computed."""
     if accepted and memory[TRIED] == 1.0:
         memory[CURRENT] = 1.0 - memory[CURRENT]
         memory[UNIT], memory[ALLOWED_SIZE] = memory[NEXT_UNIT], memory[NEXT_ALLOWED_SIZE]
@@ -518,11 +518,11 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
-        error = x / memory[ALLOWED_SIZE]  # an upper bound if at most 1: the error is about a power of this ratio
+        error = x / memory[ALLOWED_SIZE]  # the error is about a power of this ratio, which is a bound if at most 1
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
-        was_near_singular = w.nearly_singular != 0.0  # true from the first singular position of the run on
+        was_near_singular = w.nearly_singular != 0.0  # true once the run has come near a singular position
         checks_defect = w.near_now == 0.0  # near singular positions, accelerations off the constraints are wrong
         w.near_now = 0.0 if checks_defect else 2.0
         ratio_to_gap = gap_ratio(tolerances, h)
@@ -547,7 +547,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     distance = prediction_error(w, tolerances, h, q, v, q1)
     memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
     if distance > 0.0:
-        # if MAX_GROWTH or a force ahead shortened the step, x / ALLOWED_SIZE counts as at least 1 / MAX_GROWTH
+        # if MAX_GROWTH or a force ahead has shortened the step, x / ALLOWED_SIZE counts as at least 1 / MAX_GROWTH
         allowed_factor = (TARGET_PREDICTION_ERROR / distance) ** (1.0 / order)
         memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / MAX_GROWTH) * allowed_factor)
     if distance > 1.0:

@@ -1,13 +1,13 @@
 """Estimate the position errors that velocity errors cause, for methods whose steps are longer than vibrations.
 
 A velocity error e changes the positions until e changes its sign or decays. Its duration is sqrt(|e| / |J J e|), where
-J is the Jacobian of (v, F). So an error due to a force that jumps within a step lasts long and counts, and an error of
-fast vibrations hardly counts. There are two exceptions:
+J is the Jacobian of (v, F), with accelerations F. So an error due to a force that jumps within a step lasts long and
+counts, and an error of fast vibrations hardly counts. There are two exceptions:
 
 - The duration is that of the fastest component of e. If a stiff damper acts beside a contact, the component in slow
   directions lasts much longer. A filter with the time constant of several steps leaves only this component.
-- If J was computed by differences before a contact began or ended, the duration is wrong, though Newton's method still
-  converges. `derivatives_agree` detects this.
+- If J was computed by differences before a contact began or ended, the duration is wrong, although Newton's method
+  still converges. `derivatives_agree` detects this. (`w`: workspace, `f`: kit)
 """
 
 import numpy as np
@@ -20,13 +20,13 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# largest factor on the duration of a velocity error that changes as slowly as the motion: no vibration causes the
-# error, which has the same sign in later steps, so that errors add up
+# largest factor on the duration of a velocity error that changes as slowly as the motion: no vibration causes such an
+# error, which keeps its sign in later steps, so that errors add up
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, in units of tolerances[GAP]
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
-FAST_DURATION = 20.0  # a velocity error may change fast if its duration, in units of z = h gamma, is smaller than this
-OUTDATED_CHANGE = 0.3  # J counts as outdated if its relative change is larger than this
+FAST_DURATION = 20.0  # a velocity error may change fast if its duration is below this multiple of z = h gamma
+OUTDATED_CHANGE = 0.3  # J counts as outdated if its relative change exceeds this
 
 
 @compiled
@@ -35,7 +35,7 @@ def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once,
 
     `unfiltered` (n_dof) is the velocity error; `filtered_once` and `filtered_twice` (n_dof) are this error after one
     and two filters (I - z J)^-1. `a1` (n_q) are the accelerations at the end of the step, which show how fast the
-    motion changes after a contact has begun within the step. Stores the duration of the error in ERROR_DURATION.
+    motion changes after a contact has begun within the step. Store the duration of the error in ERROR_DURATION.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
@@ -58,7 +58,7 @@ def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once,
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
     """Return the largest effect, in units of the tolerances, of a velocity error e_v (n_dof) that lasts `duration` (s).
 
-    The effect on a coordinate is the smaller of two ratios: velocity error to velocity tolerance, and position error,
+    The effect on a coordinate is the smaller one of two ratios: velocity error to velocity tolerance; position error,
     |e_v| times `duration`, to position tolerance.
     """
     n = w.Q.size
@@ -104,9 +104,9 @@ def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, 
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
     """Return whether the stored derivatives J agree with the equations at the end of a step, t, or do not matter.
 
-    (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `unfiltered` (n_dof each). So (e_v - unfiltered) / z
-    is the velocity part of J (e_q, e_v). This product is compared with the difference of the accelerations between the
-    end of the step and a state displaced from it by a multiple of (e_q, e_v).
+    (e_q, e_v) is (I - z J)^-1 times an error whose velocity part is `unfiltered` (n_dof each). So the velocity part of
+    J (e_q, e_v) is (e_v - unfiltered) / z. It is compared with the difference between the accelerations at the end of
+    the step and at a state that is displaced from this end by a multiple of (e_q, e_v).
     """
     n = w.Q.size
     max_duration = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
