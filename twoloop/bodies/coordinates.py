@@ -43,9 +43,9 @@ class JointCoordinate:
 
     Notes
     -----
-    The coordinates of a planar body count turns. Those of a body in space do not: there, the angle of a single state
-    is right within 0.95 of a turn from the position given, NaN about a whole turn, and repeats after two turns. Along
-    many states, turns are counted from one to the next. A screw takes its angle from its displacement, without limits.
+    The coordinates of a planar body count turns. Those of a body in space do not: there, the angle of a single state is
+    right within 0.95 of a turn from the position given, NaN about a whole turn, and repeats after two turns. Along many
+    states, turns are counted from one state to the next. A screw takes its angle from its displacement, without limits.
 
     Examples
     --------

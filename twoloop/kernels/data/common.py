@@ -291,9 +291,8 @@ def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatch
 
 
 # forceinline is always set explicitly, because a callee inherits the flags of its caller: otherwise, all helpers that a
-# merged helper calls would be merged, too.
-# exact: the order of floating-point operations stays as in the source
-exact = _helper_decorator(fastmath=False, forceinline=False)
+# merged helper calls would be merged, too
+exact = _helper_decorator(fastmath=False, forceinline=False)  # keeps the order of floating-point operations
 compiled = _helper_decorator(forceinline=False)  # compiled as one function, which LLVM inlines only if it is short
 inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
 # inlined by LLVM: each call becomes a copy of the code. For short helpers, and for helpers used in every evaluation

@@ -3,8 +3,7 @@
 The first rows of G are C_q, from C(t, q) = 0; the other rows are A, from A(t, q) v + b(t, q) = 0.
 
 Gamma, the right-hand side of G a = Gamma, is a derivative along the motion. Two central differences, with the steps e
-and 2 e (s), yield Gamma to order 4. Their disagreement estimates the error, by which the step e is chosen. `f` is the
-kit, and `w` the workspace.
+and 2 e (s), yield Gamma to order 4. Their disagreement estimates the error, by which the step e is chosen.
 """
 
 import numpy as np

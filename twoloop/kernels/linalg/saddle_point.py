@@ -5,7 +5,6 @@
   (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
 - MULTIPLIERS: by the Schur complement G M^-1 G^T.
 - AUGMENTED: by sparse factors of the augmented matrix [M G^T; G 0], in which M is multiplied by w.mass_scale.
-
 """
 
 import numpy as np
