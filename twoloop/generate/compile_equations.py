@@ -1,15 +1,15 @@
 """Compile the equations of one mechanism: accelerations and projections, which explicit methods call.
 
 The operations of an elimination become LLVM instructions one by one, without numba, which would take seconds for a few
-hundred operations. The code is cached on disk like that of the kernels.
+hundred operations. The code is cached on disk, like the code of the kernels.
 
 **Accelerations** are computed by one of two programs. The program with the fewest operations (null_space.py) divides by
-fixed pivots. If one of these pivots is small, a function of the module computes the accelerations by an elimination
-that begins with M. In SIMD lanes this function is called for all lanes if one lane needs it; the other lanes keep their
-results, so that the result of a run does not depend on the runs in other lanes.
+fixed pivots. If one of these pivots is small, another function of the LLVM module computes the accelerations by an
+elimination that begins with M. In SIMD lanes, this function is called for all lanes if one lane needs it; the other
+lanes keep their results, so that the result of a run does not depend on the runs in other lanes.
 
 **Long equations** are split into functions that call one another, each compiled once: the time that LLVM takes grows
-faster than the length of a block. The values of long equations are stored in memory in any case. Accelerations and both
+faster than the length of a block. The values of long equations would be stored in memory anyway. Accelerations and both
 projections share the functions for the factors of the matrix at a position, and for the solution with these factors.
 """
 
@@ -36,9 +36,9 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# generated code is used if accelerations at the start are wrong by at most this fraction; in runs it grew 200 times
+# generated code is used if accelerations at the start have at most this relative error; in runs it grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, DISTANCE = 4, 0.02  # positions at which this error is measured, and their distance
+MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions that are tried for this measurement, and their distance
 
 
 def write_accelerations(
@@ -46,7 +46,7 @@ def write_accelerations(
 ) -> tuple[list[Value], Value]:
     """Write code for the accelerations at `inputs`, [t, q, v]; return their values, and a flag: whether they are valid.
 
-    On return, the builder may be in another block. `emit` must have the pointers to the coefficients.
+    On return, the builder's current block may be another one. `emit` must have the pointers to the coefficients.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -66,7 +66,7 @@ def write_acceleration_function(
 ) -> None:
     """Write a function that computes accelerations from t, q, v and the coefficients.
 
-    The function stores them in its last argument and returns true if they are valid, else it stores nothing.
+    If the accelerations are valid, the function stores them in its last argument and returns true.
     """
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, coefficients: Value, out: Value) -> Value:
@@ -105,8 +105,8 @@ def _accelerations(
 ) -> tuple[list[Value], Value]:
     """Write code for the accelerations; return their values, and a flag: whether they are valid.
 
-    If pivots are small, the code calls a function whose elimination begins with M. `state`, which may write code,
-    returns the arguments of this function: t and pointers to q and v.
+    If pivots are small, the code calls a function whose elimination begins with M. The function `state`, which may
+    write code, returns the arguments of this call: t and pointers to q and v.
     """
     program, *alternatives = equations.accelerations
     (a,) = program.run(lowering)
@@ -137,7 +137,7 @@ def _accelerations(
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
-    """Return the name of the function for program `index` of `equations.accelerations`; write it if it is missing."""
+    """Return the name of the function for program `index` of `equations.accelerations`; write a missing function."""
     program, is_mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if is_mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
@@ -161,7 +161,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return the pointer to the array of coefficients; in SIMD lanes, to the arrays of varying and of shared ones."""
+    """Return the pointer to the array of coefficients; in SIMD lanes: to varying, and to shared coefficients."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -170,17 +170,17 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# equations with more operations than this are split into functions, which halves the time to compile. SPLIT_ALL: the
-# number if there is no reduced program for the accelerations, which are then split, too, and run 50 % longer
+# projections with more operations than SPLIT_PROJECTIONS are split into functions, which halves the time to compile. If
+# accelerations have no reduced program, SPLIT_ALL is the limit: then they are split, too, and take 50 % longer to run
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
-    """Generator that splits long equations into parts: functions of the module that other functions call.
+    """Generator that splits long equations into parts: functions of the LLVM module that other functions call.
 
     solution : solution of the linear equations; `stored_indices` lists the quantities that the parts share.
-    position_programs, solution_programs : programs by names of parts. Their inputs are t, q, v (position_programs), or
-        r, c and the stored factors.
+    position_programs : programs by names of parts, with inputs t, q, v.
+    solution_programs : programs by names of parts, with inputs r, c and the stored factors.
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -225,7 +225,7 @@ class SplitFunctions:
     # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write `calls`, pairs of a part's name and its arguments, and missing parts; return whether all are valid."""
+        """Write `calls` (pairs: name of a part, arguments), and missing parts; return whether all results are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -252,13 +252,13 @@ class SplitFunctions:
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
         for i, location in locations.items():
-            if graph.operations[i] is None:  # this entry is t or a coordinate
+            if graph.operations[i] is None:  # this quantity is an input: t or a coordinate
                 emit.store(lowering.value(i), *location)
         lowering.run(graph, graph.quantities_by_use(solution.factor_program.expressions), locations)
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that computes a program, with quantities `stored` in memory; return whether they are valid."""
+        """Write the part for a program whose quantities `stored` are in memory; return whether results are valid."""
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
         results = program.run(lowering)
@@ -267,7 +267,7 @@ class SplitFunctions:
                 emit.store(value, array, j)
         return lowering.is_valid(program, results[0])
 
-    # methods called from outside: they write bodies of functions for kernels, and code of collocation steps in lanes
+    # methods for other classes: they write bodies of functions for kernels, and code of collocation steps in lanes
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         """Write code that stores the accelerations at (t, q, v) in `a`; return whether they are valid."""
@@ -280,7 +280,7 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Write code that stores q after a Newton step in `out`, its change in `moved`; return whether it is valid."""
+        """Write code that stores q after a Newton step in `out`, its change in `moved`; return whether it succeeds."""
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         _write_zeros(emit, self.n, r)
@@ -336,13 +336,13 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return pointers to four arrays on the stack: stored quantities, r, c, and one for either v or multipliers."""
+        """Return pointers to four arrays on the stack: stored quantities; r; c; velocities or multipliers."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
 
 def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
-    """Emit a return of false for invalid results, before the output arrays are written; emit none in SIMD lanes."""
+    """Except in SIMD lanes, emit code that returns false if results are invalid, before it writes output arrays."""
     if is_valid.type == BIT:
         emit.builder.return_false_unless(is_valid)
 
@@ -366,7 +366,7 @@ def write_function(
 ) -> None:
     """Write a function that computes the arrays of a program from its inputs and its coefficients.
 
-    The function returns whether the conditions hold and the first array is finite; if not, it changes no array.
+    If the conditions hold and the first array is finite, the function returns true; else it leaves the arrays alone.
     """
 
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
@@ -383,7 +383,7 @@ def write_function(
 
 
 class SharedCode:
-    """Compiled functions for the equations of one or more systems; they are read from the disk if they are cached.
+    """Compiled functions for the equations of one or more systems; cached functions are read from the disk.
 
     numbers : coefficients that the functions read.
     digest : digest of everything that the functions depend on, except the values of coefficients.
@@ -442,7 +442,7 @@ class GeneratedCode(NamedTuple):
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads
     traced: CallbackTraces
-    evaluate: Evaluator  # evaluates arrays of expressions, from the shared trace cache, for this system's parameters
+    evaluate: Evaluator  # function that evaluates expressions of the shared trace cache for this system's parameters
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -450,7 +450,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return whether a run from (t0, q0) may use this code: its pivots must be those chosen at this start."""
+        """Return whether a run from (t0, q0) may use this code: (t0, q0) must lead to the same choice of pivots."""
         try:
             return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
@@ -458,7 +458,7 @@ class GeneratedCode(NamedTuple):
 
 
 def _choice_at(system: ConstrainedSystem, t: float, q: Array) -> PivotChoice:
-    """Return the PivotChoice at a position, cached for the last one."""
+    """Return the PivotChoice at a position; the choice at the last position is cached."""
     choice: PivotChoice
     choice = system.remembered_at("choice", (t, q.tobytes()), lambda: PivotChoice.choose(system, t, q))
     return choice
@@ -467,7 +467,7 @@ def _choice_at(system: ConstrainedSystem, t: float, q: Array) -> PivotChoice:
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = accept_traces) -> GeneratedCode:
     """Return the cached code for a system and a start; `check` raises if calls of callbacks differ from their traces.
 
-    Raises ValueError if code for the equations cannot be generated.
+    Raise ValueError if code for the equations cannot be generated.
     """
     try:
         choice = _choice_at(system, t0, q0)
@@ -484,10 +484,10 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 
 
 def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
-    """Return the largest relative error of the accelerations of generated code, at rest at a start or near it.
+    """Return the largest relative error of accelerations by generated code, for zero velocities at and near a start.
 
-    Two functions compute them, with and without a projection, because their pivots may differ. The error is infinite if
-    pivots are too small at all positions.
+    Accelerations are computed with and without a projection: by two functions, whose pivots may differ. The error is
+    infinite if pivots are too small at all positions.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)
@@ -506,9 +506,9 @@ def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) 
         gamma = np.concatenate([system.evaluate(kind, t0, q, new_v) for kind in kinds])
         matrix = np.block([[mass, G[rows].T], [G[rows], np.zeros((len(rows), len(rows)))]])
         right, exact = np.concatenate([force, gamma[rows]]), np.zeros(n + len(rows))
-        for _ in range(3):  # with refinement
+        for _ in range(3):  # solve, and then refine the solution twice
             exact += np.linalg.solve(matrix, right - matrix @ exact)
-    except ValueError:  # gamma is found by differences, or forces are not defined, or the matrix is singular
+    except ValueError:  # gamma is computed by differences, or forces are not defined, or the matrix is singular
         return 0.0
     heavy = mass.diagonal() > 0.0
     size = max(np.abs(exact[:n]).max(), np.abs(force[heavy] / mass.diagonal()[heavy]).max(initial=0.0))

@@ -1,7 +1,7 @@
 """Derive C_q, C_t and Gamma exactly from traced callbacks.
 
-Programs replace the callbacks that a system does not have. The callbacks that it has are compared with the exact
-derivatives, instead of finite differences.
+Programs replace the callbacks that a system does not have. The callbacks that a system has are compared with exact
+derivatives, which is better than a comparison with finite differences.
 """
 
 import copy
@@ -20,14 +20,14 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# callbacks that are derived if a system does not have them, and the attributes of the system with their numbers of rows
+# callbacks that are derived if a system does not have them; values: attribute of the system with the number of rows
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
 class DerivedPrograms:
     """Programs that replace missing callbacks, shared by the systems of a trace cache.
 
-    programs : for each kind of callback, a program and the flat indices of its results in the callback's array.
+    programs : for each kind of callback, a program and the indices of its results in the callback's flattened array.
     traced : the traces from which the programs were derived.
     """
 
@@ -58,10 +58,10 @@ class DerivedSystem(NamedTuple):
 
 
 def derive_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
-    """Return a system with programs in place of missing C_q and Gamma, and a tuple with the traces used for them.
+    """Return a system with programs in place of missing C_q and Gamma, and a tuple of the traces behind them.
 
-    If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple: finite
-    differences then replace missing callbacks. `check` raises Untraceable if the traces are wrong.
+    If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple; in the second
+    case, finite differences replace missing callbacks. `check` raises Untraceable if the traces are wrong.
     """
     missing = [kind for kind, size in DERIVABLE_CALLBACKS.items() if getattr(system, size) and kind not in system.given]
     if not missing:
@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return missing C_q and Gamma by kind of callback ("gamma": both kinds), as expressions by flat array index."""
+    """Return missing C_q and Gamma by kind of callback, as expressions by index in the flattened array."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -102,13 +102,13 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 Array = NDArray[np.float64]
 
 MAX_ENTRIES = 50_000  # callbacks are compared with exact derivatives if C_q and A have at most this many entries
-# displacements from the start at which derivatives are compared: of q, relative to the sizes of the coordinates, and of
+# derivatives are compared at these displacements from the start: of q, relative to the sizes of the coordinates, and of
 # t, relative to FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = accept_traces) -> CallbackTraces | None:
-    """Return the exact derivatives C_q, C_t and Gamma as traces, to be compared with the callbacks for them.
+    """Return the exact derivatives C_q, C_t and Gamma as traces, to be compared with callbacks.
 
     Return None if there are too many entries, callbacks cannot be traced, or `check` raises for the traces.
     """
@@ -125,7 +125,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
     equations = cache.equations(system)
     callbacks = [kind for kind in ("jacobian", *GAMMA_SOURCES) if kind in system.given]
     exprs = {kind: equations.derivatives(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
-    # the derivatives come from traces, with which these callbacks must agree
+    # derivatives are correct only if the callbacks that were differentiated agree with their traces: compare these, too
     exprs |= {kind: equations.expressions(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return CallbackTraces(system, equations.graph, exprs)
 
@@ -133,7 +133,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
 def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Return whether callbacks for C_q, C_t and Gamma agree with the exact derivatives at states near a start.
 
-    Raises ValueError if C depends on time, at least far from the start, but there is no callback for C_t.
+    Raise ValueError if C depends on time, perhaps only far from the start, but there is no callback for C_t.
     """
     direction = generic_factors(len(q)) * sizes(q)
     states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * direction) for displacement in DISPLACEMENTS]
@@ -142,7 +142,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
         try:
             with np.errstate(all="ignore"):
                 difference = traced.difference(system, generic_states([(*state, v) for state in states]))
-        except Exception as error:  # outside the domain of the callbacks
+        except Exception as error:  # the state is outside the domain of the callbacks
             raise Untraceable(str(error)) from error
         if difference is not None:
             raise Untraceable(difference)

@@ -6,12 +6,12 @@ The matrix of
     [G  0  ] [lam] = [Gamma]
 
 with G = [C_q; A] is eliminated without its structural zeros, in an order that is chosen once. Each row of G is
-eliminated after its coordinates. So the pivots are those of the definite matrices M and -G M^-1 G^T: none is zero.
+eliminated after its coordinates. So the pivots are pivots of the definite matrices M and -G M^-1 G^T: none is zero.
 
-- If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows. The
-  generated code then reports that its results are invalid.
+- If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows, and
+  the generated code reports that its results are invalid.
 - The same factors are used to compute the nearest position and velocity on the constraints, in the metric of M.
-- If M is singular, rows g of G are added to it: M + g^T g. This changes neither accelerations nor projections.
+- If M is singular, rows g of G are added to M: M + g^T g. This changes neither accelerations nor projections.
 - If rows of G are redundant, the equations contain independent rows only.
 """
 
@@ -44,27 +44,27 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # rows of G are added to M if the ratio of its smallest to its largest eigenvalue is below this
-RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is smaller than this fraction of the row
+SINGULAR_MASS = 1e-10  # rows of G are added to M if M has a smaller ratio of the smallest to the largest eigenvalue
+RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is below this fraction of the row
 PIVOT_FRACTION = 0.01  # the pivot of a row of G must be at least this fraction of the smallest pivot at the start
 # possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to its pivot without
-# the other rows; with pivots below the last value, rounding errors would dominate
+# the other rows. If pivots were below the last of these values, rounding errors would dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
-# MIN_PIVOTS[i] is chosen for the first i for which the smallest pivot at the start is at least START_LIMITS[i]; if
-# there is none, MIN_PIVOTS[-1] is chosen
+# MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] at most the smallest pivot at the start; without such an
+# i, MIN_PIVOTS[-1] is chosen
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 N_FEW_COORDINATES = 24  # with more coordinates, MIN_INDEX_MANY replaces MIN_INDEX_FEW
-# all rows of G may be added to M if the index in MIN_PIVOTS is at least this, that is, if pivots are small.
-# MIN_INDEX_FEW: with up to N_FEW_COORDINATES coordinates. MIN_INDEX_FEW_SINGULAR: if M is singular as well, as Euler
-# parameters lose two digits even in sound models. MIN_INDEX_MANY: with more coordinates, as code gets longer
+# if pivots are so small that their index in MIN_PIVOTS is at least this limit, all rows of G may be added to M.
+# MIN_INDEX_FEW: limit with up to N_FEW_COORDINATES coordinates. MIN_INDEX_FEW_SINGULAR: if M is also singular, because
+# Euler parameters lose two digits even in sound models. MIN_INDEX_MANY: for more coordinates, because code gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
-ADDED_SIZE = 16.0  # approximate largest entry of s G^T G, which is added to M, relative to the largest entry of M
-MAX_PIVOT_RATIO = 1e5  # no refinement is needed if entries of M, with added rows, are at most this times their pivots
-SCALE_STEP = 1024.0  # scales of added rows differ by powers of this factor, which rarely change from start to start
+ADDED_SIZE = 16.0  # if s G^T G is added to M, approximate ratio of its largest entry to the largest entry of M
+MAX_PIVOT_RATIO = 1e5  # solutions need refinement if an entry of M with added rows exceeds this multiple of its pivot
+SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large step, so that they rarely depend on the start
 DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
 MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number
-# dependent coordinates are eliminated if there are at least this many rows of G per coordinate; with fewer rows, the
-# linear system for the multipliers is the smaller one
+# dependent coordinates are eliminated if G has at least this number of rows per coordinate; with fewer rows, the linear
+# system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
 
 PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -75,12 +75,12 @@ class PivotChoice:
     """Decisions of the elimination that depend on the numbers of M and G at a position.
 
     rows : indices of the independent rows of G.
-    added_rows, scales : indices of the rows g of G with which M plus the sum of scale g^T g is definite, and the
-        scales: powers of two with which the added terms are about as large as M.
+    added_rows, scales : indices of rows g of G, and scales (powers of two), such that M plus the sum of scale g^T g is
+        definite, and the added terms are about as large as M.
     min_pivot : smallest allowed pivot of a row of G, relative to its pivot without the other rows; a power of ten.
     blocks : pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which
-        these rows are solved. Empty if expressing dependent coordinates saves no operations, or no pivots are suitable.
-    is_refined : whether solutions are improved by one step of refinement, because pivots may lose digits.
+        these rows are solved. Empty if elimination of dependent coordinates would not pay, or no pivots are suitable.
+    is_refined : whether solutions are improved by one step of refinement, because small pivots may cost digits.
     """
 
     rows: tuple[int, ...]
@@ -94,11 +94,11 @@ class PivotChoice:
     def choose(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
         """Return the PivotChoice for the values of M and G at time t and position q.
 
-        Raises Untraceable if M is singular on velocities that the constraints allow.
+        Raise Untraceable if M is singular on velocities that the constraints allow.
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # without refinement, random models kept 8 digits if pivots were larger, and added rows hid no little inertia
+        # without refinement, random models kept 8 digits, unless pivots were this small or added rows hid small inertia
         is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _hides_little_inertia(choice, mass, G)
         choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
@@ -110,7 +110,7 @@ class DependentColumns:
     rows : indices of the independent rows of G.
 
     Fields:
-    choose : function of G and `arguments` that returns the number of blocks, see kernels/linalg/dependent_columns.py.
+    choose : compiled function of G and `arguments` that returns the number of blocks, see linalg/dependent_columns.py.
         None: G has too few rows, or the kinds of its entries are unknown.
     """
 
@@ -137,7 +137,7 @@ class DependentColumns:
 
 def _entry_kinds(system: ConstrainedSystem) -> Any:
     """Return the kinds of the entries of G (0: always zero, 1: constant, 2: varies), or None if they are unknown."""
-    if system.called_in_python:  # a function called in Python may store its arguments: it is traced as late as possible
+    if system.called_in_python:  # such functions may store their arguments, and are traced as late as possible
         return None
 
     def make(equations: Callable[[], Equations]) -> Any:
@@ -149,7 +149,7 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(make, partial(cache.equations, system)))
-    if kinds is None:  # callbacks that branch on parameters can be traced for the parameters of one system only
+    if kinds is None:  # a callback branches on parameters: it can be traced only for the parameters of one system
         kinds = system.remembered("kinds of entries", partial(make, partial(Equations, system)))
     return kinds
 
@@ -171,8 +171,8 @@ class PivotChooser:
     def choose(self, mass: Array, G: Array, nearby: Callable[[], tuple[Array, Array]]) -> PivotChoice:
         """Return the PivotChoice, without blocks, for M (n_q, n_q) and G (n_c + n_a, n_q).
 
-        `nearby` returns M and G at another position, at which only entries that are always zero are zero. The
-        exceptions are those of `PivotChoice.choose`.
+        `nearby` returns M and G at another position, at which no entry is zero by chance. Raise the same exceptions as
+        `PivotChoice.choose`.
         """
         system, scratch, chosen = self.system, self._scratch, self._row_indices
         is_definite = system.constant_mass and system.derived.get("no weak mass", False)
@@ -198,7 +198,7 @@ class PivotChooser:
     def _index_with(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
         """Return the index in MIN_PIVOTS of the smallest allowed pivot if `choice.added_rows` are added with `scales`.
 
-        Return -1 if M is not positive definite with them, or if the independent rows are not `choice.rows`.
+        Return -1 if M with added rows is not positive definite, or if the independent rows differ from `choice.rows`.
         """
         scratch, chosen = np.zeros_like(self._scratch), np.zeros_like(self._row_indices)
         added = G[list(choice.added_rows)]
@@ -210,8 +210,8 @@ class PivotChooser:
         """Return the choice for M + s G^T G if its smallest pivot is much larger than for M, else `choice`.
 
         G: the independent rows. `index`: index in MIN_PIVOTS of the choice for M. If a body has little inertia about
-        its joints, such as a rod with a mass in its middle, the rows are nearly dependent in the metric of M, and a
-        smallest pivot of 10^-k costs up to 2 k digits of accelerations. In the metric of M + s G^T G the rows are not
+        its joints, such as a rod with a mass in its middle, rows are nearly dependent in the metric of M, and a
+        smallest pivot of 10^-k costs up to 2 k digits of accelerations. In the metric of M + s G^T G, rows are not
         nearly dependent. If s G^T G is 10^k times as large as M, k digits are lost, and refinement restores them.
         """
         rows = G[list(choice.rows)]
@@ -224,7 +224,7 @@ class PivotChooser:
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _decode(self, index: int) -> PivotChoice:
-        """Return the choice that `self._row_indices` describes; raise Untraceable if `index` is an error code."""
+        """Return the choice that `self._row_indices` contains; raise Untraceable if `index` is an error code."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -252,9 +252,9 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     """Return the factor by which to multiply the scale of each row of G that is added to M.
 
-    The factor is 1 unless M is small in all columns of the row, and the rows `singular` have entries in all of them;
-    then it is a negative power of SCALE_STEP. Otherwise a row on Euler parameters alone, such as their norm, would
-    hide the little inertia of a body beside heavy bodies.
+    The factor is 1 unless M is small in all columns of the row, and the rows `singular` have entries in all these
+    columns; then it is a negative power of SCALE_STEP. Without this factor, a row on Euler parameters alone, such as
+    their norm, would hide the small inertia of a body beside heavy bodies.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0
@@ -262,13 +262,13 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # add 0.25: a mechanism whose parts differ by less than one step and a quarter keeps its digits without a factor
+    # add 0.25, because no digits are lost without a factor if parts of a mechanism differ by up to 1.25 steps
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
 
 def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return whether rows added to M, as in `choice`, differ in scale, or if pivots of the sum are much smaller."""
+    """Return whether rows added to M, as in `choice`, differ in scale, or M with these rows has much smaller pivots."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)
@@ -278,8 +278,8 @@ def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
 
 
 MAX_OPERATIONS = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
-# the `reduced_program` is compiled, too, if it costs at most this fraction of `mass_first_program`: where pivots become
-# small, only the other is valid. At a relative cost of 0.68 (four-bar) it saves 5 % of a run
+# `reduced_program` is compiled in addition if it costs at most this fraction of `mass_first_program`, which is needed
+# anyway where pivots are small. At a relative cost of 0.68 (four-bar), it saves 5 % of a run
 MAX_COST_RATIO = 0.75
 
 
@@ -287,7 +287,7 @@ class Elimination:
     """Symbolic elimination of the equations of a system, with the rows G = [C_q; A].
 
     choice : the decisions that depend on numbers.
-    equations : traced equations of the system, whose graph is extended.
+    equations : traced equations of the system; their graph is extended.
 
     Fields:
     graph : graph of the operations; its first inputs are t, q and v.
@@ -300,12 +300,12 @@ class Elimination:
         "moved" (n_q,), the change of the position, x, with A x = 0.
     projection : program for "q", "moved", "v" (n_q,), the projected velocity, and "a" (n_q,) and "lam" (n_c + n_a,) at
         this velocity. M, G and Q are evaluated at the position before the step.
-    basic_projection : as `projection`, but "lam" is 0 for dependent rows (in `projection` it has the least norm).
+    basic_projection : as `projection`, but "lam" is 0 for dependent rows (in `projection`, "lam" has the least norm).
     position_errors, velocity_errors : programs for "c" (n_c + n_a,), the right-hand sides of the corrections of
         positions, and of velocities.
-    redundant_rows : program without arrays, whose conditions are that the redundant constraints are satisfied.
+    redundant_rows : program without arrays; its conditions hold if the redundant constraints are satisfied.
     split_functions : generator that splits long equations into several functions, set by compile_equations.py.
-    n_operations : number of operations of callbacks and factorization, without the solution with these factors.
+    n_operations : number of operations of callbacks and factorization, but not of the solution with the factors.
     traced : traces of the callbacks.
 
     Raises Untraceable if the equations cannot be generated; the message says why.
@@ -377,7 +377,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return a and lam of the independent rows for M a + G^T lam = r, G a = c, and conditions, see `solve_refined`.
+        """Return the solution a, lam (independent rows) of M a + G^T lam = r, G a = c, and conditions: `solve_refined`.
 
         `c`: one entry for each row of G.
         """
@@ -416,7 +416,7 @@ class Elimination:
 
     @property
     def accelerations(self) -> list[Program]:
-        """Return `reduced_program`, if there is one, and `mass_first_program`, which replaces it if it is not valid."""
+        """Return `reduced_program`, if there is one, and `mass_first_program`, for states where it is not valid."""
         return (
             [self.mass_first_program]
             if self.reduced_program is None
@@ -503,8 +503,8 @@ def multipliers_of_least_norm(
     """Return the multipliers lam (one per row) of least norm with the same G^T lam as the `independent` multipliers.
 
     `all_rows`: G. `rows`, `independent`: indices and multipliers of the independent rows. `solve`: solution with the
-    factors of [M G^T; G 0]. Dependent row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of G^T
-    is spanned by e_i - sum_k Z_ik e_k. The component of lam in this space is subtracted.
+    factors of [M G^T; G 0]. A dependent row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of
+    G^T is spanned by e_i - sum_k Z_ik e_k. The component of lam in this null space is subtracted.
     """
     zero = Affine(graph, 0.0, {})
     lam = [zero] * len(all_rows)
@@ -531,8 +531,8 @@ class FactorAndSolvePrograms:
     other_programs : other programs at the same state; quantities that they share with the factors are stored, too.
 
     Fields:
-    stored_indices : for each quantity that the first step stores, by its index in the graph of `equations`: its index
-        in the array of stored quantities. The factors come first.
+    stored_indices : quantities that the first step stores. Keys: indices in the graph of `equations`; values: indices
+        in the array of stored quantities, which begins with the factors.
     factor_program : program that computes the stored quantities.
     graph : graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the stored factors.
     solution_program : program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for dependent rows.

@@ -1,7 +1,7 @@
 """Record the operations of callbacks in a graph, and differentiate the recorded expressions.
 
 A value is an affine expression c + sum_i c_i x_i of quantities x_i. Quantities are the time, coordinates, velocities,
-and the results of products and functions of affine expressions. An operation that occurs twice is recorded once.
+and results of operations: products and functions of affine expressions. A repeated operation is recorded once.
 """
 
 import math
@@ -25,16 +25,16 @@ from twoloop.kernels.evaluation import operations as op
 # largest number of operations of a derived program or a series: tracing more would take longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
 # A product is recorded once for all its multiples: the constant factors of both arguments are taken out, unless this
-# might underflow or overflow. They stay in if their product is not between MIN_FACTOR and 1 / MIN_FACTOR in magnitude,
-# and in the squares from which a power with an exponent above HIGH_EXPONENT is computed.
+# might underflow or overflow. Factors stay in if the magnitude of their product is not between MIN_FACTOR and
+# 1 / MIN_FACTOR, and in squares that are steps to a power with an exponent above HIGH_EXPONENT.
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
-# reason given in messages when a callback is refused because it compares an expression or converts it to a number
+# reason in messages about a callback that compares an expression, or converts it to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
 
-# functions of `math` that also accept Parameters
+# functions of `math`, replaced by functions that also accept Parameters
 SIN, COS, EXP, LOG, ATAN, SQRT = map(math_function, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
-_equal = float.__eq__  # comparison of the current values of floats or Parameters, which refuse ==
+_equal = float.__eq__  # compares the current values of floats or Parameters; the operator == of Parameters raises
 _magnitude = float.__abs__  # absolute value as a plain float, also for a Parameter
 
 CONVERSION_REASON = (
@@ -45,9 +45,9 @@ CONVERSION_REASON = (
 class Graph(SymbolicObject):
     """Graph of quantities, numbered from 0.
 
-    operations : for each quantity the kind of operation and two arguments, of which the second may be None; None for an
-        input. The second argument of a logarithm or an arctangent is the divisor of its derivative.
-    input_sizes : number of inputs added by each call of `inputs`.
+    operations : for each quantity, the kind of operation and two arguments, the second of which may be None; None for
+        an input. The second argument of a logarithm or an arctangent is the divisor of its derivative.
+    input_sizes : number of inputs that each call of `inputs` has added.
     traced : results of traced callbacks: arrays of expressions by kind of callback.
     """
 
@@ -58,9 +58,9 @@ class Graph(SymbolicObject):
         self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs on which it depends
         self.traced: dict[str, Any] = {}
         self._recorded_quantities: dict[tuple[int, int, int], int] = {}
-        # rank of each factor (by its identifier) in the order of first use, which is the same for all parameter values
+        # keys: identifiers of factors; values: ranks in the order of first use, which no parameter value changes
         self._factor_order: dict[int, int] = {}
-        self._identifiers: dict[Any, int] = {}  # identifier of each key of an expression: keys take long to compare
+        self._identifiers: dict[Any, int] = {}  # integers that stand for keys of expressions: keys take long to compare
         self._quantities: dict[int, Affine] = {}
 
     def copy(self) -> "Graph":
@@ -125,7 +125,7 @@ class Graph(SymbolicObject):
         return self.quantity(quantity)
 
     def quantities_for(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of quantities that `exprs` need, arguments first, except inputs and `available` ones."""
+        """Return the indices of quantities that `exprs` need, arguments first, without inputs and `available` ones."""
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms]
         while stack:
@@ -147,14 +147,14 @@ class Graph(SymbolicObject):
         return [expr for expr in (self.operations[i] or ())[1:] if isinstance(expr, Affine)]
 
     def quantities_by_use(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of the quantities of `quantities_for`, each just before its first use."""
+        """Return the same indices as `quantities_for`, each right before the first use of its quantity."""
         order: list[int] = []
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms][::-1]
         while stack:
             i = stack.pop()
             operation = None if i < 0 else self.operations[i]
-            if i < 0:  # the arguments of ~i, which were above it on the stack, are in `order` by now
+            if i < 0:  # the arguments of quantity ~i were above it on the stack, and are in `order` by now
                 order.append(~i)
             elif i not in needed and operation is not None and i not in available:
                 needed.add(i)
@@ -182,12 +182,12 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return the square; `is_high_power`: it is a factor in a power with an exponent above HIGH_EXPONENT."""
+        """Return the square; `is_high_power`: whether it is a step to a power with an exponent above HIGH_EXPONENT."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 
 def rounded(value: float) -> Any:
-    """Return a number rounded to 41 bits (12 digits); for a Parameter, its rounded scale and its Powers."""
+    """Return a number rounded to 41 bits (12 digits); for a Parameter, return its rounded scale and its Powers."""
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
@@ -198,8 +198,8 @@ def rounded(value: float) -> Any:
 class Affine:
     """Affine expression of quantities with the operators of a number, so that callbacks can run on expressions.
 
-    An expression has no value to be compared. While a callback runs on expressions, operations by which the callback
-    could distinguish expressions from numbers raise an exception.
+    An expression has no value that could be compared. While a callback runs on expressions, an operation raises an
+    exception if it could reveal to the callback that an expression is not a number.
     """
 
     __slots__ = ("cached_identifier", "cached_key", "constant", "graph", "terms")
@@ -265,7 +265,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
-                terms.pop(i, None)  # the term may be absent: c may have underflowed to zero
+                terms.pop(i, None)  # if c has underflowed to zero, there may be no such term
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -363,7 +363,7 @@ class Affine:
         return self._function(op.COSINE, COS)
 
     def as_term(self) -> "Affine":
-        """Return the expression as a number or a multiple of one quantity; record a longer sum as a new quantity."""
+        """Return the expression if it is a number or a multiple of one quantity; else record it as a new quantity."""
         if len(self.terms) + (not _equal(self.constant, 0.0)) < 2:
             return self
         scale, expr = self.normalized()
@@ -382,7 +382,7 @@ class Affine:
         return self.graph.operation(op.ARCTANGENT, self, self * self + 1.0)
 
     def _refuse_numeric_use(self, *_: Any) -> Any:
-        """Refuse an operation that needs a definite value: comparison, conversion, rounding, hash or pickling."""
+        """Refuse an operation that needs a number: comparison, conversion, rounding, hash or pickling."""
         self.graph.refuse(BRANCHING_REASON)
 
     def __float__(self) -> float:
@@ -466,7 +466,7 @@ def is_zero(expr: Affine) -> bool:
 
 
 class Derivative:
-    """Derivatives of expressions along a direction; `direction`: its nonzero components, by indices of inputs."""
+    """Derivatives of expressions along a direction; `direction`: nonzero components, by indices of inputs."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
@@ -483,7 +483,7 @@ class Derivative:
 
     def _differentiate_quantity(self, i: int) -> Affine:
         """Return the derivative of quantity i; first, differentiate the quantities on which it depends."""
-        stack = [i]  # an explicit stack, as products may be nested more deeply than Python allows recursion
+        stack = [i]  # no recursion, because products may be nested more deeply than Python's limit
         while i not in self._derivatives:
             op = self.graph.operations[stack[-1]]
             exprs = () if op is None else [expr for expr in op[1:] if isinstance(expr, Affine)]

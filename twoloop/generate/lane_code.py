@@ -1,8 +1,8 @@
 """Generate code for many runs of one mechanism at once: every number is a vector, with one run in each of its lanes.
 
 `series`, `elimination` and `compile_equations` write the operations. Coefficients are read as vectors, so that each run
-may have its own parameters. The step-size control of Taylor series is generated, too. The layout of the memory is in
-kernels/lanes/layout.py. The code is cached on disk; its key is the structure of the equations.
+may have its own parameters. The step-size control of Taylor series is generated, too. For the memory `work` and its
+fields, such as T, H, NEW, see kernels/lanes/layout.py. Code is cached on disk; its key is the structure of equations.
 """
 
 import hashlib
@@ -49,15 +49,15 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-# after a step is rejected because PREDICTION_ERROR > 1, the next step size is chosen for this PREDICTION_ERROR
+# if a step is rejected because PREDICTION_ERROR > 1, the next step size is chosen for this value of PREDICTION_ERROR
 TARGET_ERROR = 0.3
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
-MAX_REJECTIONS = 10  # largest number of successive rejected steps; after more, the run leaves its lane
+MAX_REJECTIONS = 10  # a run leaves its lane after more successive rejected steps than this
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
 # a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
-CONTRACTION = 0.5  # a projection fails if the ratio of a correction to the previous one is larger than this
-N_PARALLEL = 3  # number of coordinates whose series one loop evaluates: each needs 3 of the 16 vector registers
+CONTRACTION = 0.5  # a projection fails if the ratio of a correction to the previous correction is above this
+N_PARALLEL = 3  # number of coordinates whose series a loop evaluates: each of them needs 3 of the 16 vector registers
 
 
 class LaneMemory(NamedTuple):
@@ -84,7 +84,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Store and return UNIT, the unit of time of the series, s; a new one in new runs and after accepted steps."""
+        """Store and return UNIT, the unit of time of the series, s; choose it in new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -139,7 +139,7 @@ class LaneSteps:
             store_mask(emit, work, field, is_continued)
 
     def evaluate_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Evaluate the series at X units of time; store NEW, `series_a`, and the positions once more as `predicted`."""
+        """Evaluate the series at X units of time; store NEW, `series_a`, and a copy of the positions as `predicted`."""
         memory = self.memory(emit, order, control, work)
         for j, q in enumerate(self.evaluate_positions(emit, memory, emit.load(work, lanes.X))):
             emit.store(q, memory.predicted, j)
@@ -159,7 +159,7 @@ class LaneSteps:
                 power = order - 1 - m
                 row = emit.pointer(memory.series, power * n)
                 for j, (q, v, a) in zip(group, _triples(carried), strict=True):
-                    # a first and q last: in this order each new number takes the register of the old one
+                    # with a first and q last, each new number can take the register of the old number
                     a = a * x + v
                     v = v * x + q
                     new += [q * x + emit.load(row, j), v, a]
@@ -171,7 +171,7 @@ class LaneSteps:
         return positions
 
     def evaluate_defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store DEFECT, the defect of a step at its end (see `compute_defect`), for the accelerations in memory."""
+        """Store DEFECT, the defect of a step at its end, see `compute_defect`, with the accelerations in memory."""
         memory = self.memory(emit, order, control, work)
         a = [emit.load(memory.a, j) for j in range(self.n)]
         emit.store(self.compute_defect(emit, control, memory, a), work, lanes.DEFECT)
@@ -179,11 +179,11 @@ class LaneSteps:
     def compute_defect(self, emit: LaneEmitter, control: Value, memory: LaneMemory, a: list[Value]) -> Value:
         """Return the defect of the series at NEW, relative to the tolerances, see control/step_size.py.
 
-        The defect is the difference between the accelerations of the series and `a`, by the equations of motion.
+        The defect is the difference between accelerations by the series and `a`, accelerations by the equations.
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)
-        # per_duration is infinite if h is 0: then positions set no limit
+        # if h is 0, per_duration is infinite, so that positions set no limit
         duration, per_duration = h / order, order / h
         largest = max_defect = emit.constant(0.0)
         for each in a:
@@ -255,7 +255,7 @@ class LaneSteps:
         store_mask(emit, work, lanes.ACCEPTED, is_accepted)
         n_refused = emit.load(work, lanes.N_REJECTED)
         n_refused = select(is_running & is_refused, n_refused + one, n_refused)
-        # end a run with a value that is not finite: shorter steps could pass the point where equations are undefined
+        # if a value is not finite, end the run: shorter steps could pass the point where the equations are undefined
         n_refused = select(is_valid, n_refused, emit.constant(math.inf))
         emit.store(n_refused, work, lanes.N_REJECTED)
         h_longest = emit.load(work, lanes.H) * select(is_refused, factor, emit.constant(MAX_FACTOR))
@@ -273,7 +273,7 @@ class LaneSteps:
             )
 
     def tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
-        """Return rtol, and a list with atol of each coordinate, broadcast to all lanes."""
+        """Return rtol, and a list of atol for each coordinate, broadcast to all lanes."""
         atol = [broadcast_entry(emit, control, lanes.ATOL + j) for j in range(self.n)]
         return broadcast_entry(emit, control, lanes.RTOL), atol
 
@@ -317,10 +317,10 @@ SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by colum
 
 
 def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: SparseRows) -> Value:
-    """Return a mask of the lanes where det G1 G0^T <= 0, whose steps may have passed a singular position.
+    """Return a mask of the lanes where det G1 G0^T <= 0: steps in these lanes may have passed a singular position.
 
-    G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula
-    the determinant is the inner product of the vectors of their maximal minors, which is positive if the two vectors
+    G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula,
+    the determinant is the inner product of two vectors, the maximal minors of G0 and of G1, and is positive if these
     are similar. A step through a position at which the rows become dependent may lead to another assembly: then all
     minors pass through zero and change their signs. A lane with a zero pivot is in the mask, too.
     """
@@ -336,7 +336,7 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
     one, zero, select, compare = emit.constant(1.0), emit.constant(0.0), emit.builder.select, emit.builder.compare
     remaining, sign = set(range(len(matrix))), one
     while remaining:
-        # pivot of minimum degree: fewest entries in its row, because rows and columns have the same pattern
+        # pivot of minimum degree: its row has the fewest entries (rows and columns have the same pattern)
         i = min(remaining, key=lambda each: (len(matrix[each]), each))
         remaining.remove(i)
         pivot = matrix[i].pop(i)
@@ -355,10 +355,10 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
 
 Array = NDArray[np.float64]
 
-WEIGHT_ROUNDING = 1e-13  # weights of at most this size count as zero: in products such as A A they are rounding errors
+WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero: in products such as A A, they are rounding errors
 
 
-# A, b, c of an explicit Runge-Kutta method whose first stage is the state itself, and weights of two error estimates
+# A, b, c of an explicit Runge-Kutta method (its first stage is the state itself), and weights of two error estimates
 Tableau = tuple[Array, Array, Array, Array, Array]
 
 
@@ -374,7 +374,7 @@ class LaneStages:
 
     @property
     def structure(self) -> list[bytes]:
-        """Return the tableau as a list of bytes; besides n, the code depends on nothing else."""
+        """Return the tableau as a list of bytes; the code depends only on the tableau and on n."""
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
@@ -412,7 +412,7 @@ class LaneStages:
         error = e / emit.function("sqrt", 1.0 + ratio * ratio)
         select, compare = emit.builder.select, emit.builder.compare
         error = select(compare("fcmp ogt", e, zero), error, zero)
-        # the maxima e and d ignore NaN; `total` is NaN if a value is not finite
+        # the maxima e and d ignore NaN; `total` does not: it is NaN if a value is not finite
         error = select(compare("fcmp oeq", total, zero), error, emit.constant(math.inf))
         emit.store(error, work, lanes.ERROR)
 
@@ -426,7 +426,7 @@ class _Coordinate:
         self.old_state = tuple(emit.load(series_pointer, lanes.BEGIN * n + index) for index in (0, n))
         self._acceleration_locations = [(series_pointer, (lanes.SLOPES + k) * n) for k in range(count)]
         self._loaded: dict[int, Value] = {}
-        if count > 1:  # the acceleration of the last stage was just computed, and is not stored yet
+        if count > 1:  # the acceleration of the last stage was just computed, and is not in memory yet
             self._loaded[count - 1] = emit.load(emit.pointer(memory.a, j))
             emit.store(self._loaded[count - 1], *self._acceleration_locations[count - 1])
 
@@ -448,7 +448,7 @@ class _Coordinate:
         return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Store q and v at a stage in NEW; return both. Accelerations have `weights` in v, `position_weights` in q."""
+        """Store q and v at a stage in NEW; return both. `weights`, `position_weights`: of accelerations in v, in q."""
         emit, (q, v) = self.emit, self.old_state
         drift = float(weights.sum()) * v
         q = q + x * (drift + x * self.sum(position_weights))
@@ -459,17 +459,17 @@ class _Coordinate:
 
 
 GOLDEN_SECTION = 0.6180339887498949  # the multiples of this number, modulo 1, are spread evenly on [0, 1]
-MAX_PARTS = 1000.0  # largest number of parts of a step, between which the defect is evaluated
-MAX_SERIES_OPERATIONS = 1500  # largest number of operations of a series: this many take some seconds to compile
+MAX_PARTS = 1000.0  # largest number of parts of a step; the defect is evaluated between parts
+MAX_SERIES_OPERATIONS = 1500  # largest number of operations of a series; to compile 1500 takes some seconds
 
 
 class LaneCode(LaneSteps):
     """Generator of the code of one mechanism for SIMD lanes, including the step-size control.
 
     series : whether to generate code for the Taylor series, too.
-    tableau : tableau of an explicit method for whose stages code is generated.
+    tableau : tableau of an explicit method, to generate code for its stages.
 
-    Raises Untraceable if the equations, or their series, cannot be generated; the message says why.
+    Raise Untraceable if the equations, or their series, cannot be generated; the message says why.
     """
 
     def __init__(
@@ -498,7 +498,7 @@ class LaneCode(LaneSteps):
         self._row_program = Program(equations.graph, {"G": [rows[k, j] for k, j in self._row_entries]})
         programs = [*equations.accelerations, equations.position_projection, equations.basic_projection]
         programs += [equations.redundant_rows, *([self.solution.factor_program] if series else [])]
-        # coefficients of the program for G must get indices, also if the code is read from the disk
+        # coefficients of the program for G must get their indices even if the code is read from the disk
         self.structure = self._structure(programs if series else [*programs, self._row_program])
         self.n_numbers = self.numbers.n_varying
         programs += [self.solution.solution_program] if series else []
@@ -556,8 +556,8 @@ class LaneCode(LaneSteps):
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Store WORST_DEFECT, the largest defect at equidistant times within the step, at most GAP apart.
 
-        T_NEW becomes each of these times, and finally the end of the step. SHIFT is a multiple of the golden section
-        modulo 1, which moves the times as far as GAP allows, so that they differ from step to step.
+        T_NEW becomes each of these times, and finally the end of the step. The times are shifted by SHIFT, a multiple
+        of the golden section modulo 1, as far as GAP allows, so that they differ from step to step.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -585,7 +585,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct the positions NEW once where ACTIVE is 1; store in ACTIVE and UNCONVERGED where this succeeds."""
+        """Correct the positions NEW once in lanes with ACTIVE = 1; set ACTIVE and UNCONVERGED: 1 if this succeeds."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -678,13 +678,13 @@ class LaneCode(LaneSteps):
 class LaneConstraints(LaneSteps):
     """Generator of the code for C, C_t and the entries of C_q in SIMD lanes.
 
-    system : without nonholonomic rows.
+    system : a system without nonholonomic rows.
 
     Fields:
     pattern : sparsity pattern of C_q: first, for each row, the index in `pattern` of its first column; then the length
         of `pattern`; then the columns of the entries of all rows.
 
-    Raises Untraceable if the constraints cannot be generated; the message says why.
+    Raise Untraceable if the constraints cannot be generated; the message says why.
     """
 
     tasks = lanes.TASKS_OF_STARTS
@@ -724,7 +724,7 @@ FILE_PREFIX = "lanes"  # first part of the names of cached files
 
 
 class GeneratedLanes(Generic[Code]):
-    """Compiled code of a mechanism for SIMD lanes, with a method that computes the code's coefficients from parameters.
+    """Compiled code of a mechanism for SIMD lanes; its coefficients are computed from parameters.
 
     tape : tape of the parameters with which `code` was traced.
     """

@@ -1,10 +1,10 @@
 """Write code for SIMD lanes, where every number is a vector, and for the recurrences of a Taylor series in lanes.
 
-The recurrences compute the coefficients of one order from those of lower orders. The Taylor coefficients of the factors
-of products are stored in rows, one row for each order; a factor that several products share is stored once.
+The recurrences compute the coefficients of one order from coefficients of lower orders. The Taylor coefficients of the
+factors of products are stored in rows, one row for each order; a factor that several products share is stored once.
 
-Usually each lane has its own run. In collocation steps each lane has a stage of one run; for such vectors, `load_lanes`
-and `store_lanes` have indices that count numbers instead of vectors.
+Usually each lane has its own run. In collocation steps, each lane has a stage of one run; for such vectors, the indices
+of `load_lanes` and `store_lanes` count numbers, not vectors.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,11 +29,11 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.kernels.lanes.layout import LANES
 
-# polynomials for log2 on [1, 2] and 2^x on [-1/2, 1/2]: coefficients, lowest power first, by least squares at Chebyshev
-# points. The errors of the polynomials, 2e-06 and 1e-07, are small enough for step sizes
+# coefficients, lowest power first, of polynomials for log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at
+# Chebyshev points. Their errors, 2e-06 and 1e-07, are small enough for step sizes
 LOG2_COEFFICIENTS = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
 EXP2_COEFFICIENTS = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
-MAX_EXPONENT, MIN_ARGUMENT = 1000.0, 1e-300  # largest |x| in 2^x, and smallest argument of log2: others would overflow
+MAX_EXPONENT, MIN_ARGUMENT = 1000.0, 1e-300  # limits that prevent overflow: of |x| in 2^x, and of arguments of log2
 
 
 class LaneEmitter(Emitter):
@@ -62,7 +62,7 @@ class LaneEmitter(Emitter):
         return self.broadcast(super().load_constant(value))
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal, or a loaded Coefficient, which has the same value in all lanes unless it varies."""
+        """Return a literal, or a Coefficient loaded from memory, which is equal in all lanes unless it varies."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
@@ -80,12 +80,12 @@ class LaneEmitter(Emitter):
         return base
 
     def load(self, base: Value, index: int = 0, constant: bool = False) -> Value:
-        """Return vector number `index` of the array at `base`, loaded from memory."""
+        """Return the vector with the index `index` of the array at `base`, loaded from memory."""
         pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{self.double_type}*")
         return self.builder.load(pointer, constant=constant)
 
     def store(self, value: Value, base: Value, index: int = 0) -> None:
-        """Store `value` as vector number `index` of the array at `base`."""
+        """Store `value` as the vector with the index `index` of the array at `base`."""
         self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, index), f"{self.double_type}*"))
 
     def function(self, name: str, x: Value) -> Value:
@@ -98,7 +98,7 @@ class LaneEmitter(Emitter):
         return result
 
     def max_over_lanes(self, x: Value) -> Value:
-        """Return the largest number of all lanes; LLVM's reduction, which treats NaN exactly, would be sequential."""
+        """Return the largest number in all lanes; LLVM's own reduction would be sequential, to treat NaN exactly."""
         width = self.lanes
         while width > 2:
             width //= 2
@@ -128,11 +128,11 @@ class LaneEmitter(Emitter):
         return power * self.polynomial(EXP2_COEFFICIENTS, x - whole)
 
     def minimum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the smaller of a and b, or a if one of the two is NaN: if a is NaN, the result is NaN."""
+        """Return the smaller one of a and b, or a if either is NaN; so the result is NaN if a is NaN."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def maximum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the larger of a and b, or a if one of the two is NaN: if a is NaN, the result is NaN."""
+        """Return the larger one of a and b, or a if either is NaN; so the result is NaN if a is NaN."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
 
@@ -147,7 +147,7 @@ def store_lanes(emit: LaneEmitter, value: Value, base: Value, index: int = 0) ->
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """Return the sums of the elements of a, and of b, which are computed by the same instructions."""
+    """Return the sum of the elements of a and the sum of the elements of b, computed by the same instructions."""
     builder, half = emit.builder, STAGES // 2
     lower_half, upper_half = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
     total = builder.shuffle(a, b, lower_half) + builder.shuffle(a, b, upper_half)
@@ -157,7 +157,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return a vector of element number `lane` of each of `vectors`; for a single vector, return this element."""
+    """Return a vector of the elements in lane `lane` of all `vectors`; for a single vector, return this element."""
     builder, indices = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -181,7 +181,7 @@ def loop_over_coordinates(
 
 
 ZERO_ROW = -1  # order of the row of zeros, which is stored before the row of order 0
-# largest number of sums in one loop, so that the totals fit into the registers: 32 of eight doubles, or 16 of four
+# largest number of sums in one loop: their totals must fit into 32 registers of eight doubles, or 16 of four doubles
 MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
@@ -213,7 +213,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # factors of the sums that are carried over, by product; `_factors`, which `_shared_sums` calls, reads this dict
+        # for each product, factors of the sum that is carried over; `_shared_sums` calls `_factors`, which reads this
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -238,7 +238,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return terms and constant of each expression in `sums`; `rows`: its number in `sums.row`."""
+        """Return terms and constant of each expression in `sums`; `rows`: numbers of the expressions in `sums.row`."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -251,7 +251,7 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return pairs of a row's index and its expression, terms and constant, in `sums`."""
+        """Return a pair for each row in `sums`: its index, and its expression as terms and constant."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
@@ -268,16 +268,16 @@ class LaneSeries:
     def _factor_index(self, *key: Any) -> int:
         """Return the index of a factor in a row.
 
-        `key` is (terms, constant), or ("scaled", terms, constant) for this factor multiplied by the order.
+        `key`: (terms, constant), or ("scaled", terms, constant) for the same factor multiplied by the order.
         """
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
         """Return the factors of the sums that products (cos x) x' and (sin x) x' share with recurrences of sin and cos.
 
-        Keys: the quantities that are such products. Values: pairs of factors, see `_factors`. (cos x) x' is the
-        derivative of sin x. So the part of its coefficient k that is known before order k is solved is a sum in the
-        recurrence of sin x for order k + 1, divided by the unit of time. The same holds for (sin x) x' and cos x.
+        Keys: quantities that are such products. Values: pairs of factors, see `_factors`. (cos x) x' is the derivative
+        of sin x. So one part of its coefficient k, which is known before order k is solved, is a sum in the recurrence
+        of sin x for order k + 1, divided by the unit of time. The same holds for (sin x) x' and cos x.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -291,7 +291,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return the indices in a row of the factors X and Y in the recurrence of each result of an operation."""
+        """Return pairs of factors X and Y, as indices in a row, for the recurrence of each result of an operation."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -308,7 +308,7 @@ class LaneSeries:
         return [(x, result_indices[1]), (x, result_indices[0])] if kind == SINE else [(x, result_indices[0])]
 
     def write_order_0(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Write code for order 0 at `inputs`, [t, q, v]; `scratch` already has the factors of the linear equations."""
+        """Write code for order 0 at `inputs`, [t, q, v]; `scratch` has the factors of the linear equations already."""
         for index in (*range(self.rhs_offset, self.divisor_offset), *range(self.carried_offset, self.row_0_offset)):
             emit.store(emit.constant(0.0), scratch, index)
         row = _Row(self, emit, emit.pointer(scratch, self.row_0_offset))
@@ -319,7 +319,7 @@ class LaneSeries:
             emit.store(quantities.sum(*expr), scratch, self.rhs_offset + index)
 
     def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write code for order k > 0: it stores the coefficients k + 1 of q in `out`, and the factors in `scratch`."""
+        """Write code for order k > 0, which stores coefficients k + 1 of q in `out`, and factors in `scratch`."""
         builder, n = emit.builder, self.n
         next_order = k + 1
         q = emit.pointer(out, k * n)
@@ -371,7 +371,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for the results of operations at order 0; store the factors that are known already in `row`."""
+        """Write code for the results of operations at order 0; store factors that are known by now in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -409,14 +409,14 @@ class LaneSeries:
     def _write_sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
         """Return a dict of sums over 1 < j < k. Keys: (indices of the factors X and Y, whether it is for order k + 1).
 
-        The value for (pair, False) is the sum of X[j] Y[k - j], for (pair, True) that of X[j] Y[k + 1 - j]. The first
-        and last terms, which are known later, are added by `_PartialSums`. So one loop computes several sums, does not
+        The value for (pair, False) is the sum of X[j] Y[k - j]; for (pair, True), the sum of X[j] Y[k + 1 - j]. First
+        and last terms become known later, and `_PartialSums` adds them. So one loop computes several sums, does not
         wait for the previous order, and loads each row once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
         keys += [(pair, False) for pair in pairs - set(self.carried_pairs)]
-        keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours often share a factor
+        keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # so neighbours often share a factor
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
         order = k + 1
         for begin in range(0, len(keys), MAX_SUMS_IN_LOOP):
@@ -492,14 +492,14 @@ class LaneSeries:
 
 
 class _Row:
-    """Row of the factors of one order in memory; values that this object stored are not loaded again."""
+    """Row of the factors of one order in memory; values that were stored through this object are not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store the value of the factor `key` at its index; if `when` is "if used", skip a factor without an index."""
+        """Store the value of the factor `key` at its index; with `when` = "if used", skip a factor without an index."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value

@@ -1,8 +1,8 @@
 """Write LLVM code for programs (`Lowering`), and for single operations (`Emitter`).
 
-Numba takes milliseconds to compile a line of source, and LLVM well below a millisecond for an operation. So long lists
-of operations are written as LLVM functions, which kernels call at their addresses. Sine and cosine are written inline,
-so that the processor computes the sines and cosines of several angles in parallel.
+Numba takes milliseconds to compile a line of source; LLVM takes well below a millisecond for an operation. So long
+lists of operations are written as LLVM functions, which kernels call by their addresses. Sine and cosine are written
+inline, so that the processor computes the sines and cosines of several angles in parallel.
 
 The code reads coefficients from memory: it can be used for all mechanisms with the same structure of the equations.
 """
@@ -79,7 +79,7 @@ class Emitter:
         return self.load(self.numbers, number.index, constant=True)
 
     def add_sums(self, a: Value, b: Value) -> Value:
-        """Return a + b for two sums without reassociation: LLVM would chain the terms of both, which is slower."""
+        """Return a + b for two sums; LLVM must not reassociate, because one chain of all terms would be slower."""
         return self.builder.operation("fadd", a, b)
 
     def fma(self, a: Value, b: Value, c: Value) -> Value:
@@ -87,7 +87,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Return the value at x of a polynomial; `coefficients`: constant first. Pairs of terms run in parallel."""
+        """Return the value at x of a polynomial, with pairs of terms in parallel; `coefficients`: constant first."""
         square, terms = self.builder.operation("fmul", x, x), [self.load_constant(each) for each in coefficients]
         pairs = [self.fma(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -97,11 +97,11 @@ class Emitter:
         return total
 
     def maximum(self, a: Value, b: Value) -> Value:
-        """Return the larger of two numbers."""
+        """Return the larger one of two numbers."""
         return self.builder.select(self.builder.compare("fcmp ogt", a, b), a, b)
 
     def minimum(self, a: Value, b: Value) -> Value:
-        """Return the smaller of two numbers."""
+        """Return the smaller one of two numbers."""
         return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
 
     def scale(self, factor: float, a: Value) -> Value:
@@ -136,7 +136,7 @@ class Emitter:
     def load_vector(self, base: Value, index: int, width: int) -> Value:
         """Return the vector that begins at base[index]; this address must be aligned to the size of the vector.
 
-        The load is slow just after the elements were stored one by one: the processor waits until all are stored.
+        Right after its elements were stored one by one, the load is slow: the processor waits until all are stored.
         """
         pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{vector_of(DOUBLE, width)}*")
         return self.builder.load(pointer, 8 * width)
@@ -158,7 +158,7 @@ class Emitter:
         """Return a context that writes a loop over integers from `first` to `end` - 1.
 
         The context yields the integer, the values carried from the previous iteration (`initial` in the first one), and
-        a list to which the new values are appended. After the loop this list has the final values.
+        a list, to which the caller appends the new values. After the loop, this list has the final values.
         """
         builder = self.builder
         is_entered = builder.compare("icmp slt", first, end)
@@ -189,7 +189,7 @@ class Quantities:
     Each part of a divided function loads its quantities again: otherwise the compiler would spill them to the stack. So
     the memory from which quantities are loaded must not change.
 
-    load : function that writes the load of a quantity, for quantities that were not defined.
+    load : function that writes code to load a quantity, for quantities that were not defined.
     """
 
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
@@ -204,7 +204,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value of a quantity: the defined one, or one loaded once in each part of a function."""
+        """Return the value of a quantity: its defined value, or else a value loaded once in each part of a function."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._loaded_in_part()
@@ -226,7 +226,7 @@ class Quantities:
         """Return `constant` plus the sum of coefficient * quantity over the terms."""
         key = terms, constant
         if self._emit.builder.module.splits_blocks and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # another multiplication takes no longer than loading the product
+            ((quantity, coefficient),) = terms  # to multiply again takes no longer than to load the product
             return self._emit.scale(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
@@ -258,7 +258,7 @@ def write(
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
-LARGEST_ANGLE = 1e6  # largest accepted angle, rad: for larger angles, HALF_PI as a sum of two numbers is not accurate
+LARGEST_ANGLE = 1e6  # largest accepted angle, rad; for larger angles, HALF_PI, a sum of two numbers, is not accurate
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # pi/2 as a sum: angles are reduced by multiples of pi/2
 # coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from Moshier's Cephes, sin.c
 SINES = (
@@ -311,7 +311,7 @@ NO_LOCATIONS: Mapping[int, Location] = {}  # no memory locations
 class Lowering(Algebra[Value]):
     """Algebra that writes the operations of programs to an LLVM function; its values are values of this function.
 
-    locations : memory locations of quantities that are stored already.
+    locations : memory locations of quantities that are already stored.
     """
 
     def __init__(self, emit: Emitter, numbers: Coefficients, locations: Mapping[int, Location] = NO_LOCATIONS):
@@ -364,7 +364,7 @@ class Lowering(Algebra[Value]):
         return self._sines_and_cosines[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], locations: Mapping[int, Location] = NO_LOCATIONS) -> None:
-        """Write code that computes quantities in the given order, and stores those that have one of `locations`."""
+        """Write code that computes `quantities` in the given order, and stores those that occur in `locations`."""
         if not locations:
             return super().run(graph, quantities)
         for i in quantities:
@@ -378,8 +378,8 @@ class Lowering(Algebra[Value]):
     def run_program(self, program: Program) -> list[list[Value]]:
         """Write code that computes the arrays of a program, and the quantities in its conditions; return the arrays.
 
-        In a divided function each number is computed just before its use, so that few numbers are in registers between
-        parts; LLVM reorders instructions only within a part.
+        In a divided function, each number is computed right before its use, so that few numbers are in registers
+        between parts; LLVM reorders instructions only within a part.
         """
         graph = program.graph
         if not self.emit.builder.module.splits_blocks:

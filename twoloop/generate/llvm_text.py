@@ -1,8 +1,8 @@
 """Write LLVM modules as text: functions, blocks and instructions.
 
-llvmlite builds modules from objects, which takes ten times as long as writing text, and longer than the compilation by
-LLVM. Types are represented by their text. Pointers have the type to which they point, such as double*, as all versions
-of LLVM accept this.
+llvmlite would build modules from objects, which takes ten times as long as writing text, and longer than the
+compilation by LLVM. Types are represented by their text. Pointers name the type that they point to, such as double*,
+because all versions of LLVM accept this.
 """
 
 import struct
@@ -12,7 +12,7 @@ from typing import Any
 
 from twoloop.kernels.data.common import OPTIONS
 
-FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # fast-math flags of floating-point instructions, as in kernels
+FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # flags of floating-point instructions, the same as in kernels
 DOUBLE, INTEGER, WORD, BIT, VOID = "double", "i64", "i32", "i1", "void"
 DOUBLES_PER_CACHE_LINE = 8  # size of a cache line of the processor, in doubles
 # largest number of instructions in a block if blocks are split: longer blocks more than double the compile time
@@ -20,7 +20,7 @@ MAX_BLOCK_LENGTH = 400
 
 
 def _operator(name: str, is_reflected: bool = False) -> "Callable[[Value, Value | float], Value]":
-    """Return the method of Value that appends the operation `name`; `is_reflected`: the value is the second operand."""
+    """Return a method of Value that appends the operation `name`; `is_reflected`: the value is its second operand."""
     is_comparison, of_doubles = name.startswith("fcmp"), f"f{name} {FAST_MATH_FLAGS}"
 
     def append(value: "Value", other: "Value | float") -> "Value":
@@ -43,7 +43,7 @@ class Value:
     """
 
     __slots__ = ("builder", "text", "type")
-    __array_ufunc__ = None  # operators of NumPy numbers call those of this class
+    __array_ufunc__ = None  # with this, operators of NumPy numbers call the operators of this class
 
     def __init__(self, kind: str, text: str, builder: "Builder | None" = None):
         self.type, self.text = kind, text
@@ -67,7 +67,7 @@ class Value:
 
 
 class Phi(Value):
-    """Phi node: a value that depends on the block from which control enters the block of the node."""
+    """Phi node: a value that depends on the block from which control has come to the block of the node."""
 
     __slots__ = ("incoming",)
 
@@ -76,7 +76,7 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """Add the value that the node has if control enters its block from `block`."""
+        """Add the value that the node has if control comes from `block`."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
@@ -208,11 +208,11 @@ class Builder:
         self.position_at_end(self.append_block())
 
     def text(self) -> str:
-        """Return the LLVM text that defines the function."""
+        """Return the text of the function's definition in LLVM."""
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
-        # without this alignment spilled vectors lie across two cache lines, and take twice as long to load and store
+        # without this alignment, spilled vectors lie across two cache lines, and take twice as long to load and store
         attributes = "noinline alignstack(64)" if f"<{DOUBLES_PER_CACHE_LINE} x" in body else "noinline"
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
@@ -239,7 +239,7 @@ class Builder:
         return value
 
     def _split_block(self) -> None:
-        """Continue in a new block; its address is stored, so that LLVM does not merge it with the current block."""
+        """Continue in a new block; store the block's address, so that LLVM does not merge it with the current block."""
         block = self.append_block()
         self.jump(block)
         self.module.block_addresses.append(f"i8* blockaddress(@{self.name}, %{block.name})")
@@ -286,7 +286,7 @@ class Builder:
         return pointer
 
     def load_constant(self, number: float) -> Value:
-        """Return a number loaded from memory just before its use: a literal would occupy a register for long."""
+        """Return a number loaded from memory right before its use: a literal would occupy a register for long."""
         if self._far_pointer is None:
             self._far_pointer = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")

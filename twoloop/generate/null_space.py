@@ -5,11 +5,11 @@ a_i = T^T (Q - M g) with T = [B; 1]. This takes about half the operations of an 
 may be singular in directions that the constraints exclude.
 
 Pivots are chosen once. If a pivot becomes small during a run, a condition of the generated code fails, and the
-accelerations are computed by the elimination that begins with M.
+elimination that begins with M computes the accelerations.
 
-Bodies of little inertia beside heavy ones make pivots of very different size, whatever rows are added to M. In this
+Bodies of small inertia beside heavy bodies cause pivots of very different size, whatever rows are added to M. In this
 case, one step of refinement solves for the residual of the solution, and restores the digits that elimination loses.
-The loss may grow during a run: if the step changes a solution too much, a condition fails, as for small pivots.
+The loss may grow during a run: if refinement changes a solution too much, a condition fails, as for small pivots.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,8 +19,8 @@ import numpy as np
 
 from twoloop.generate.graph import Affine, is_zero
 
-# accelerations are valid if a step of refinement changes them by at most this fraction. Their error is then mostly the
-# square of this change, but as large as the change if a part of little inertia loses all digits
+# accelerations are valid if a step of refinement changes them by at most this fraction. Usually their error is then the
+# square of this change; it is as large as the change if a part of small inertia loses all digits
 LARGEST_CHANGE = 1e-7
 
 
@@ -37,7 +37,7 @@ class Factors:
     """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; the pivots are its diagonal blocks.
 
     blocks : blocks in the order of elimination.
-    conditions : pairs, for rows of G (index `n` and later), of a pivot and the pivot without the other rows of G. The
+    conditions : for rows of G (index `n` and later), pairs: a pivot, and this pivot without the other rows of G. The
         first expression must be larger than a fraction of the second.
     mass_pivots : pivots of M (index below `n`), which are positive if M is definite.
     """
@@ -69,7 +69,7 @@ class Factors:
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a block of pivots; add conditions. `own_pivots`: pivots of G without its other rows."""
+        """Return the inverse of a block of pivots; add conditions. `own_pivots`: pivots of rows of G on their own."""
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -117,7 +117,7 @@ def solve(blocks: Sequence[Block], rhs: Sequence[Affine]) -> list[Affine]:
 
 
 def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products; if all first factors are multiples of one expression, add up the second factors."""
+    """Return the sum of products; if first factors are all multiples of one expression, add up the second factors."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -136,8 +136,8 @@ def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
 def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
     """Return pairs (coordinate, row of G) that are eliminated first: their pivots need no condition and no division.
 
-    The coordinate occurs in no other row of [M G^T; G 0], and both of its entries, in M and in G, are constants. The
-    rank of G is the rank of the remaining rows plus the number of pairs.
+    The coordinate occurs in no other row of [M G^T; G 0], and its two entries, in M and in G, are constants. The rank
+    of G is the rank of the remaining rows plus the number of pairs.
     """
     pairs: dict[int, int] = {}  # coordinates by rows of G
     for i, row in enumerate(rows[:n]):
@@ -149,8 +149,8 @@ def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tup
 def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
     """Return the indices of all rows that are not in `pairs`, by minimum degree, in tuples of one or two rows.
 
-    Two rows with the same neighbours are in one tuple. A row of G (index n and later) comes after its coordinates.
-    Among rows of equal degree, the one after the shortest chain of divisions comes first, so that operations overlap.
+    Two rows with the same neighbours are in one tuple. A row of G (index n and later) comes after its coordinates. Of
+    rows with equal degree, the row that needs the shortest chain of divisions comes first, so that operations overlap.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -185,14 +185,14 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
 PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
 Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
-# lower limit of three squares: of a pivot over the norm of the entries that it divides, of a pivot over the norm of its
-# column, and of the sine of the angle between the two columns of a block. A ratio of 10^-k costs up to 3 k digits of
+# lower limit of the squares of three numbers: pivot over norm of the entries that it divides; pivot over norm of its
+# column; sine of the angle between the two columns of a block. A number of 10^-k costs up to 3 k digits of
 # accelerations. The choice at a start has stricter limits, see linalg/dependent_columns.py
 MIN_PIVOT_SQUARE = 0.03**2
 
 
 class ReductionFailed(Exception):
-    """Exception if a pivot is always zero, or if the elimination of dependent coordinates takes too many operations."""
+    """Exception: a pivot is always zero, or the elimination of dependent coordinates takes too many operations."""
 
 
 class DependentCoordinates:
@@ -200,16 +200,15 @@ class DependentCoordinates:
 
     rows : the matrix G, of full rank.
     blocks : rows and columns of the pivots, in the order of elimination.
-    max_added_operations : largest number of operations that may be added to the graph.
+    max_added : largest number of operations that may be added to the graph.
 
     Fields:
     independent : independent coordinates.
-    T : for each row of T, its nonzero entries by column, an independent coordinate.
+    T : for each row of T, its nonzero entries by column; a column is an independent coordinate.
     g : the vector g of length n_q; 0 for independent coordinates.
-    conditions : pairs of expressions. The first one is larger than the second one in each pair, unless a pivot is too
-        small.
+    conditions : pairs of expressions. Unless a pivot is too small, the first one is larger in each pair.
 
-    Raises ReductionFailed if a pivot is always zero, or if the elimination takes more than `max_added` operations.
+    Raise ReductionFailed if a pivot is always zero, or if the elimination takes more than `max_added` operations.
     """
 
     def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: PivotBlocks, max_added: int):
@@ -233,7 +232,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve one or two rows of [G gamma] for as many coordinates, `columns`; eliminate them from the other rows."""
+        """Solve one or two rows of [G gamma] for as many coordinates, `columns`; eliminate these from other rows."""
         self.check_length()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)
@@ -258,7 +257,7 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check_length(self, n_following: int = 0) -> None:
-        """Raise ReductionFailed if more than `max_added` operations are added, with `n_following` later ones."""
+        """Raise ReductionFailed if more than `max_added` operations are added, including `n_following` later ones."""
         if len(self._graph.operations) + n_following > self._max_operations:
             raise ReductionFailed
 
@@ -282,7 +281,7 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """Add to `conditions` that a pivot is not small relative to the entries that it divides, nor to its column.
+        """Add two conditions: a pivot is not small relative to the entries that it divides, nor to its column.
 
         `pivot`: determinant of `block`. For two rows, the second condition is that the columns of the block are not
         nearly parallel. A pivot may change its sign, because the formula for the accelerations remains valid.
@@ -300,7 +299,7 @@ class DependentCoordinates:
             self.conditions.append((pivot * pivot, (a * b).times(MIN_PIVOT_SQUARE)))
 
     def _substitute(self, j: int, row: Terms) -> None:
-        """Store T[j] and g[j] of a dependent coordinate j, computed from T and g of coordinates in its solved row."""
+        """Store T[j] and g[j] of a dependent coordinate j, computed from T and g of the coordinates in `row`."""
         self.check_length()
         rhs, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
@@ -367,13 +366,13 @@ def solve_refined(
     r: Sequence[Affine],
     c: Sequence[Affine],
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return a and lam of the independent rows for M a + G^T lam = r, G a = c, with refinement if `choice.is_refined`.
+    """Return a and lam (independent rows) with M a + G^T lam = r, G a = c; refine them if `choice.is_refined`.
 
-    Also return conditions, pairs of expressions of which the first is larger than the second, unless the solution has
-    lost too many digits. If a is small, near equilibrium, it counts as large as the acceleration of all masses by r.
+    Also return conditions: pairs of expressions; unless the solution has lost too many digits, the first one is larger.
+    If a is small, near equilibrium, it counts as large as the acceleration of all masses by r.
 
-    `solve`: solution of a linear system with the factors of [M + s g^T g, G^T; G 0], where rows g are added to M as in
-    PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.
+    `solve`: function that solves a linear system with the factors of [M + s g^T g, G^T; G 0], with rows g added to M as
+    in PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:

@@ -1,7 +1,7 @@
 """Compute with numbers that record how they depend on parameters, so that one trace serves all parameter values.
 
-A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. Whether
-terms cancel, and whether expressions are equal, is decided from the current values, which must be generic.
+A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. The
+current values decide whether terms cancel, and whether expressions are equal; so these values must be generic.
 """
 
 import math
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# product of powers of atoms, as pairs of the index of an atom and an exponent; the empty tuple is the number 1
+# product of powers of atoms (see `ParameterTape`) as pairs: index of an atom, exponent; the empty tuple is the number 1
 Powers = tuple[tuple[int, float], ...]
 
 MAX_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
-_as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
-# largest sum of two terms, relative to one of them, that counts as zero: such a sum is a rounding error
+_as_float = float.__pos__  # converts a Parameter to a float; the function float() would be refused
+# the sum of two terms counts as zero, because it is a rounding error, up to this fraction of a term
 CANCELLATION_LIMIT = 8.0 * 2.0**-52
 NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
@@ -39,7 +39,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {  # functions that use only operator
     "reciprocal": lambda x: 1.0 / x,
     "hypot": lambda x, y: (x * x + y * y) ** 0.5,
 }
-# names in FUNCTIONS and OPERATORS of functions that have other names in `math` or NumPy
+# names in FUNCTIONS and OPERATORS (values) of functions that have other names in `math` or NumPy (keys)
 NUMPY_NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power", "true_divide": "divide"}
 
 
@@ -55,8 +55,8 @@ class SymbolicObject:
     """Base of the objects that replace numbers while a callback is traced.
 
     is_tracing : whether a callback is being traced with this object.
-    refusal_reason : reason why the callback cannot be traced, or "". It is stored because the callback may catch the
-        exception.
+    refusal_reason : reason why the callback cannot be traced, or "". The reason is stored, because the callback may
+        catch the exception.
     """
 
     is_tracing, refusal_reason = False, ""
@@ -92,7 +92,7 @@ class ParameterTape(SymbolicObject):
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
         self.atoms: list[Any] = [None] * len(values)
-        self._merged_products: dict[tuple[Powers, Powers], Powers] = {}  # cache: product of two Powers, by its factors
+        self._merged_products: dict[tuple[Powers, Powers], Powers] = {}  # cached products; keys: the two factors
         self._atom_indices: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
@@ -165,7 +165,7 @@ class ParameterTape(SymbolicObject):
 
 
 class Parameter(float):
-    """Float that records how it depends on parameters: it is `scale` times `powers`, a product of atoms of a tape."""
+    """Float that records how it depends on parameters: its value is `scale` times `powers`, a product of atoms."""
 
     __slots__ = ("powers", "scale", "tape")
     tape: ParameterTape
@@ -187,7 +187,7 @@ class Parameter(float):
         return elementwise(lambda *arguments: apply_function(name, *arguments), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse an operation whose result depends on the current value, unless a module of `generate` called it."""
+        """Refuse an operation whose result depends on the current value, unless a module of `generate` calls it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.is_tracing and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
@@ -254,7 +254,7 @@ def _product(a: float, b: float) -> float:
 
 
 def _power(base: float, exponent: float) -> float:
-    # a power whose exponent is no whole number is an atom: as Powers, (x^2)^0.5 would become x instead of |x|
+    # a power with a fractional exponent becomes an atom: as Powers, (x^2)^0.5 would become x, not |x|
     if type(exponent) is Parameter or not exponent.is_integer():
         return _record_function("power", base, exponent)
     assert isinstance(base, Parameter)
@@ -334,7 +334,7 @@ for _name in _UNARY_FUNCTIONS:
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
-    """Return an array of function values at all entries of arrays, without calls of the entries' `__array_ufunc__`."""
+    """Return an array of function values at all entries of arrays, without calling `__array_ufunc__` of the entries."""
     operands = list(map(_object_array, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:

@@ -3,7 +3,7 @@
 - `Program.run` executes a program, or writes code for it. The algebra defines what values are: arrays (`ArrayAlgebra`),
   LLVM values (`llvm_code.Lowering`), degrees of growth (`time_dependence.DegreeAlgebra`).
 - `OperationTable` lists the operations as arrays, which compiled kernels interpret row by row.
-- Derivatives are further quantities of the graph (`graph.Derivative`). Expressions of parameters alone are coefficients
+- Derivatives are further quantities of the graph (`graph.Derivative`). Expressions in parameters alone are coefficients
   (`parameter_expressions`), which are computed before a program runs.
 """
 
@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a traced function of the user is compared with calls of the function
-TIME_SPACING = 0.37  # time between successive compared states, s: unlikely to be a period of a force
-MAX_TRACE_DIFFERENCE = 1e-10  # up to this relative difference between trace and call, a rounding error may be the cause
+TIME_SPACING = 0.37  # time between successive compared states, s; unlikely to be the period of a force
+MAX_TRACE_DIFFERENCE = 1e-10  # relative differences between trace and call up to this size may be rounding errors
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
@@ -35,7 +35,7 @@ COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 class Algebra(Generic[T]):
     """Arithmetic in which a program runs; subclasses define the type of values T, and the operations on values.
 
-    functions : for each kind of operation with one argument: the function that computes its value.
+    functions : for each kind of operation with one argument, the function that computes its value.
     values : values of the quantities defined so far, by index of the quantity.
     """
 
@@ -103,7 +103,7 @@ class Program:
         return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
-        """Return the number of multiplications and additions; a reciprocal counts as four, other functions as none."""
+        """Return the number of multiplications and additions; a reciprocal counts as four, other functions as zero."""
         exprs, total = self.expressions, 0
         for i in self.quantities():
             kind, *_ = self.graph.operations[i]  # type: ignore[misc]
@@ -178,7 +178,7 @@ class OperationTable(NamedTuple):
 
     @classmethod
     def from_results(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
-        """Return the table that computes `results`, expressions by result index; `n_inputs`: number of its inputs."""
+        """Return the table that computes `results` (expressions, by index of the result) from `n_inputs` inputs."""
         needed = graph.quantities_for(results.values())
         node_of = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node_of[i]) for i in needed]  # type: ignore[misc]
@@ -220,20 +220,20 @@ class OperationTable(NamedTuple):
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
     def replace_coefficients(self, convert: Callable[[Any], Array]) -> "OperationTable":
-        """Return a copy of the table with `convert` applied to its two arrays of coefficients and constants."""
+        """Return a copy of the table with `convert` applied to its arrays of coefficients and of constants."""
         return self._replace(constants=convert(self.constants), coefficients=convert(self.coefficients))
 
 
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
-LITERALS = (0.0, 1.0, -1.0)  # values of coefficients that are literals in the code, as they need no multiplication
-LITERAL_TOLERANCE = 8.0 * 2.0**-52  # a coefficient counts as the literal 1 or -1 if it differs from it by at most this
+LITERALS = (0.0, 1.0, -1.0)  # these coefficients are literals in the code, because they need no multiplication
+LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient and the literal 1 or -1 that replaces it
 
 
 class Coefficient(float):
     """Coefficient that generated code reads from an array; two coefficients are equal only if they are one object.
 
-    `index`: index in the array. `varies`: whether this is the array of coefficients that vary with parameters.
+    `index`: index in the array. `varies`: whether the array is that of the coefficients that vary with parameters.
     """
 
     __slots__ = ("index", "varies")
@@ -331,7 +331,7 @@ class Coefficients:
         return tape.evaluate(list(self._varying.values()), parameters)
 
     def _literal_or_coefficient(self, value: float) -> float:
-        if type(value) is Parameter:  # no literal, even if its current value is 0 or 1
+        if type(value) is Parameter:  # never a literal, even if its current value is 0 or 1
             if self._separates_varying:
                 expr = value.scale, value.powers
                 self._varying.setdefault(expr, value)
@@ -343,7 +343,7 @@ class Coefficients:
 
 
 def nearest_literal(value: float) -> float | None:
-    """Return 0, 1 or -1 if a number equals it up to rounding; None if the number must be read from an array."""
+    """Return 0, 1 or -1 if `value` is equal to it up to rounding; None: the number must be read from an array."""
     if type(value) is Parameter or not math.isfinite(value):
         return None
     nearest = float(round(value))

@@ -1,8 +1,8 @@
 """Write the program for the Taylor series of a mechanism's motion.
 
-Each order needs G = [C_q; A], its rates, M and Q, see taylor_step.py. Operations on time and coordinates only, such as
-those for G and M, are called early; operations that depend on velocities are called late. G v and G^T lam + M a are
-computed with few products: terms that share a factor become one product.
+Each order needs G = [C_q; A], its rates, M and Q, see taylor_step.py. An operation is "early" if it depends on time and
+coordinates only, as for G and M, and "late" if it depends on velocities, too. G v and G^T lam + M a are computed with
+few products: terms that share a factor become one product.
 """
 
 from collections.abc import Container, Sequence
@@ -23,7 +23,7 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-# series are traced if M and [C_q; A] have at most this many entries, or if the user chooses Taylor
+# series are traced if M and [C_q; A] have at most this number of entries, or if the user chooses the method Taylor
 MAX_ENTRIES = 200_000
 
 # callbacks from which a series is derived
@@ -31,7 +31,7 @@ USED_CALLBACKS = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate"
 
 
 class Sums(NamedTuple):
-    """Affine expressions as arrays: first term and constant of each expression, and all terms after the first ones."""
+    """Affine expressions as arrays: constant and first term of each expression, then all further terms."""
 
     column: Integers  # quantity in the first term of each expression
     coefficient: Array  # coefficient of the first term of each expression
@@ -47,8 +47,8 @@ class OperationGroups:
 
     groups : one row for each group of independent operations of one kind: the kind, then the first and end index of
         three ranges: the operations, and their further terms in `first` and in `second` (see `Sums`). A group of sines
-        includes the cosines of the same angles. The last group contains the products whose second factors depend on
-        the solution of the linear system.
+        includes the cosines of the same angles. The last group contains the products with a second factor that depends
+        on the solution of the linear system.
     first, second : arguments of the operations.
     """
 
@@ -63,10 +63,9 @@ class SeriesProgram:
 
     early : early operations; the last ones are the products in G v.
     late : late operations; the last ones are the products in G^T lam + M a.
-    rows, row_indices : G v + G_t without terms that are a constant times v_i: the rows that are not zero, and their
-        indices.
-    balance, balance_indices : Q - G^T lam - M a without terms that are a constant times lam_i or a_i: the entries that
-        are not zero, and their indices.
+    rows, row_indices : nonzero rows of G v + G_t, and their indices; terms "constant times v_i" are left out.
+    balance, balance_indices : nonzero entries of Q - G^T lam - M a, and their indices; terms "constant times lam_i" and
+        "constant times a_i" are left out.
     traced : traces of the callbacks.
     """
 
@@ -113,14 +112,14 @@ class SeriesProgram:
 
 
 def is_quick_to_trace(system: ConstrainedSystem) -> bool:
-    """Return whether M, C_q and A have so few entries, zeros among them, that tracing a series takes about a second."""
+    """Return whether M, C_q and A have so few entries, zeros included, that tracing a series takes about a second."""
     return system.n_q * (system.n_q + system.n_c + system.n_a) <= MAX_ENTRIES
 
 
 def series_for(system: ConstrainedSystem, check: Check = accept_traces) -> SeriesProgram:
     """Return the cached series program of a system; `check` raises if calls of callbacks differ from their traces.
 
-    Raises Untraceable as `series_program`.
+    Raise Untraceable in the same cases as `series_program`.
     """
 
     def make(cache: TraceCache) -> SeriesProgram:
@@ -135,9 +134,9 @@ def series_program(
 ) -> SeriesProgram:
     """Trace the callbacks of a system and return its series program.
 
-    `equations`: traces to be extended; None: new ones. `independent`: rows of G in the program; None: all rows.
+    `equations`: traces to be extended; None: new traces. `independent`: rows of G in the program; None: all rows.
 
-    Raises Untraceable if a callback cannot be traced; the message names it and the reason.
+    Raise Untraceable if a callback cannot be traced; the message names the callback and the reason.
     """
     equations = Equations(system) if equations is None else equations
     n, n_rows = system.n_q, system.n_c + system.n_a
@@ -166,7 +165,7 @@ def series_program(
 
 
 def _find_sums(graph: Graph) -> dict[int, Affine]:
-    """Return the expressions that replace quantities that are sums, by quantity: sums need no recurrence."""
+    """Return, for each quantity that is a sum, the expression that replaces it: sums need no recurrence."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -196,8 +195,8 @@ def _sum_of_products(
     """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
 
     Terms are collected by factors, or by the quantities in the factors, whichever needs fewer products. If both need
-    the same number, rates (`of_rates`) are collected by quantities. This gives products such as (cos x) x', whose sums
-    the recurrence of sin x computes anyway, see `_shared_sums` in lane_series.py.
+    the same number, rates (`of_rates`) are collected by quantities. This leads to products such as (cos x) x', whose
+    sums are computed in the recurrence of sin x anyway, see `_shared_sums` in lane_series.py.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -280,7 +279,7 @@ def _assemble_program(
 
 
 def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any]]:
-    """Return the operations that `exprs` need, as (quantity, operation), each sine with the cosine of its angle."""
+    """Return the operations that `exprs` need, as (quantity, operation); a sine comes with the cosine of its angle."""
     needed = set(graph.quantities_for(exprs))
     trig_kinds = (SINE, COSINE)
     angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in trig_kinds}
@@ -305,7 +304,7 @@ def _remove_terms(expr: Affine, inputs: Container[int]) -> Affine:
 
 
 def _grouped_operations(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Return groups of operations of one kind, as (kind, operations); a group depends only on the groups before it."""
+    """Return groups of operations of one kind, as (kind, operations); a group depends only on previous groups."""
     nodes = {node for node, *_ in operations}
     levels: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}

@@ -30,16 +30,16 @@ SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # operations without short pul
 MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, have no short pulses up to this degree
 MAX_DEGREE_OF_STATE = 32  # polynomials in q and v, and their roots, have no short pulses up to this degree
 MAX_DEGREE_OF_DIVISOR = 4  # up to this total degree of its divisors, in q and v, a quotient has no short pulses
-FASTEST_DECAY = -2.0  # quotients that decay faster, for large x, may have short pulses; 1 / (1 + (x / w)**2) has none
+FASTEST_DECAY = -2.0  # quotients that decay as x^p with smaller p may have short pulses; 1 / (1 + (x / w)**2) has none
 MAX_RATE = 4.0  # long steps resolve a sine if its argument changes by at most this per unit of a coordinate or velocity
-# callbacks are traced for this analysis only with at most this many coordinates: otherwise tracing may take seconds,
-# ten times as long as sampling the forces during a run
+# callbacks are traced for this analysis only up to this number of coordinates; for larger systems, tracing may take
+# seconds, ten times as long as sampling the forces during a run
 MAX_COORDINATES = 300
 TIME_MASK = 1  # bit mask of t, the first input of a graph
 
 
 class ShortForces(NamedTuple):
-    """Whether forces or drives may have short pulses: one flag for their dependence on t, one for that on q or v."""
+    """Whether forces or drives may have short pulses, as functions of t, and as functions of q or v."""
 
     by_time: bool  # a force, C_t or b may have short pulses as a function of time
     by_state: bool  # a force may have short pulses as a function of q or v
@@ -53,14 +53,14 @@ class Dependence(NamedTuple):
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
-        """Return this result: it is the same for all systems of the trace cache."""
+        """Return this result, which is the same for all systems of the trace cache."""
         return self
 
 
 def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
     """Return whether forces, C_t or b may have short pulses in time, and in q and v; true if they cannot be traced.
 
-    Functions called in Python may store their arguments: they are traced only if the force was (`force_was_traced`).
+    Functions called in Python may store their arguments. So they are traced only if the force was traced already.
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -72,7 +72,7 @@ def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
     """Return whether forces may act for a short time, or vary much over a distance shorter than a step.
 
     Quotients and roots may vary in this way: the stages of a long step may evaluate 1 / (1 + (x / w)**2) on its flanks,
-    but not at its peak; they may also evaluate a fast vibration at nearly equal phases.
+    but not at its peak. Stages may also evaluate a fast vibration at nearly equal phases.
     """
     if any(may_be_short(system, force_was_traced)):
         return True
@@ -208,8 +208,8 @@ def _has_state_pulses(graph: Graph, quantities: list[int], n_q: int) -> bool:
 def _may_be_steep(graph: Graph, quantities: list[int]) -> bool:
     """Return whether one of the `quantities` may vary much over a distance shorter than a step.
 
-    All operations except sums, products, sines and cosines count. So does a sine or cosine of time, or of an argument
-    whose derivative by a coordinate or velocity exceeds MAX_RATE.
+    It may if it uses any operation except sums, products, sines and cosines; or a sine or cosine of time, or of an
+    argument whose derivative by a coordinate or velocity exceeds MAX_RATE.
     """
     if any(graph.kind(i) not in SMOOTH_OPERATIONS for i in quantities):
         return True

@@ -11,8 +11,8 @@ missing callbacks. Series, eliminations, references and derived callbacks are ge
 
 - Parameters that are whole numbers are constants in the traces: they may be counts, indices or switches, and zeros and
   ones save operations. Parameters of equal magnitude are one variable.
-- So all systems of one cache have equal values of these constants, and equal magnitudes of the same parameters.
-- A callback that branches on its parameters, or rounds them, is traced for each system.
+- So systems that share a cache have the same constants, and the same groups of parameters with equal magnitude.
+- A callback that branches on its parameters, or rounds them, is traced for each system anew.
 """
 
 import copy
@@ -62,8 +62,8 @@ ARRAY_CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
     """Run a callback in Python on symbols and return its result; compiled callbacks fill an array of `arguments`.
 
-    Raises Untraceable if the callback does not run on symbols, or may treat them differently from numbers; the message
-    says why.
+    Raise Untraceable if the callback does not run on symbols, or may treat symbols differently from numbers; the
+    message says why.
     """
     graph, value = t.graph, None
     with graph.running_callback():
@@ -133,7 +133,7 @@ def _symbolic_type(value: Any, *more: Any) -> Any:
 
 
 def _first_symbol(value: Any) -> Affine | None:
-    """Return the first symbol in a value (a symbol, an array, a list or a tuple); None if it contains none."""
+    """Return the first symbol in a value (a symbol, an array, a list or a tuple); None if there is no symbol."""
     if type(value) is Affine:
         return value
     if isinstance(value, np.ndarray):
@@ -144,7 +144,7 @@ def _first_symbol(value: Any) -> Affine | None:
 
 
 def _has_parameters(value: Any) -> bool:
-    """Return whether a value is a Parameter, or an array, list or tuple that contains one."""
+    """Return whether a value is a Parameter, or an array, list or tuple that contains a Parameter."""
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist() if value.dtype == object else ()
     return any(map(_has_parameters, value)) if isinstance(value, list | tuple) else type(value) is Parameter
@@ -186,7 +186,7 @@ def _is_real_dtype(dtype: Any) -> bool:
 
 
 def _symbolic_constructor(constructor: Any) -> Callable[..., Any]:
-    """Return a substitute for `zeros`, `ones` or `empty` whose arrays of real numbers can contain expressions."""
+    """Return a substitute for `zeros`, `ones` or `empty` that returns arrays which can contain expressions."""
 
     def function(shape: Any, dtype: Any = None, **options: Any) -> Any:
         if not _is_real_dtype(dtype):
@@ -264,12 +264,12 @@ TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# callbacks that return gamma, the right-hand side of G a = gamma, and those for G and G_t, from which gamma is derived
+# keys: callbacks for gamma, the right-hand side of G a = gamma; values: callbacks for G and G_t, which yield gamma, too
 GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
 class Equations:
-    """Traced callbacks of a system; each is traced once, at its first use.
+    """Traced callbacks of a system; each callback is traced once, when its trace is first used.
 
     parameters : values that replace the system's own parameters.
 
@@ -289,7 +289,7 @@ class Equations:
         self._results_before_copy: dict[str, Any] = {}  # results of callbacks traced before this graph was copied
 
     def trace_all(self) -> "Equations":
-        """Trace the callbacks of the system that can be traced, so that copies share the results; return self."""
+        """Trace all callbacks of the system that can be traced, so that copies share the results; return self."""
         for kind in TRACING_ORDER:
             if not self._is_derived(kind):
                 with suppress(Untraceable):  # `expressions` raises it again if the callback is needed
@@ -297,7 +297,7 @@ class Equations:
         return self
 
     def copy(self) -> "Equations":
-        """Return a copy with a copy of the graph; callbacks traced so far are not traced again in the copy."""
+        """Return a copy with a copy of the graph; the copy does not trace again what has been traced so far."""
         equations = copy.copy(self)
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
@@ -308,11 +308,11 @@ class Equations:
         return equations
 
     def expressions(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the result of a callback as expressions; of a missing callback, derivatives (C_q, gamma) or zeros.
+        """Return the result of a callback as expressions; for a missing callback, derivatives (C_q, gamma) or zeros.
 
-        `v`: expressions to be used as velocities, instead of the inputs `self.v`.
+        `v`: expressions that replace the inputs `self.v` as velocities.
 
-        Raises Untraceable if a callback does not run on symbols; the message names the callback and the reason.
+        Raise Untraceable if a callback does not run on symbols; the message names the callback and the reason.
         """
         if v is not None and "v" in KINDS[kind].state:
             return self._derive_or_trace(kind, v)
@@ -321,7 +321,7 @@ class Equations:
         return self._expressions[kind].copy()
 
     def derivatives(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return C_q, C_t or gamma by differentiation, as an array of expressions, even if it has a callback."""
+        """Return C_q, C_t or gamma by differentiation, as an array of expressions, even if a callback computes it."""
         if kind == "jacobian":
             return self._jacobian()
         return (
@@ -421,9 +421,9 @@ Array = NDArray[np.float64]
 ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]  # entry i is scales[i] * products[indices[i]]
 Evaluator = Callable[[Any], Array]  # evaluates an array of expressions for the parameters of one system
 
-# limits of the random values of parameters in traces: values are of similar size, so that rounding hides no term
+# limits of the random values of parameters in traces: these have similar sizes, so that rounding hides no term
 GENERIC_RANGE = 0.5, 1.5
-# a parameter is a constant if its magnitude is below this value or above its inverse: powers would under- or overflow
+# a parameter of magnitude below this value, or above its inverse, is a constant: its powers would under- or overflow
 MIN_MAGNITUDE = 1e-30
 
 _TRACE_CACHES = BoundedCache()
@@ -438,7 +438,7 @@ class TraceCache:
 
     Fields:
     parameters : parameters with which callbacks are traced.
-    traced_kinds : kinds of callbacks that were traced. They do not branch: they write to equal entries in all systems.
+    traced_kinds : kinds of callbacks that were traced. They do not branch, and so write to the same entries always.
     within_bounds : kinds of traced callbacks for which `check_bounds` succeeded in one of the systems.
     """
 
@@ -456,13 +456,13 @@ class TraceCache:
         self.traced_kinds: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
-        # results of `_scaled_products` by id of the array; the array is stored, too, so that its id is not reused
+        # results of `_scaled_products`; keys: ids of arrays, which are stored, too, so that their ids stay unique
         self._arrays: dict[int, tuple[Any, ScaledProducts]] = {}
-        self._tracing_lock = RLock()  # one lock for all traces, as they record on one tape
+        self._tracing_lock = RLock()  # one lock for all traces, because they record on one tape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
         """Return the traced callbacks of a system, with their own copy of the graph, which the caller may extend."""
-        if system.called_in_python:  # a function called in Python may store arguments: it is traced as late as possible
+        if system.called_in_python:  # such functions may store their arguments, and are traced as late as possible
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
@@ -485,7 +485,7 @@ class TraceCache:
             scales, indices, products = self._scaled_products(array)
             with np.errstate(all="ignore"):
                 values: Array = scales * np.array(list(map(product, products)))[indices]
-            if not np.isfinite(values).all():  # an expression may divide by a sum of parameters that is zero
+            if not np.isfinite(values).all():  # for example, an expression divides by a sum of parameters that is zero
                 raise Untraceable("a number of them is not finite for these parameters")
             return values
 
@@ -508,7 +508,7 @@ class TraceCache:
         if key not in self._results:
             with self._tracing_lock:
                 if key not in self._results:
-                    with garbage_collection_off():  # there is no garbage, because all objects stay in the cache
+                    with garbage_collection_off():  # `make` leaves no garbage: all its objects stay in the cache
                         self._results[key] = make()
         return self._results[key]
 
@@ -518,11 +518,11 @@ def derive_cached(
 ) -> Any:
     """Return the result of `make` for a trace cache, converted for one system by the result's method `specialize`.
 
-    The trace cache is shared with other systems. If callbacks cannot be traced with variable parameters, or `check`
-    raises Untraceable (a callback may treat variable parameters differently from numbers), it is a cache for this
-    system alone. Results are cached by `key`.
+    The trace cache is shared with other systems. A cache for this system alone replaces it if callbacks cannot be
+    traced with variable parameters, or if `check` raises Untraceable (a callback may treat variable parameters
+    differently from numbers). Results are cached by `key`.
 
-    Raises Untraceable if the result cannot be derived from either cache, or `check` raises for it.
+    Raise Untraceable if the result cannot be derived from either cache, or if `check` raises for it.
     """
     for find_cache in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("family", find_cache), partial(find_cache, system))
@@ -539,7 +539,7 @@ def derive_cached(
 
 
 def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return the result of `derive_cached` from one trace cache, or the exception that says why there is none."""
+    """Return the result of `derive_cached` for one trace cache, or the exception that says why there is no result."""
     try:
         result = cache.remembered(key, partial(make, cache))
         return result.specialize(
@@ -552,13 +552,13 @@ def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make:
 
 
 def load_checked_bounds(system: ConstrainedSystem) -> None:
-    """Add to `system.within_bounds` the kinds of callbacks that were checked in other systems with the same traces."""
+    """Add kinds of callbacks, whose indices were checked in other systems with the same traces, to `within_bounds`."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 
 
 def share_checked_bounds(system: ConstrainedSystem) -> None:
-    """Add the traced kinds in `system.within_bounds` to the trace cache, for other systems with the same traces."""
+    """Add traced kinds in `system.within_bounds` to the trace cache, for other systems with the same traces."""
     if not system.called_in_python:
         cache = shared_cache(system)
         cache.within_bounds |= cache.traced_kinds & system.within_bounds
@@ -570,7 +570,7 @@ def shared_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Return the trace cache that a system with compiled callbacks shares with others; create it if it is missing."""
+    """Return the trace cache that a system with compiled callbacks shares with others; create the cache if missing."""
     parameters = system.parameters
     classes = _parameter_classes(parameters)
     fixed_parameters = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that the bytes are equal
@@ -599,12 +599,12 @@ def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
 
 
 class ParameterArrays:
-    """Arrays of numbers for arrays of expressions in parameters; `write` fills them with values for new parameters."""
+    """Arrays of numbers that replace arrays of expressions in parameters; `write` computes them for new parameters."""
 
     def __init__(self) -> None:
-        # arrays of numbers by id of the expressions; these are stored, too, so that the id is not reused
+        # arrays of numbers; keys: ids of the arrays of expressions, which are stored, too, so that ids stay unique
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # flat array of numbers, indices of the entries that vary, and their slice in the values that `write` computes
+        # flat arrays of numbers, indices of entries that vary, and slices of the values that `write` computes for them
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -612,9 +612,9 @@ class ParameterArrays:
         self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, exprs: Any) -> Array:
-        """Return the array of numbers that `write` fills for an array of expressions: one for each array object.
+        """Return the array of numbers that `write` fills for an array of expressions, always the same for one object.
 
-        If the entries are plain numbers, return the given array.
+        If the entries of the given array are plain numbers, return this array.
         """
         if exprs.dtype != object:
             return exprs  # type: ignore[no-any-return]
@@ -623,7 +623,7 @@ class ParameterArrays:
         return self._arrays[id(exprs)][1]
 
     def _numbers_for(self, exprs: Any) -> Array:
-        """Return an array of numbers for `exprs`: constants now, values of Parameters when `write` is called."""
+        """Return an array of numbers for `exprs`; it contains constants now, and values of Parameters after `write`."""
         entries, begin = exprs.ravel().tolist(), len(self._scales)
         varying = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in varying:

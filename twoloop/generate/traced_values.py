@@ -1,8 +1,8 @@
 """Compare the values of traces with the values that calls of the callbacks return.
 
-A trace is wrong if tracing does not detect that the callback branches, if the callback stores data between calls, or if
+A trace is wrong if tracing did not detect that the callback branches, if the callback stores data between calls, or if
 it reads changing data that are not its arguments (a global variable, whose value numba froze at compilation). Before a
-run, values are compared at states near the start, at times spread over the run; after a run, at states of the run.
+run, values are compared at states near the start, with times spread over the run; after a run, at states of the run.
 """
 
 import copy
@@ -32,15 +32,15 @@ KINDS = (
 N_NEARBY = 8  # number of random states near the start at which calls and traces are compared, besides the start
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
-# approximate largest number of compared states: in a chunk of steps, in a run, in a run with callbacks called in Python
+# approximate largest number of compared states: of a chunk of steps, of a run, of a run with callbacks called in Python
 MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
-MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run: large systems need fewer states
-# largest difference between call and trace that counts as a rounding error, relative to the largest term of any entry
+MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run: for large systems, fewer states suffice
+# differences between call and trace count as rounding errors up to this fraction of the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 # a trace is wrong if it differs from a call by more than this fraction; see also `_is_systematic`
 CLEAR_DIFFERENCE = 1e-6
-PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
-MARGIN = 0.01  # margin of a CheckedRegion, relative to its ranges: small compared with the steps of a run
+PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # of states near a state, see `_is_systematic`: largest relative distance, number
+MARGIN = 0.01  # margin of a CheckedRegion, relative to its ranges; small compared with the steps of a run
 MARGIN_AT_REST = 1e-9  # margin added for coordinates at rest, whose range is 0, relative to the largest range
 
 
@@ -60,10 +60,10 @@ class CallbackTraces:
         self.is_compared = np.array([kind in kinds for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
-        self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, compared or not
+        self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, whether or not compared
         self.is_trusted = False
         entries = (exprs[kind][index] for kind, index in self.entry_indices)
-        # the table computes no entries that are always zero
+        # entries that are always zero are left out of the table
         results = {k: expr for k, expr in enumerate(entries) if expr.terms or expr.constant}
         self.nonzero_kinds = frozenset(self.entry_indices[k][0] for k in results)
         self.program = OperationTable.from_results(graph, 1 + 2 * system.n_q, results)
@@ -88,7 +88,7 @@ class CallbackTraces:
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
         """Compare calls and traces at the states `nearby`; set `is_trusted`, or raise Untraceable if they differ."""
         difference = None
-        for states in (nearby, *nearby[:, None, :]):  # all states at once; if a call raises, one state after another
+        for states in (nearby, *nearby[:, None, :]):  # first all states at once; if a call raises, one after another
             try:
                 difference = difference or self.difference(system, states, everywhere=False)
             except Exception:  # the state is outside the domain of the callbacks
@@ -102,8 +102,8 @@ class CallbackTraces:
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Return a description of the first difference between calls and traces at states [t, q, v], or None.
 
-        `everywhere`: if a call returns a value that is not finite, the value of the trace must not be finite either.
-        Otherwise values that are not finite are not compared.
+        `everywhere`: where a call returns a value that is not finite, the value of the trace must not be finite either.
+        If false, such values are not compared.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -122,7 +122,7 @@ class CallbackTraces:
         else:
             is_agreeing |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        # for each entry, the largest term of all entries that the same callback returns
+        # for each entry, the largest term in any entry of the same callback
         max_term = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
         for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * max_term)):
             if not differences[k, entry] <= CLEAR_DIFFERENCE * max_term[entry] or self._is_systematic(
@@ -167,14 +167,14 @@ class CallbackTraces:
 
 
 class Sample:
-    """Sample of the states [t, q, v] of a run so far, evenly thinned out in long runs; `n`: length of [q, v]."""
+    """Sample of the states [t, q, v] of a run so far, thinned out evenly in long runs; `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._chunks = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add the states of a chunk of steps: `rows` [q, v, ...] at times `t`, and the last one, `state`, at `end`."""
+        """Add the states of a chunk of steps: `rows` [q, v, ...] at times `t`, and the last one: `state`, at `end`."""
         stride = 1 + len(t) // MAX_STATES_OF_CHUNK
         times = t[::stride]
         states = np.empty((len(times) + 1, 1 + self._n))
@@ -198,9 +198,9 @@ class Sample:
 def refuse_wrong_traces(
     traced: Sequence[CallbackTraces], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array
 ) -> None:
-    """Compare traces that are not trusted yet with calls at states near the start, at times spread over the run.
+    """Compare traces that are not trusted yet with calls, at states near the start with times spread over the run.
 
-    Raises Untraceable if a trace is wrong; the message names the callback and the entry.
+    Raise Untraceable if a trace is wrong; the message names the callback and the entry.
     """
     untrusted = [trace for trace in traced if not trace.is_trusted]
     if not untrusted:
@@ -212,11 +212,11 @@ def refuse_wrong_traces(
             trace.check_near_start(system, nearby)
 
 
-Check = Callable[[CallbackTraces], None]  # raises Untraceable if traces are wrong
+Check = Callable[[CallbackTraces], None]  # function that raises Untraceable if traces are wrong
 
 
 def accept_traces(traced: CallbackTraces) -> None:
-    """Accept any traces: a `Check` for results that no run uses."""
+    """Accept any traces; this `Check` is for results that no run uses."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
@@ -239,7 +239,7 @@ def _random_directions(n_q: int) -> Array:
 
 
 def extreme_states(t: Array, rows: Array) -> Array:
-    """Return the states, as rows [t, q, v], at which t or an entry of `rows` [q, v] is smallest or largest."""
+    """Return those states, as rows [t, q, v], at which t or an entry of `rows` [q, v] is smallest or largest."""
     states = np.column_stack([t, rows])
     return states[np.unique([states.argmin(axis=0), states.argmax(axis=0)])]
 
@@ -247,7 +247,7 @@ def extreme_states(t: Array, rows: Array) -> Array:
 class CheckedRegion:
     """Region in which callbacks agreed with their traces: ranges of the states [t, q, v], and of the parameters.
 
-    bounds : smallest and largest t, q and v, with a margin: no comparison is needed at states within them.
+    bounds : smallest and largest t, q and v, with a margin; states within these bounds need no comparison.
     """
 
     def __init__(self) -> None:
@@ -257,7 +257,7 @@ class CheckedRegion:
         self.bounds = self._ranges
 
     def is_comparison_due(self) -> bool:
-        """Return whether the next run has to compare callbacks at all sampled states, as runs 1, 2, 4, 8, ... do."""
+        """Return whether the next run has to compare callbacks at all sampled states: runs 1, 2, 4, 8, ... have to."""
         return (self._runs + 1) & self._runs == 0
 
     def count_run(self) -> None:
