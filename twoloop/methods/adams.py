@@ -7,8 +7,8 @@ import numpy as np
 
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 
-# stability limits for orders 1 to 12: of h times the frequency of a vibration, at which it grows by 1 % per step,
-# and of h times a rate of decay, above order 6 that of order 6, because the order falls when decay limits the steps
+# stability limits for orders 1 to 12: h times the frequency of a vibration that grows by 1 % per step; and h times a
+# rate of decay (above order 6: the limit of order 6, because the order falls when decay limits the steps)
 STABLE_TO = tuple(
     zip(
         (2.01, 2.01, 0.92, 0.97, 1.09, 1.23, 1.28, 1.13, 1.00, 0.89, 0.79, 0.71),
@@ -27,7 +27,7 @@ class Adams:
     integral of the polynomial through the last accelerations, velocities by the single integral. The end of every step
     is moved to the nearest state on the constraints, in the metric of M; with nonholonomic rows, to the state with the
     same independent coordinates. The method thus departs from the paper, whose outer loop has only independent
-    coordinates, and a new partition does not interrupt it.
+    coordinates, and a new partition does not interrupt the method.
 
     It starts by itself, with order 1 and a short step. After a run of many steps, a test at a few states shows whether
     stability rather than accuracy limited the steps. If so, `result.message` says so and names other methods.
@@ -68,6 +68,6 @@ class Adams:
             np.array([LARGEST_MOVE]),
             np.zeros(kernels.memory_size(n_q)),
             projects=True,
-            exponent=1.0,  # not used: the order varies, and the step returns the factor for its order
+            exponent=1.0,  # not used: the order varies, and the step returns the ratio of step sizes for its order
             stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],
         )

@@ -15,27 +15,27 @@ from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
 MANY_COORDINATES = 16  # from this number of coordinates on, evaluations may cost more than the algebra of Adams' method
-# from MANY_COORDINATES on, Adams replaces DOP853 if there are at most this many constraints per coordinate: with more,
+# from MANY_COORDINATES on, Adams replaces DOP853 up to this number of constraints per coordinate; with more constraints
 # projections cost more than evaluations
 MAX_CONSTRAINT_RATIO = 0.25
-ADAMS_TOLERANCE = 1e-10  # Adams replaces DOP853 from MANY_COORDINATES on if the tolerance is below this
+ADAMS_TOLERANCE = 1e-10  # below this tolerance, Adams replaces DOP853 from MANY_COORDINATES on
 VERY_MANY_COORDINATES = 64  # Adams replaces DOP853 from this number of coordinates on, except with sparse matrices
 MAX_NEWTON_COORDINATES = 1000  # Newton's method, with full matrices, is tried up to this number of coordinates
-# tolerance whose rule for the choice of a series also applies at looser ones if the other methods need short steps
+# if the other methods need short steps, a series is chosen at any looser tolerance by the rule for this tolerance
 SHORT_STEP_TOLERANCE = 1e-9
 SERIES_TOLERANCE = 1e-6  # a Taylor series may cost less than DOP853 if the tolerance is below this
-MAX_OPERATIONS = 12  # a Taylor series costs less than DOP853 if it takes at most this many operations per coordinate
-# replaces MAX_OPERATIONS below FEW_COORDINATES, and for at least MANY_COORDINATES at looser tolerances
+MAX_OPERATIONS = 12  # up to this number of operations per coordinate, a Taylor series costs less than DOP853
+# replaces MAX_OPERATIONS below FEW_COORDINATES and, at looser tolerances, from MANY_COORDINATES on
 MAX_OPERATIONS_FEW = 8
 FEW_COORDINATES = 5  # with fewer coordinates, MAX_OPERATIONS_FEW replaces MAX_OPERATIONS
-SERIES_TOLERANCE_MANY = 1e-8  # replaces SERIES_TOLERANCE from MANY_COORDINATES on with generated code
+SERIES_TOLERANCE_MANY = 1e-8  # with generated code, replaces SERIES_TOLERANCE from MANY_COORDINATES on
 LOOSE = 3e-5  # from this tolerance on, the method for few digits integrates stiff motion
 TIGHTEST = 9e-7  # below this tolerance, the method for many digits integrates stiff motion
-# from this h rho on (rho: largest rate of motion), stiffness may limit DOP853 (stable to 5.9) and Adams
+# from this h rho on (rho: largest rate of motion), stiffness may limit steps of DOP853 (stable to 5.9) and of Adams
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25
 LIMIT_FEW_OF_MANY = 2.0  # replaces LIMIT_FEW from MANY_COORDINATES on, where evaluations cost more than a trial
-# number of successive estimates of h rho above the limit before a trial, as accuracy may allow a few long steps; for
-# Adams, and with LIMIT_FEW_OF_MANY, one estimate is enough
+# number of successive estimates of h rho above the limit before a trial: more than one, because accuracy may allow a
+# few long steps; for Adams, and with LIMIT_FEW_OF_MANY, one estimate is enough
 ESTIMATES_FEW = 2
 # if h rho / order is at least this, stiffness may limit a series, which is stable to 0.42 (decay) or 0.6 (vibration)
 LIMIT_SERIES = 0.3
@@ -43,14 +43,14 @@ COST_RATIO = 4.0  # estimated cost of an evaluation without generated code, in e
 # COST_RATIO_HEAVY replaces COST_RATIO if callbacks take at least MANY_OPERATIONS per coordinate: these operations cost
 # the same with and without generated code
 COST_RATIO_HEAVY, MANY_OPERATIONS = 2.0, 17
-MATRIX_COST = 3.0  # cost of a Newton matrix in evaluations, to which an eighth of the number of coordinates is added
+MATRIX_COST = 3.0  # cost of a Newton matrix, in evaluations: this number plus an eighth of the number of coordinates
 
 
 def switching(first: Plan, second: Plan, limit: float, n_q: int, estimates: int = 1, cost_ratio: float = 1.0) -> Plan:
     """Return the plan that switches from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
 
-    `limit`: value of h rho (rho: largest rate of the motion) that `estimates` successive estimates must exceed before
-    `second` is tried. `cost_ratio`: cost of an evaluation of `second`, in evaluations of `first`.
+    `second` is tried if `estimates` successive estimates of h rho (rho: largest rate of the motion) exceed `limit`.
+    `cost_ratio`: cost of an evaluation of `second`, in evaluations of `first`.
     """
     from twoloop.kernels.control import stiffness as kernels
 
@@ -89,16 +89,16 @@ class Auto:
       cannot continue, or the equations are too long for it, the run uses `series` at tolerances below 1e-6 (from 16
       coordinates on: below 1e-8), else `few`, or `many` from 64 coordinates on.
     - `series` if the operations of the callbacks can be traced and are few: at most 12 per coordinate (8 with fewer
-      than five coordinates) at tolerances below 1e-6; at looser ones at most 8, with 16 coordinates or more.
+      than five coordinates) at tolerances below 1e-6; at looser tolerances at most 8, with 16 coordinates or more.
     - `many` from 64 coordinates on, and from 16 on if there are at most a quarter as many constraints or the tolerance
       is below 1e-10. Systems that give the entries of sparse matrices need one of the last two conditions, because
       their projections, one per step, cost as much as evaluations.
     - `few` otherwise.
 
     At looser tolerances a run also begins with `series` if the other methods may take no steps longer than a hundredth
-    of the run. Within 10 steps it continues without the series if the next step would be no longer than that. Steps of
-    `few` may be longer if forces and constraints have no quotients, roots or fast vibrations. A run also continues
-    without the series if the series is not finite although the callbacks are.
+    of the run. It continues without the series if, after one of its first 10 steps, the next step would be no longer
+    than this either. Steps of `few` may be longer if forces and constraints have no quotients, roots or fast
+    vibrations. A run also continues without the series if the series is not finite although the callbacks are.
 
     The largest rate of the motion is estimated from the derivatives of the accelerations, after 100 evaluations and
     then after every 600 (two to four times as many with generated code). This rate sets the limit of stability of the
@@ -106,7 +106,7 @@ class Auto:
 
     - steps have come near the limit, at two successive estimates (at one with `many`, and with `few` from 16
       coordinates on);
-    - steps are above 5 % of the limit, and the rate is more than thirty times that of the motion itself, or all
+    - steps are above 5 % of the limit, and the rate is more than thirty times the rate of the motion itself, or all
       velocities that could vibrate or decay at this rate are within ten tolerances;
     - the whole run is expected to cost a thousand trials.
 
@@ -114,11 +114,11 @@ class Auto:
     each independent coordinate if tangents have to be computed by differences. Three tenths of the expected cost of the
     whole run count as spent. The implicit method (`loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else
     `tight`) is kept if a second of motion costs less with it, counted in evaluations and Newton matrices. The run
-    returns to the explicit method if the steps come below the limit, or if that method costs less. Counts decide, not
-    times, so that a run can be repeated.
+    returns to the explicit method if the steps come below the limit, or if the explicit method costs less. Counts
+    decide, not times, so that a run can be repeated.
 
-    Above 1000 coordinates no implicit method is tried, as its matrices are full. No series is tried if M and C_q have
-    more than 200,000 entries, zeros among them, as tracing takes seconds (method="Taylor" does it).
+    Above 1000 coordinates no implicit method is tried, because its matrices are full. No series is tried if M and C_q
+    have more than 200,000 entries, zeros included, because tracing would take seconds (method="Taylor" traces them).
 
     While the implicit method runs, errors of positions are within the tolerances; velocities are tested for the errors
     that they will cause in the positions before they turn back or decay. Fixed steps are taken by `fixed`.
@@ -162,7 +162,7 @@ class Auto:
     cost_ratio: float | None = None
     # whether the system gives the entries of sparse matrices: an evaluation then costs no more than a projection
     sparse: bool = False
-    # whether forces may change much over a distance shorter than a step, so that every method must limit its steps
+    # whether forces may change much over a distance shorter than a step: then every method must limit its steps
     narrow: bool = True
 
     def for_system(
@@ -188,7 +188,7 @@ class Auto:
         """Return whether a step of the series costs less than the steps of the explicit method that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
-        if self.cost_ratio is not None:  # generated code: a series runs near singular positions, as it is more exact
+        if self.cost_ratio is not None:  # generated code: near singular positions, a series is more exact
             return tolerance < (SERIES_TOLERANCE if n_q < MANY_COORDINATES else SERIES_TOLERANCE_MANY)
         if tolerance < SERIES_TOLERANCE:
             return operations <= (MAX_OPERATIONS if n_q >= FEW_COORDINATES else MAX_OPERATIONS_FEW)
@@ -206,7 +206,7 @@ class Auto:
         return plan.changed(substitute=fallback, traced=traced, within_newton=fallback.within_newton)
 
     def _without_lanes(self, n_q: int, rtol: float, atol: float) -> Plan:
-        """Return the plan without `lanes`, that is without collocation in SIMD lanes."""
+        """Return the plan without `lanes`, the method with collocation in SIMD lanes."""
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = cached_plan(implicit, n_q, rtol, atol)
@@ -215,7 +215,7 @@ class Auto:
             return self._explicit(n_q, rtol, atol, second, cost_ratio)
         pays = self._series_pays(n_q, tolerance)
         explicit = self._explicit(n_q, rtol, atol, second, cost_ratio)
-        # at looser tolerances the series also pays if the other methods are limited to a hundredth of the run
+        # at looser tolerances, the series also pays if steps of the other methods are limited to a hundredth of the run
         stages_suffice = explicit.max_gap < 1.0 and not self.narrow
         if not pays and (stages_suffice or not self._series_pays(n_q, SHORT_STEP_TOLERANCE)):
             return explicit

@@ -1,8 +1,8 @@
 """DOP853(...): the explicit method of order 8 of Dormand and Prince, in the two-loop procedure.
 
-Tableau: Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I (1993), II.5. The numbers are those of
-`scipy.integrate.DOP853`. They are copied, because importing that package takes a tenth of a second; a test compares
-them. Both error estimates are weighted sums of the slopes of the stages; the slope at the end has the weight zero.
+Tableau: Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I (1993), II.5. The numbers are copied from
+`scipy.integrate.DOP853`, because importing SciPy's package takes a tenth of a second; a test compares them with SciPy.
+Both error estimates are weighted sums of the slopes of the stages; the slope at the end has the weight zero.
 """
 
 from dataclasses import dataclass
@@ -72,29 +72,29 @@ E5 = np.array(
 
 
 COARSE_SHARE = 0.1  # factor on the error estimate of order 3 in the combined estimate e5^2 / sqrt(e5^2 + 0.01 e3^2)
-# largest change of a position, relative to the tolerance, for which the velocity of a stage uses an earlier Jacobian
+# the velocity of a stage uses an earlier Jacobian if no position has changed by more than this since, in tolerances
 REUSE_TOLERANCE = 1e-4
-# lower limit of the error, relative to the tolerance, in the trend that the step size follows (`Plan.least_error`); it
-# is low because halving the step divides the error by more than 100
+# lower limit of errors, relative to the tolerance, in the trend that the step size follows (`Plan.least_error`); it is
+# low, because halving the step divides the error by more than 100
 LEAST_ERROR = 1e-6
 EVALUATED_NODES = C[(B != 0.0) | (E5 != 0.0) | (E3 != 0.0)]  # nodes of the stages with nonzero weights
 # longest part of a step between two of these nodes, relative to the step: 4/15
 LONGEST_GAP = float(np.diff([*np.sort(EVALUATED_NODES), 1.0]).max())
 STABLE_TO = (5.96, 6.39)  # limits of stability: h times the frequency of a vibration, and h times a rate of decay
-SAFETY = 0.8  # safety factor of the step size: 0.9 doubles the rejected steps, and costs a tenth more at equal error
+SAFETY = 0.8  # safety factor of the step size; 0.9 doubles the rejected steps, and costs a tenth more at equal error
 
 
 @dataclass(frozen=True)
 class DOP853:
     """Explicit Runge-Kutta method of Dormand and Prince, order 8 with 12 stages, for smooth motion that is not stiff.
 
-    There is no outer loop. Every stage is one evaluation, so a step costs 12 evaluations, and a rejected one 11.
+    There is no outer loop. Every stage is one evaluation, so a step costs 12 evaluations, and a rejected step 11.
     Accepted states are on the constraints.
 
-    If parts of the system could vibrate or decay faster than it moves, stability, not accuracy, limits the step h:
-    h w_max to 5.96 for undamped vibrations, and h times the largest rate of decay to 6.39. Vibrations that such steps
-    hardly resolve are damped, by 0.15 % of the amplitude per step at h w_max = 3. If stability limited many steps,
-    `result.message` says so and names other methods.
+    If parts of the system could vibrate or decay faster than the system moves, stability, not accuracy, limits the step
+    size h: h w_max to 5.96 for undamped vibrations, and h times the largest rate of decay to 6.39. Vibrations that such
+    steps hardly resolve are damped, by 0.15 % of the amplitude per step at h w_max = 3. If stability limited many
+    steps, `result.message` says so and names other methods.
 
     A step is accepted when the largest component of the estimated local error of q and v, including the dependent
     ones, is within the tolerance. Fixed steps have no error estimate.
@@ -103,13 +103,13 @@ class DOP853:
     ----------
     stages : {"free", "restored"}
         "free": all coordinates are integrated alike, stages are off the constraints by the error of the formula, and
-        the end of the step is moved to the nearest state on them, in the metric of M. This departs from the paper.
+        the end of the step is moved to the nearest state on the constraints, in the metric of M, unlike in the paper.
         "restored": the paper's procedure with this tableau. The independent coordinates are integrated, and the inner
-        loop restores the dependent ones at every stage. With nonholonomic constraints, the state at the end of a step
-        is always restored in this way.
+        loop restores the dependent coordinates at every stage. With nonholonomic constraints, the state at the end of a
+        step is always restored in this way.
     inner_tol : float, optional
-        Tolerance of Newton's method for the positions, unit of q, with "restored": it stops when its last correction is
-        at most this. None: 1e-8.
+        Tolerance of Newton's method for the positions, unit of q, with "restored": the iteration stops after a
+        correction of at most inner_tol. None: 1e-8.
 
     Raises
     ------
@@ -120,10 +120,10 @@ class DOP853:
     -----
     Tableau and error estimate, e5^2 / sqrt(e5^2 + 0.01 e3^2) of embedded estimates of orders 5 and 3: Hairer, Norsett
     and Wanner, Solving ODEs I (1993), II.5 and II.10; e5 and e3 are largest components here, not root mean squares.
-    After a run has come near a singular position, the quotient e5 / sqrt(e5^2 + 0.01 e3^2) in this estimate is replaced
-    by its square root, as terms of high order are not small there, and errors have to be within a tenth of the
-    tolerances, if these are at least 1e-10. The numbers are those of SciPy's `DOP853`. The stability limits are those
-    of the method's polynomial R(z): |R| <= 1 on the imaginary axis up to 5.96 i, on the real one down to -6.39.
+    Once a run has come near a singular position, the quotient e5 / sqrt(e5^2 + 0.01 e3^2) in this estimate is replaced
+    by its square root, because terms of high order are not small there, and errors have to be within a tenth of the
+    tolerances, if these are at least 1e-10. The numbers are those of SciPy's `DOP853`. The stability limits follow from
+    the method's polynomial R(z): |R| <= 1 on the imaginary axis up to 5.96 i, and on the real axis down to -6.39.
 
     Examples
     --------

@@ -14,7 +14,7 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
-PARTS = 6  # number of steps into which a step is divided, and computed again, for the solution between its ends
+PARTS = 6  # for the solution between its ends, a step is computed again as this number of steps
 # largest distance between neighbouring nodes, relative to the step
 LONGEST_GAP = float(np.diff([0.0, *tables().nodes]).max())
 
@@ -23,13 +23,13 @@ LONGEST_GAP = float(np.diff([0.0, *tables().nodes]).max())
 class Lobatto16:
     """Implicit steps of order 16 by collocation at nine Lobatto nodes, whose stages are found by fixed-point iteration.
 
-    It is the outer loop of the paper's procedure with another tableau, and for all coordinates. It needs no Jacobian;
-    stages are predicted by the polynomial of the previous step. Generated code evaluates the eight unknown stages at
-    once, one in each SIMD lane; a step takes four to eight such sweeps. Accepted states are on the constraints.
+    The method is the outer loop of the paper's procedure with another tableau, and for all coordinates. It needs no
+    Jacobian; the polynomial of the previous step predicts the stages. Generated code evaluates the eight unknown stages
+    at once, one in each SIMD lane; a step takes four to eight such sweeps. Accepted states are on the constraints.
 
     It is for smooth motion that is not stiff. If the iteration converges too slowly, as in stiff motion, the run
-    continues with "DOP853". It also does so after a singular position at tolerances below 1e-8; the position itself is
-    crossed by collocation with projected stages.
+    continues with "DOP853". At tolerances below 1e-8, it also does so after a singular position; collocation with
+    projected stages crosses the position itself.
 
     Raises
     ------
@@ -61,7 +61,7 @@ class Lobatto16:
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = accept_traces
     ) -> "Lobatto16":
-        """Return the method with the generated code of this system; raise ValueError if there is none, or too long."""
+        """Return the method with the generated code of this system; raise ValueError if code is missing or too long."""
         if code is None or not compiles_quickly(code.shared):
             raise ValueError(
                 f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. "

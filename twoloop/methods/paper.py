@@ -9,8 +9,8 @@ from twoloop.methods.plan import INNER_TOL, Plan, check_tolerances, outer_tolera
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
-MIN_DISTANCE = 0.02  # smallest |beta - 1/6|, the factor of Newmark's error estimate, at which it is used
-# ratio of the outer tolerance to err_out; the iterations converge so fast that a small ratio costs next to nothing
+MIN_DISTANCE = 0.02  # Newmark's error estimate has the factor |beta - 1/6|, and can be used if this is not smaller
+# ratio of the outer tolerance to err_out; the iterations converge so fast that a small ratio costs hardly anything
 OUTER_TO_ERROR_TOL = 1e-3
 
 
@@ -26,12 +26,12 @@ class Newmark:
     error_tol : float, optional
         err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this, and the
         error of a run is proportional to error_tol^(2/3); steps are shortened to end at output times. None: a step is
-        accepted when the largest component of e / h, the error per unit step, is at most r atol + rtol |v|, so that the
+        accepted when the largest component of e / h, the error per unit time, is at most r atol + rtol |v|, so that the
         error of a run is proportional to the tolerance. 1 / r is the time in which the largest velocity, or
-        acceleration, so far would change a coordinate by the largest value so far. r is not in the paper; it does not
+        acceleration, so far would change a coordinate by its largest value so far. r is not in the paper; it does not
         become zero, whatever the origin of the coordinates.
     inner_tol : float, optional
-        Newton's method for the positions stops when its last correction is at most this (unit of q). None: 1e-8.
+        Newton's method for the positions stops after a correction of at most inner_tol (unit of q). None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position would change by more than this, relative to
         max(|value|, 1). None: 1e-3 error_tol or 0.01 min(rtol, atol); with fixed steps 1e-14.
@@ -104,7 +104,7 @@ class Newmark:
         )
 
 
-BDF_HIGHEST = 5  # highest order of BDF; the formula of order 6 is almost unstable, those beyond are unstable
+BDF_HIGHEST = 5  # highest order of BDF; the formula of order 6 is almost unstable, higher orders are unstable
 
 
 @dataclass(frozen=True)
@@ -113,16 +113,16 @@ class BDF:
 
     For y' = f(y), y = [q_i, v_i], each step solves y = p + c (f(y) - p'). Here p extrapolates the last k + 1 points,
     and c = h / (1 + 1/2 + ... + 1/k). The outer loop is a fixed-point iteration on the independent accelerations; every
-    evaluation contains the inner loop. A step takes two to three evaluations. At equal tolerance errors are larger than
-    those of `RungeKutta`: compare at equal error. The method is meant for few digits.
+    evaluation contains the inner loop. A step takes two to three evaluations. At equal tolerance, errors are larger
+    than with `RungeKutta`: compare at equal error. The method is meant for few digits.
 
     With step-size control a run begins with order 1 and a small step. A step is accepted when the largest component of
-    the estimated local error of q and v, including the dependent ones, is within the tolerance. Fixed steps have the
-    order max_order from the beginning; 3-stage Gauss steps compute the past points that it needs.
+    the estimated local error of q and v, including dependent entries, is within the tolerance. Fixed steps have the
+    order max_order from the beginning; 3-stage Gauss steps compute the past points that this order needs.
 
-    In undamped motion, small oscillations lose energy with orders 1, 2 and 5 and gain it with orders 3 and 4, at the
-    rate of the truncation error; large oscillations may do either from order 3 on. The fixed-point iteration limits h
-    to about the reciprocal of the largest frequency or rate of decay, so that stiff problems need small steps.
+    In undamped motion, small oscillations lose energy with orders 1, 2 and 5 and gain energy with orders 3 and 4, at
+    the rate of the truncation error; from order 3 on, large ones may lose or gain energy. The fixed-point iteration
+    limits h to about the reciprocal of the largest frequency or rate of decay, so that stiff problems need small steps.
 
     For large systems with sparse matrices, all coordinates are integrated, and the end of each step is moved onto the
     constraints.
@@ -132,7 +132,7 @@ class BDF:
     max_order : int
         Highest order, 1 to 5.
     inner_tol : float, optional
-        Newton's method for the positions stops when its last correction is at most this (unit of q). None: 1e-8.
+        Newton's method for the positions stops after a correction of at most inner_tol (unit of q). None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position would change by more than this, relative to
         max(|value|, 1), but not before one correction. None: 0.01 min(rtol, atol); with fixed steps 1e-14.
@@ -146,10 +146,10 @@ class BDF:
     -----
     Sect. 5 of the paper proposes BDF as further work and leaves its form open, so that the details are chosen here.
     Modified divided differences with fixed leading coefficient, and their error estimate: Brenan, Campbell and Petzold,
-    Numerical Solution of Initial-Value Problems in DAEs (1996), on DASSL. Unlike the backward differences on an
-    equidistant history of Shampine and Reichelt (1997) they need no interpolation when the step size changes. The next
-    order is the one that allows the largest step, as in VODE. Stability and error constants: Hairer, Norsett and
-    Wanner, Solving ODEs I (1993), chapter III.
+    Numerical Solution of Initial-Value Problems in DAEs (1996), on DASSL. They need no interpolation when the step size
+    changes, unlike the backward differences on an equidistant history of Shampine and Reichelt (1997). The next order
+    is the one that allows the largest step, as in VODE. Stability and error constants: Hairer, Norsett and Wanner,
+    Solving ODEs I (1993), chapter III.
 
     Examples
     --------
@@ -187,7 +187,7 @@ class BDF:
             kernels.BDF,
             kernels.options_array(self.max_order, inner_tol, outer_tol, gauss(kernels.STARTER_STAGES)),
             np.zeros(kernels.memory_size(n_q)),
-            exponent=1.0,  # not used: the order varies, and the step returns the factor for its order
+            exponent=1.0,  # not used: the order varies, and the step returns the ratio of step sizes for its order
             projects=True,
             separate=True,
         )
@@ -209,19 +209,19 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
       is still usable. `outer_test="independent"` is the other reading.
     - (26): "Rotol" is read as Rtol. (27): n is 2 n_q, because z holds positions and velocities.
     - (28)-(34): the undefined q is the order 5, so the exponent is 1/6.
-    - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta method iterates the K_i, and so does this. Its step 2
-      predicts K_i = f(t_n + c_i h, y_{n+1}); here one K, at (t_{n+1}, y_{n+1}), predicts all.
-    - Left open by the text and chosen: the K_i are calculated one after another with the latest of the others, as the
-      loop is printed; the accepted state is that of the two half steps; Newton starts from the last iterate of the
-      same stage; err_in bounds the largest correction; 200 iterations at the most; the first step size, by solve_dae;
-      c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
-    - A step also ends as after (33) when the inner loop does not converge: 25 iterations, a correction of more than
-      half the one before, or a singular C_qd.
+    - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta method iterates the K_i, and so does this method. Step 2 of
+      the paper predicts K_i = f(t_n + c_i h, y_{n+1}); here one K, at (t_{n+1}, y_{n+1}), predicts all K_i.
+    - Left open by the text and chosen: the K_i are calculated one after another, each with the latest values of the
+      others, as the loop is printed; the accepted state is the end of the two half steps; Newton starts from the last
+      iterate of the same stage; err_in bounds the largest correction; there are at most 200 iterations; solve_dae
+      chooses the first step size; c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
+    - A step also ends as after (33) when the inner loop does not converge: after 25 iterations, a correction of more
+      than half the previous one, or a singular C_qd.
     - "Once in a time step or several time steps": the partition is checked after every step. It is chosen anew when
       max|C_qd^-1 C_qi| has grown to three times its first value, or when a step failed in the inner loop.
     - Steps are shortened to end at output times and at the end of the run.
     - A step is also rejected if the force jumps between its start and the first stage: neither the step nor its halves
-      evaluate the force before the jump, and errors of 1e5 tolerances were not noticed.
+      evaluate the force before the jump, so that errors of 1e5 tolerances were not noticed.
 
     Parameters
     ----------
@@ -242,22 +242,22 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
 
 
 def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float = 0.5) -> Newmark:
-    """Return the two-loop procedure with Newmark's method, with which the paper compares; beta = 1/2 as printed.
+    """Return the two-loop procedure with Newmark's method, as the paper uses it for comparison; beta = 1/2 as printed.
 
     As printed: (12) with beta = gamma = 1/2; the outer loop by (11) and (12) with the inner loop between them.
 
     Where this differs from the printed text, and why:
 
-    - beta = 1/2 is not the average-acceleration method in the form (12), which has beta = 1/4: the leading error is
-      four times larger. Both can be chosen; the printed one is the default.
+    - In the form (12), the average-acceleration method has beta = 1/4, not 1/2, with which the leading error is four
+      times larger. Both values can be chosen; the printed value is the default.
     - The paper refers to Hussein and Shabana for error control and convergence. err_out is taken as the tolerance
       of the local error |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 (Zienkiewicz and Xie 1991), with the step factor
       0.9 (err_out / error)^(1/3) between 0.5 and 5 and h_max = 1 s: with other choices the cost does not grow as in
       Table 3. After a step that did not converge h is halved, and h_max is 0.7 h for ten steps.
     - The outer loop stops when y_i would change by less than err_out / 1000, relative to max(|y_i|, 1); it is given
       up when the differences grow.
-    - Newton starts from the Taylor polynomial of the dependents, not from the last position.
-    - The partition is renewed as in `paper_irk`; steps are shortened to end at output times, too.
+    - Newton starts from the Taylor polynomial of the dependent coordinates, not from the last position.
+    - As in `paper_irk`, the partition is renewed, and steps are shortened to end at output times.
 
     Parameters
     ----------

@@ -12,14 +12,14 @@ from twoloop.kernels.compile.caches import BoundedCache
 
 Array = NDArray[np.float64]
 
-# largest last correction of the inner loop, unit of q: as Newton's method converges quadratically, the error that
-# remains is about the square of this correction
+# the inner loop ends after a correction of at most this, unit of q: as Newton's method converges quadratically, the
+# error that remains is about the square of this correction
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # lower limit of the error, relative to the tolerance, in the trend that the step size follows
-JUMP_RATIO = 10.0  # measured largest ratio of error to estimate of a step in which a force jumps, for most methods
-# largest correction of a position, unit of q, after which a projection is not repeated: velocities are then as exact
+JUMP_RATIO = 10.0  # if a force jumps in a step, largest measured ratio of error to error estimate, for most methods
+# a projection ends after a correction of positions by at most this, unit of q; velocities are then as accurate
 LARGEST_MOVE = 1e-14
-OUTER_TOL_RATIO = 0.01  # tolerance of the outer loop, relative to that of the step
+OUTER_TOL_RATIO = 0.01  # tolerance of the outer loop, relative to the tolerance of the step
 OUTER_TOL_FIXED = 1e-14  # tolerance of the outer loop in fixed steps, which are iterated to rounding
 LEAST_TOLERANCE = 1e-14  # lower limit of rtol and atol in rules that derive other values from them
 
@@ -31,19 +31,19 @@ class Plan:
     step: Any  # a Step of kernels/data/common.py, or its name
     options: Array  # parameters of the step
     memory: Array  # data that the step keeps from attempt to attempt
-    exponent: float  # the next step size is this one times safety error**-exponent
-    first: Any = None  # the two steps between which `step` switches
+    exponent: float  # the next step size is the present one times safety * error**-exponent
+    first: Any = None  # for a pair of methods: `step` switches between the steps `first` and `second`
     second: Any = None
     safety: float = 0.9  # safety factor of the step size
-    factor_min: float = 0.2  # smallest ratio of the next step size to this one
-    factor_max: float = 5.0  # largest ratio of the next step size to this one
+    factor_min: float = 0.2  # smallest ratio of the next step size to the present one
+    factor_max: float = 5.0  # largest ratio of the next step size to the present one
     limit_start: float = np.inf  # largest step size, s, unless a step has failed recently
-    limit_factor: float = 0.7  # largest step size after a failed step, relative to this step
+    limit_factor: float = 0.7  # largest step size after a failed step, relative to the failed step
     limit_memory: int = 10  # number of accepted steps after a failed step for which `limit_factor` applies
     symmetric: bool = False  # whether each step uses the partition chosen at its midpoint
     least_error: float = 0.0  # lower limit of the error in the trend that the step size follows; 0: no trend
-    jump_ratio: float = 1.0  # largest ratio of error to estimate of a step in which a force jumps
-    reuse: float = 0.0  # largest correction of a position, within a step, with which the previous Jacobian is used
+    jump_ratio: float = 1.0  # if a force jumps in a step, largest ratio of error to error estimate
+    reuse: float = 0.0  # within a step, the previous Jacobian is used if positions are corrected by at most this
     checks_within: bool = False  # whether short steps trigger a check for a singular position nearby
     # whether steps evaluate accelerations without a projection, and call the projection separately
     projects: bool = False
@@ -51,20 +51,20 @@ class Plan:
     separate: bool = False  # whether errors of q and v are independent: then v is not the slope of q between steps
     # function of `memory` that returns the largest stable h rho for vibration and for decay, see control/stiffness.py
     stable_to: Any = None
-    inner: Any = None  # inner loop that calls generated code; None: the general one
+    inner: Any = None  # inner loop that calls generated code; None: the general inner loop
     own: tuple[Any, ...] = ()  # generated functions, see kernels/data/common.py
     numbers: Any = None  # coefficients of the generated functions of the inner loop
     own_numbers: Any = None  # data of the generated functions of collocation
     matrices: int = 0  # number of (n_q, n_q) matrices of Newton's method in the workspace
     parts: int = 1  # number of equal steps into which a step is divided for the solution between its ends
-    interior: "Plan | None" = None  # plan of these `parts` of a step; None: the plan of the method with fixed steps
-    # whether steps evaluate the equations between their ends; if not, their length is limited
+    interior: "Plan | None" = None  # plan by which these `parts` are computed; None: the method's plan for fixed steps
+    # whether steps evaluate the equations between their ends; if not, the step size is limited
     evaluates_within: bool = False
     max_gap: float = 1.0  # longest part of a step without an evaluation of the equations, relative to the step
-    substitute: "Plan | None" = None  # plan that continues the run if values of this one are not finite
-    on_trial: bool = False  # whether the substitute also takes over if this plan's steps are not longer than its own
+    substitute: "Plan | None" = None  # plan that continues the run if values by this plan are not finite
+    on_trial: bool = False  # whether the substitute also takes over if its own steps would be as long
     traced: tuple[Any, ...] = ()  # traces of the callbacks on which steps rely, see traced_values.py
-    # plan of the `parts` of Newton steps, for the solution between their ends; None: these steps are not divided
+    # plan for the parts of Newton steps, for the solution between their ends; None: Newton steps are not divided
     within_newton: "Plan | None" = None
 
     @property
@@ -89,7 +89,7 @@ class Plan:
 
 
 def takes_code(method: Any, fixed: bool) -> bool:
-    """Return whether the steps of a method, or those of its method for fixed steps, can run with generated code."""
+    """Return whether steps of a method (if `fixed`: of its method for fixed steps) can run with generated code."""
     return bool(getattr(getattr(method, "fixed", method) if fixed else method, "takes_code", False))
 
 
@@ -104,7 +104,7 @@ def least_tolerance(rtol: float, atol: float) -> float:
 
 
 def outer_tolerance(rtol: float, atol: float, fixed: bool) -> float:
-    """Return the tolerance of the outer loop, relative to max(|value|, 1), of methods without their own rule."""
+    """Return the tolerance of the outer loop, relative to max(|value|, 1), for methods without a rule of their own."""
     return OUTER_TOL_FIXED if fixed else OUTER_TOL_RATIO * least_tolerance(rtol, atol)
 
 
@@ -139,11 +139,11 @@ _PLANS = BoundedCache()  # plans of methods that do not depend on the system
 
 
 def cached_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:
-    """Return the cached plan, without fixed steps, of a method that does not depend on the system."""
+    """Return the cached plan, for step-size control, of a method that does not depend on the system."""
     key = (id(method), n_q, rtol, atol)
     entry: tuple[Method, Plan] | None = _PLANS.get(key)
     if entry is None:
-        # store the method, too, so that no other object gets its id
+        # store the method, too, so that no other object gets the same id
         _PLANS[key] = entry = method, method.plan(n_q, rtol, atol, False)
     return entry[1]
 
@@ -157,7 +157,7 @@ def crossing_plan(n_q: int) -> Plan:
 
 @cache
 def _crossing_options() -> Array:
-    """Return the options of steps across a singular position, cached: their tableau costs more than most such steps."""
+    """Return the options of steps across a singular position; cached, because the tableau costs more than a step."""
     from twoloop.kernels.steps import crossing_step as kernels
     from twoloop.methods.tableaux import gauss
 

@@ -20,16 +20,16 @@ from twoloop.methods.plan import (
 )
 from twoloop.methods.tableaux import Tableau
 
-NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps with Newton's method: stiff forces magnify rounding errors
-# h rho from which on fixed-point iteration converges so slowly that Newton's method is tried; rho: largest rate
+NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps with Newton's method; stiff forces magnify rounding errors
+# from this h rho on (rho: largest rate), fixed-point iteration converges so slowly that Newton's method is tried
 LIMIT_OF_FIXED_POINT = 1.5
-# largest condition number of the matrix of eigenvectors of A; its inverse: smallest allowed |eigenvalue| of A
+# largest condition number of the matrix of eigenvectors of A; 1 / MAX_CONDITION: smallest allowed |eigenvalue| of A
 MAX_CONDITION = 1e8
-# number of parts of a step for the solution within it, by the highest order for which the number suffices: with fewer
-# parts the error is more than a few times that at the ends (four-bar linkage, tolerances of 1e-4 to 1e-12)
+# number of parts into which a step is divided for the solution within it (keys: highest order for which this number is
+# enough). With fewer parts, errors are more than a few times those at the ends (four-bar, tolerances 1e-4 to 1e-12)
 PARTS = {5: 1, 6: 2, 8: 3, 10: 4, np.inf: 6}
-# highest order for which Newton steps are not divided for the solution within them; at higher orders interpolation is
-# not accurate enough, as it cannot use the accelerations of these steps
+# up to this order, Newton steps are not divided for the solution within them; at higher orders, interpolation is not
+# accurate enough, because it cannot use the accelerations of these steps
 MAX_ORDER_UNDIVIDED = 6
 
 
@@ -45,24 +45,24 @@ class RungeKutta:
         "fixed-point": iteration on the stage accelerations, predicted from the previous step; it is given up when its
         corrections grow.
         "newton": simplified Newton's method on the stage accelerations, in the eigenvectors of the tableau's A. The
-        Jacobian comes from the tangents that the system gives, else from differences of the two-loop right-hand side,
-        and is kept while the iteration converges fast. For stiff problems, where fixed-point iteration needs h w_max
-        below a constant. Its error estimate is an embedded one of order s, filtered (Hairer & Wanner II, IV.8); `error`
-        has no effect.
+        Jacobian comes from the tangents that the system gives, else from differences of the accelerations, and is kept
+        while the iteration converges fast. For stiff problems, where fixed-point iteration needs h w_max below a
+        constant. The error estimate is embedded, of order s, and filtered (Hairer & Wanner II, IV.8); `error` has no
+        effect.
         "auto": "fixed-point", and Newton's method where steps come near the limit of convergence of "fixed-point" and a
-        trial shows that a second of motion costs less; the run can switch back, see `Auto`.
+        trial shows that a second of motion costs less with it; the run can switch back, see `Auto`.
         "paper": fixed-point iteration on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
         The step size follows the error and, except with "paper", its trend (Gustafsson 1994).
     error : {"richardson", "richardson-paper"}
-        Both take the difference of one step of h and two of h/2, undivided as in (26), for the local error.
-        "richardson": the largest component of the difference counts, and the step continues from the extrapolated
-        state, whose order is one higher, put back on the constraints. "richardson-paper": the root mean square (27) of
-        the difference counts, and the step continues from the two half steps. Fixed steps have no error estimate and
-        use the tableau as it is, with sums from step to step that compensate rounding (Kahan). With "richardson" the
-        accelerations at both ends of the step are compared with the polynomial through those of the stages: so a jump
-        of the force between an end and its nearest stage is found, too.
+        Both take the difference between one step of h and two steps of h/2, undivided as in (26), for the local error.
+        "richardson": the largest component of the difference counts, and the new state is the extrapolated state, whose
+        order is one higher, projected onto the constraints. "richardson-paper": the root mean square (27) of the
+        difference counts, and the new state is the end of the two half steps. Fixed steps have no error estimate and
+        use the tableau as it is, with sums from step to step that compensate rounding (Kahan). With "richardson", the
+        accelerations at both ends of the step are compared with the polynomial through the stage accelerations: so a
+        jump of the force between an end and its nearest stage is found, too.
     inner_tol : float, optional
-        Newton's method for the positions stops when its last correction is at most this (unit of q). None: 1e-8.
+        Newton's method for the positions stops after a correction of at most inner_tol (unit of q). None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position changes by more than this, relative to
         max(|value|, 1). None: 0.01 min(rtol, atol); with fixed steps 1e-14.
@@ -74,11 +74,11 @@ class RungeKutta:
         `RungeKutta(gauss(3), partition="symmetric")` with fixed steps; with step-size control it may.
     tested : {"all", "positions"}
         Quantities that the error estimate of outer="newton" counts: positions and velocities, or positions and the
-        effect of velocities on them before these turn back or decay. Stiff vibrations that do not matter show in the
-        velocities; "positions" ignores them.
+        effect that velocities have on them before these turn back or decay. Stiff vibrations that do not matter show in
+        the velocities; "positions" ignores them.
     outer_test : {"all", "independent"}
         Quantities that (32) of outer="paper" counts: all coordinates and velocities, after the dependent ones are
-        restored, or the independent ones only. The text of the paper says both. No effect on other outer loops.
+        restored, or only the independent ones. The text of the paper says both. No effect on other outer loops.
 
     Raises
     ------
@@ -196,7 +196,7 @@ class RungeKutta:
         return newton.changed(within_newton=newton.changed(memory=newton.memory.copy(), parts=tableau.stages - 1))
 
     def _parts(self) -> int:
-        """Return the number of parts of a step that makes the solution within it as accurate as that at its ends."""
+        """Return the number of parts of a step with which the solution within it is as accurate as at its ends."""
         if self.outer in ("newton", "paper"):
             return 1
         return next(parts for order, parts in PARTS.items() if self.tableau.order <= order)
@@ -204,15 +204,15 @@ class RungeKutta:
 
 Array = NDArray[np.float64]
 
-# largest last correction of a stage, relative to the tolerance of the run; the error that remains is much smaller, as
-# the correction is applied and convergence is quadratic
+# the iteration of a stage ends after a correction of at most this, relative to the tolerance of the run; the error that
+# remains is much smaller, because the correction is applied and convergence is quadratic
 STAGE_TOL_RATIO = 3.0
-# largest last correction of a stage, relative to max(|q|, 1): larger ones make stiff problems so inaccurate that steps
-# become short
+# upper limit of the last correction of a stage, relative to max(|q|, 1): larger ones would make stiff problems so
+# inaccurate that steps become short
 LOOSEST_OUTER = 3e-3
-FEW_STEPS = 1e-3  # tolerance of a run below which last corrections are smaller, because they add up over more steps
-STAGE_TOL_FIXED = 1e-12  # last correction of a stage in fixed steps, relative: stiff forces magnify rounding
-STAGE_SAFETY = 0.8  # safety factor of the step size: 0.9 rejects one attempt in seven for the stiff beam
+FEW_STEPS = 1e-3  # below this tolerance of a run, last corrections are smaller, because they add up over more steps
+STAGE_TOL_FIXED = 1e-12  # relative last correction of a stage in fixed steps; stiff forces magnify rounding errors
+STAGE_SAFETY = 0.8  # safety factor of the step size; 0.9 would reject one attempt in seven for the stiff beam
 
 
 def _trbdf2() -> tuple[Array, Array]:
@@ -241,12 +241,12 @@ FORMULAS = {"TRBDF2": (_trbdf2, 2), "ESDIRK4": (_esdirk4, 4)}  # function that r
 def _jump_weights(c: Array) -> Array:
     """Return weights (s,) of ESDIRK4's stage accelerations whose weighted sum shows a jump anywhere in a step.
 
-    The sum is zero for quadratic accelerations. For a jump it is the sum of the weights of the later stages, which is
+    The sum is zero for quadratic accelerations. For a jump, it is the sum of the weights of all later stages, which is
     about half of the largest error of the step.
     """
     order = np.argsort(c)
     nodes = c[order]
-    # sums of the weights of all stages after each gap between nodes; the second and the last one are computed below
+    # sums of the weights of all stages after each gap between nodes; the second and the last sum are computed below
     sums_after = np.array([0.1392, 0.0, -0.16, -0.16, 0.0])
     moments = np.array([np.diff(nodes), np.diff(nodes**2)])
     sums_after[[1, 4]] = np.linalg.solve(moments[:, [1, 4]], -moments @ sums_after)
@@ -256,8 +256,8 @@ def _jump_weights(c: Array) -> Array:
 
 
 JUMP_WEIGHTS = {"TRBDF2": np.zeros(3), "ESDIRK4": _jump_weights(_esdirk4()[0].sum(axis=1))}
-# `Plan.jump_ratio` of the formulas: the weights of ESDIRK4 differ from the embedded ones by 0.04 at most, so that the
-# first estimate is 1/300 of the error if a force jumps in the first half of a step
+# `Plan.jump_ratio` of the formulas: the weights of ESDIRK4 differ from its embedded weights by at most 0.04, so that
+# the first estimate is 1/300 of the error if a force jumps in the first half of a step
 JUMP_RATIOS = {"TRBDF2": 1.0, "ESDIRK4": 300.0}
 
 
@@ -267,24 +267,24 @@ class ESDIRK:
 
     The stages are solved by Newton's method, one after another. If the system gives tangents, each iteration has its
     own Jacobian. Otherwise Jacobians are computed by differences, and kept while the iteration converges fast and the
-    error estimate confirms them. An earlier Jacobian no longer leads to convergence once stiff directions have turned;
+    error estimate confirms them. Once stiff directions have turned, an earlier Jacobian no longer leads to convergence;
     therefore `RungeKutta(..., outer="newton")`, whose stages share one Jacobian, is limited to short steps at loose
-    tolerances, but it is the better method at tight ones.
+    tolerances, but is the better method at tight tolerances.
 
-    Both formulas are L-stable and end with their last stage. With step-size control "TRBDF2" continues from its
-    embedded formula, of order 3: the difference, filtered for stiff components three times, is L-stable, too. A step is
-    accepted when these errors are within the tolerance: the error of the positions, estimated by the embedded formula
-    and filtered; the error that the velocity error will add to the positions before it turns back or decays (ten times
-    that if it does so no faster than the motion changes); and the part of it that remains some steps later, over the
-    time in which the motion changes. ESDIRK4 has a second embedded formula for jumps of a force within a step, which
-    the first formula hardly shows. Vibrations faster than the steps are damped. `tested="all"` tests velocities, too.
+    Both formulas are L-stable and end with their last stage. With step-size control, steps of "TRBDF2" end at the
+    result of its embedded formula, of order 3: the difference, filtered for stiff components three times, is L-stable,
+    too. A step is accepted when these errors are within the tolerance: the error of the positions, estimated by the
+    embedded formula and filtered; the position error that the velocity error will cause before it turns back or decays
+    (times ten if it does so no faster than the motion changes); and the part of it that remains some steps later, over
+    the time in which the motion changes. ESDIRK4 has a second embedded formula for jumps of a force within a step,
+    which the first hardly shows. Vibrations faster than the steps are damped. `tested="all"` also tests velocities.
 
     Parameters
     ----------
     formula : {"TRBDF2", "ESDIRK4"}
         Order 2 with two implicit stages, or order 4 with five.
     inner_tol : float, optional
-        Newton's method for the dependent positions stops when its last correction is at most this (unit of q). None:
+        Newton's method for the dependent positions stops after a correction of at most inner_tol (unit of q). None:
         1e-8.
     outer_tol : float, optional
         The outer loop stops when the last correction changes no independent position by more than this, relative to
@@ -292,7 +292,7 @@ class ESDIRK:
         add up over more steps; with fixed steps 1e-12.
     tested : {"all", "positions"}
         Quantities that the error estimate counts: positions and velocities, or positions and the effect of velocities
-        on them. Stiff vibrations that do not matter show in the velocities; "positions" ignores them.
+        on positions. Stiff vibrations that do not matter show in the velocities; "positions" ignores them.
 
     Raises
     ------

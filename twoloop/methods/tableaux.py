@@ -1,8 +1,8 @@
 """Runge-Kutta tableaux, generated for any number of stages.
 
-Every family is the collocation method at its nodes. Symplectic families average it with its symplectic adjoint: A_S =
-(A + B)/2 with B_ij = b_j (1 - A_ji / b_i). Sun's Radau IIB is this average of Radau IIA (its 3-stage tableau is Table 1
-of Zhang & Zhang 2016), Lobatto IIIE that of Lobatto IIIA.
+Each family is the collocation method at its nodes. Symplectic families average this method with its symplectic adjoint:
+A_S = (A + B)/2 with B_ij = b_j (1 - A_ji / b_i). Sun's Radau IIB is this average for Radau IIA (its 3-stage tableau is
+Table 1 of Zhang & Zhang 2016), and Lobatto IIIE is this average for Lobatto IIIA.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from twoloop.checks.arguments import check_real, check_size, check_text, check_v
 Array = NDArray[np.float64]
 
 ROUNDING_OF_SUM = 1e-12  # largest rounding error of a sum of coefficients, relative to the sum of their magnitudes
-MAX_STAGES = 100  # largest number of stages: no motion is smooth for as long as steps with more stages would be
+MAX_STAGES = 100  # largest number of stages: with more stages, steps would be longer than any motion stays smooth
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Tableau:
     b, c : ndarray (s,)
         Weights and nodes; c = A 1, so that time-dependent problems are integrated consistently.
     order : int
-        Classical order; step-size control relies on it, and it is not checked beyond b summing to 1.
+        Classical order, on which step-size control relies; it is not checked, except that b must sum to 1.
 
     Raises
     ------
@@ -164,8 +164,8 @@ def radau_iia(s: int) -> Tableau:
 def sun_radau_iib(s: int) -> Tableau:
     """Return Sun's symplectic Radau II ("IIB") tableau with s >= 1 stages: order 2s - 1; s = 3 is Table 1 of the paper.
 
-    Its stability function is that of Gauss: |R(iy)| = 1 and R(infinity) = +-1, no damping. With s = 1 it is the
-    implicit midpoint rule, of order 2.
+    It has the stability function of the Gauss method: |R(iy)| = 1 and R(infinity) = +-1, no damping. With s = 1 it is
+    the implicit midpoint rule, of order 2.
 
     Examples
     --------

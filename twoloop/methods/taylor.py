@@ -18,12 +18,12 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 LOWEST_ORDER, HIGHEST_ORDER = 4, 40  # limits of the option `order`
-# order of the series: LEAST_ORDER + ORDER_PER_DIGIT per digit of the tolerance, about the cheapest for the benchmark
+# order of the series: LEAST_ORDER plus ORDER_PER_DIGIT for each digit of the tolerance; cheapest order in the benchmark
 ORDER_PER_DIGIT, LEAST_ORDER = 1.15, 5.0
 ORDER_PER_DIGIT_IN_LANES, LEAST_ORDER_IN_LANES = 1.25, 3.5  # ORDER_PER_DIGIT and LEAST_ORDER in SIMD lanes
 FIXED_STEP_ORDER = 19  # order of fixed steps
-# limits of the number of parts into which a step is divided for the solution within it; the states between parts are
-# values of the series of the step, projected onto the constraints
+# smallest and largest number of parts into which a step is divided for the solution within it; the states between parts
+# are values of the step's series, projected onto the constraints
 MIN_PARTS, MAX_PARTS = 3, 6
 PADDING = 8  # a table is padded to a multiple of this number of operations
 
@@ -39,7 +39,7 @@ def _order(rtol: float, atol: float, least: float, per_digit: float) -> int:
 
 @dataclass(frozen=True)
 class Taylor:
-    """Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
+    """Taylor series of the motion, with an order that the tolerance sets, for smooth motion that is not stiff.
 
     It suits tight tolerances without generated code. The callbacks run once in Python on symbols; this takes
     milliseconds and compiles nothing. The coefficients of q, v, a and lam follow from the recorded operations, order by
@@ -54,8 +54,8 @@ class Taylor:
     Parameters
     ----------
     order : int, optional
-        Order of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 plus 1.15
-        for each digit of the smaller tolerance, or 19 with fixed steps.
+        Order of the method, 4 to 40: velocities are a series of this order, positions a series of the next order. None:
+        5 plus 1.15 for each digit of the smaller tolerance, or 19 with fixed steps.
 
     Raises
     ------
@@ -65,9 +65,9 @@ class Taylor:
     Notes
     -----
     Number of derivatives of each equation: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001),
-    364-394. The step size, at which each of the last two terms is within the tolerance: A. Jorba and M. Zou, A software
-    package for the numerical integration of ODEs by means of high-order Taylor methods, Experimental Mathematics 14
-    (2005), 99-117. In the statistics every order counts as an evaluation.
+    364-394. The step size, with which each of the last two terms is within the tolerance: A. Jorba and M. Zou, A
+    software package for the numerical integration of ODEs by means of high-order Taylor methods, Experimental
+    Mathematics 14 (2005), 99-117. In the statistics, every order counts as an evaluation.
 
     Examples
     --------
