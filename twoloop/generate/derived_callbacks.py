@@ -28,7 +28,7 @@ class DerivedPrograms:
     """Programs that replace missing callbacks, shared by the systems of a trace cache.
 
     programs : for each kind of callback, a program and the indices of its results in the callback's flattened array.
-    traced : the traces from which the programs were derived.
+    traced : the traces that the programs were derived from.
     """
 
     def __init__(self, programs: dict[str, tuple[OperationTable, list[int]]], traced: CallbackTraces):
@@ -46,7 +46,7 @@ class DerivedPrograms:
 
 
 class DerivedSystem(NamedTuple):
-    """Pair of a system with programs for missing callbacks, and the traces from which the programs were derived."""
+    """Pair: a system with programs for missing callbacks, and the traces that the programs were derived from."""
 
     system: ConstrainedSystem
     traced: CallbackTraces

@@ -250,7 +250,7 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 
 
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
-    """Return the factor by which to multiply the scale of each row of G that is added to M.
+    """Return, for each row of G that is added to M, the factor on its scale.
 
     The factor is 1 unless M is small in all columns of the row, and the rows `singular` have entries in all these
     columns; then it is a negative power of SCALE_STEP. Without this factor, a row on Euler parameters alone, such as

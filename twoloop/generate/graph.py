@@ -55,7 +55,7 @@ class Graph(SymbolicObject):
         self.input_sizes: list[int] = []
         self.operations: list[tuple[int, Affine, Affine | None] | None] = []
         self.is_late: list[bool] = []  # whether a quantity depends on inputs other than time and coordinates
-        self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs on which it depends
+        self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs that it depends on
         self.traced: dict[str, Any] = {}
         self._recorded_quantities: dict[tuple[int, int, int], int] = {}
         # keys: identifiers of factors; values: ranks in the order of first use, which no parameter value changes
@@ -482,7 +482,7 @@ class Derivative:
         return total
 
     def _differentiate_quantity(self, i: int) -> Affine:
-        """Return the derivative of quantity i; first, differentiate the quantities on which it depends."""
+        """Return the derivative of quantity i; first, differentiate the quantities that it depends on."""
         stack = [i]  # no recursion, because products may be nested more deeply than Python's limit
         while i not in self._derivatives:
             op = self.graph.operations[stack[-1]]

@@ -264,7 +264,7 @@ class LaneSteps:
         store_mask(emit, work, lanes.RUNNING, is_running & within_limit)
 
     def commit(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Copy NEW to STATE in the lanes in which the step was accepted."""
+        """Copy NEW to STATE in the lanes where the step was accepted."""
         memory = self.memory(emit, order, control, work)
         is_accepted = is_set(emit, work, lanes.ACCEPTED)
         for k in range(2 * self.n):
@@ -299,7 +299,7 @@ def broadcast_entry(emit: LaneEmitter, control: Value, index: int) -> Value:
 
 
 def is_set(emit: LaneEmitter, work: Value, field: int) -> Value:
-    """Return the mask of the lanes in which a field is not 0."""
+    """Return the mask of the lanes where a field is not 0."""
     return emit.builder.compare("fcmp one", emit.load(work, field), emit.constant(0.0))
 
 
@@ -309,7 +309,7 @@ def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
 
 
 def clear_active_unless(emit: LaneEmitter, work: Value, is_valid: Value) -> None:
-    """Clear ACTIVE in the lanes in which `is_valid` is false."""
+    """Clear ACTIVE in the lanes where `is_valid` is false."""
     store_mask(emit, work, lanes.ACTIVE, is_set(emit, work, lanes.ACTIVE) & is_valid)
 
 
@@ -613,7 +613,7 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.ACTIVE, has_finished | converged)
 
     def _project(self, emit: LaneEmitter, outputs: Program, field: int, memory: LaneMemory) -> tuple[Value, Value]:
-        """Correct NEW by a projection program, in the lanes in which `field` is 1.
+        """Correct NEW by a projection program, in the lanes where `field` is 1.
 
         Return a mask of the lanes whose correction is valid, and the largest change of a position in each lane.
         """
@@ -666,7 +666,7 @@ class LaneCode(LaneSteps):
         self.stage_generator.write(emit, (order, control, work), self.memory(emit, order, control, work))
 
     def check_redundant_rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Clear ACTIVE in the lanes in which NEW violates a redundant constraint."""
+        """Clear ACTIVE in the lanes where NEW violates a redundant constraint."""
         memory, outputs = self.memory(emit, order, control, work), self.equations.redundant_rows
         lowering, (no_values,) = lower_program(emit, outputs, self._new_state(emit, work, memory), self.numbers)
         clear_active_unless(emit, work, lowering.is_valid(outputs, no_values))
@@ -726,7 +726,7 @@ FILE_PREFIX = "lanes"  # first part of the names of cached files
 class GeneratedLanes(Generic[Code]):
     """Compiled code of a mechanism for SIMD lanes; its coefficients are computed from parameters.
 
-    tape : tape of the parameters with which `code` was traced.
+    tape : tape of the parameters in the traces of `code`.
     """
 
     def __init__(self, tape: ParameterTape, code: Code):

@@ -234,7 +234,7 @@ class LaneSeries:
 
     @property
     def structure(self) -> list[Any]:
-        """Return the data on which the code depends, for a digest."""
+        """Return the data that the code depends on, for a digest."""
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:

@@ -169,7 +169,7 @@ class Module:
         return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
 
     def add_number(self, number: float) -> int:
-        """Add a number to the array from which `Builder.load_constant` loads; return the index of the number."""
+        """Add a number to the array for `Builder.load_constant`; return the index of the number."""
         self._numbers.append(number)
         return len(self._numbers) - 1
 
@@ -222,7 +222,7 @@ class Builder:
         return Block(f"b{self._n_blocks - 1}")
 
     def position_at_end(self, block: Block) -> None:
-        """Append a block to the function, and make it the current block, to which instructions are appended."""
+        """Append a block to the function, and make it the current block: the next instructions go there."""
         self.block = block
         self._blocks.append(block)
 
@@ -306,7 +306,7 @@ class Builder:
         return self._append_value(base.type, f"getelementptr inbounds {base.type[:-1]}, {base}, {index}")
 
     def load(self, pointer: Value, align: int = 8, constant: bool = False) -> Value:
-        """Return the value to which a pointer points; `constant`: this value does not change during a call."""
+        """Return the value at the address `pointer`; `constant`: this value does not change during a call."""
         kind, metadata = pointer.type[:-1], ", !invariant.load !0" if constant else ""
         return self._append_value(kind, f"load {kind}, {pointer}, align {align}{metadata}")
 
@@ -315,7 +315,7 @@ class Builder:
         self._append_line(f"store {value}, {pointer}, align {align}")
 
     def insert(self, vector: Value, value: Value, index: int) -> Value:
-        """Return a copy of a vector in which the element with this index is replaced by `value`."""
+        """Return a copy of a vector with `value` in place of the element with this index."""
         return self._append_value(vector.type, f"insertelement {vector}, {value}, {WORD} {index}")
 
     def extract(self, vector: Value, index: int) -> Value:

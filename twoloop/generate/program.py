@@ -233,7 +233,7 @@ LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient a
 class Coefficient(float):
     """Coefficient that generated code reads from an array; two coefficients are equal only if they are one object.
 
-    `index`: index in the array. `varies`: whether the array is that of the coefficients that vary with parameters.
+    `index`: index in the array. `varies`: whether this array is for coefficients that vary with parameters.
     """
 
     __slots__ = ("index", "varies")
@@ -273,7 +273,7 @@ class Coefficients:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Return the values of the coefficients; if `separate_varying`, only of those that do not vary."""
+        """Return the values of the coefficients; if `separate_varying`, only of coefficients that do not vary."""
         return np.array(self._values, dtype=np.float64)
 
     @property

@@ -36,7 +36,7 @@ class Sums(NamedTuple):
     column: Integers  # quantity in the first term of each expression
     coefficient: Array  # coefficient of the first term of each expression
     constant: Array
-    row: Integers  # index of the expression to which each further term belongs
+    row: Integers  # for each further term, the index of its expression
     further_column: Integers  # quantity in each further term
     further_coefficient: Array
 

@@ -75,7 +75,7 @@ class CallbackTraces:
         return traced
 
     def replace_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
-        """Return a copy that is not trusted yet, in which `convert` has replaced each array of coefficients."""
+        """Return a copy, not trusted yet, with each array of coefficients replaced by `convert`."""
         traced = copy.copy(self)
         traced.program = self.program.replace_coefficients(convert)
         traced.is_trusted = False
@@ -185,7 +185,7 @@ class Sample:
             self._chunks = self._chunks[::2]
 
     def end_at(self, t: float, state: Array) -> None:
-        """Remove the states after t, the time at which a run ended, and add the state at t."""
+        """Remove the states after t, the end of the run, and add the state at t."""
         states = self.states()
         self._chunks = [states[states[:, 0] <= t]]
         self.add(states[:0, 0], states[:0], t, state)
@@ -281,12 +281,12 @@ class CheckedRegion:
         return bool((smallest - margin <= parameters).all() and (parameters <= largest + margin).all())
 
     def add_parameters(self, parameters: Array) -> None:
-        """Extend the ranges to the parameters of a run in which calls and traces agreed."""
+        """Extend the ranges to the parameters of a run whose calls and traces agreed."""
         smallest, largest = self._parameters or (parameters, parameters)
         self._parameters = np.minimum(smallest, parameters), np.maximum(largest, parameters)
 
     def add(self, states: Array) -> None:
-        """Extend the ranges of states, and `bounds`, to states at which calls and traces agreed."""
+        """Extend the ranges of states, and `bounds`, to states where calls and traces agreed."""
         if len(states) == 0:
             return
         checked = np.concatenate([states, self._ranges]) if self._ranges.size else states

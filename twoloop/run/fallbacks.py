@@ -263,7 +263,7 @@ def crossing_kit(kit: Kit) -> Kit:
 
 
 def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: int) -> tuple[Plan, Array, int]:
-    """Return plan, controls and code with which the loop continues after an attempt to cross a singular position.
+    """Return plan, controls and code for the next steps of the loop, after an attempt to cross a singular position.
 
     The next step is the next piece of the polynomial, an attempt with another size, or a step of the run's own method.
     """

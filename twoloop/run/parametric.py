@@ -66,7 +66,7 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region in which runs have compared callbacks and, if `with_derivatives`, their derivatives."""
+        """Return the region where runs have compared callbacks and, if `with_derivatives`, their derivatives."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
@@ -129,7 +129,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _replace_arrays(self, plan: Plan) -> Plan:
-        """Return a copy of a plan in which arrays that `_fill_arrays` fills replace arrays of expressions."""
+        """Return a copy of a plan with arrays for `_fill_arrays` in place of arrays of expressions."""
         array, values = self._expression_arrays.array, vars(plan)
         changes: dict[str, Any] = {name: array(values[name]) for name in NUMBER_FIELDS if values[name] is not None}
         changes |= {name: self._replace_arrays(values[name]) for name in PLAN_FIELDS if values[name] is not None}

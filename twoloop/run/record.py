@@ -177,7 +177,7 @@ class Recorder:
             self._store_states(self._t[:0], self._rows[:0, : 2 * self._n_q])
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
-        """Record times and states [q, v, a, lam] at which steps ended, and the kind of interval of each step.
+        """Record times and states [q, v, a, lam] at the ends of steps, and the kind of interval of each step.
 
         `kinds` is empty unless states between steps are requested.
         """
@@ -228,7 +228,7 @@ class Recorder:
 
     @property
     def interrupted_at(self) -> float | None:
-        """Time at which Ctrl-C interrupted the search for events, or None; the result ends at this time."""
+        """Time reached when Ctrl-C interrupted the search for events, or None; the result ends at this time."""
         ended_early = self.interrupted and self.search is not None and self.end_event is None
         return self.search.reached if ended_early and self.search is not None else None
 
@@ -368,8 +368,8 @@ class Statistics:
     n_inner : int or None
         Newton iterations of the inner loop.
     n_evaluations : int or None
-        Solutions of eq. (6) for accelerations and multipliers, and evaluations of the forces alone, with which the
-        derivatives of a banded system are computed.
+        Solutions of eq. (6) for accelerations and multipliers, and evaluations of the forces alone, for the derivatives
+        of a banded system.
     n_partitions : int or None
         Coordinate partitionings, the first included.
     n_factorizations : int or None
@@ -381,7 +381,7 @@ class Statistics:
         Process time of the integration, s. It includes the steps, storing their results, events, and the interpolation
         of q and v at output times. Compilation, checks of the input, the workspace, the first accelerations, and a and
         lam at interpolated times are not included. If a run was repeated, the time includes all attempts, while the
-        counts are those of the last attempt. For repeated calls of less than a millisecond, it is the elapsed time.
+        counts belong to the last attempt. For repeated calls of less than a millisecond, it is the elapsed time.
 
     Examples
     --------

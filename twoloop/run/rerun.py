@@ -32,7 +32,7 @@ N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked 
 
 
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
-    """Return the region of states in which callbacks were compared with the same traces, by any run of the system."""
+    """Return the region of states where any run of the system has compared callbacks with the same traces."""
     if run.region is not None:
         return run.region
     key = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
@@ -210,7 +210,7 @@ class IndependentRerun:
         tableau = radau_iia(7)
         stiff = RungeKutta(tableau, outer="newton", tested="all" if method == "all" else "positions")
         chosen = DOP853() if method == "explicit" else stiff
-        nodes = dop853.C if method == "explicit" else tableau.c  # fractions of a step at which equations are evaluated
+        nodes = dop853.C if method == "explicit" else tableau.c  # times of evaluations, as fractions of a step
         self.spacing = float(np.diff(np.unique(np.concatenate([[0.0], nodes, [1.0]]))).max())
         plan = chosen.plan(system.n_q, rtol, float(atol.min()), False)
         self.run = Run(system, plan, t, q, v, rtol, atol, None)

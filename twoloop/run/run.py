@@ -81,7 +81,7 @@ class Run:
         self.kit = make_kit(system, t0, q0, plan, self.fixed_order)
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # ranks are computed at every start, and may then require another workspace; usually those of the last start fit
+        # a start may require a workspace for other ranks; usually, the ranks at the last start are the right ones
         self.work = self._make_workspace(*(system.derived.get("ranks", ()) if self.fixed_order is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -118,14 +118,14 @@ class Run:
         self.sizes_to_try: list[float] = []  # step sizes, s, that are still to be tried
         self.larger_sizes: list[float] = []  # larger sizes, s, to try if too few nodes are beyond the position
         self.crossing_size = 0.0  # size of the last attempted step across a singular position, s
-        self.piece_ends: list[float] = []  # times, s, at which the next pieces of the polynomial across a position end
+        self.piece_ends: list[float] = []  # ends, s, of the next pieces of the polynomial across a position
         self.origins: list[Any] = []  # an `Origin` for each polynomial across the position that is still to be tried
         self.t1 = np.inf  # end of the run, s
-        self.starts_singular = False  # whether the start is a singular position from which the rank rises
+        self.starts_singular = False  # whether the start is a singular position, and the rank rises beside it
         self.branch_known = False  # whether the branch of the motion that leaves such a start is known
         self.jumps: list[float] = []  # times at which C_t or b, and therefore the velocities, jumped
         self.compared_until = [-np.inf]  # callbacks were compared with traces up to this time; copies share the list
-        self.region: CheckedRegion | None = None  # states at which callbacks were compared; integrators share it
+        self.region: CheckedRegion | None = None  # region where callbacks were compared; integrators share it
         self.varied_parameters: Array | None = None  # array of parameters, if several systems use the run in turn
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)

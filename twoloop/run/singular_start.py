@@ -26,7 +26,7 @@ CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
 # largest relative error of derivatives by finite differences; smaller derivatives count as 0
 MAX_DIFFERENCE_ERROR = 1e-8
-# the rank of C_q rises if a singular value that is zero has a derivative larger than this, relative to that of C_q
+# the rank of C_q rises if a zero singular value has a larger derivative than this, relative to the derivative of C_q
 MIN_RANK_DERIVATIVE = 1e-6
 # the derivative of a zero singular value is certain if it is at least this multiple of its uncertainty: the derivative
 # of the rows along velocities as large as the tolerances

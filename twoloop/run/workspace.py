@@ -85,7 +85,7 @@ def _derivative_entries(
 ) -> set[tuple[int, int]]:
     """Return the indices of nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and of their transposes.
 
-    The search goes column by column, and ends after the column in which the count exceeds `max_entries`.
+    The search goes column by column, and stops when the count of entries exceeds `max_entries`.
     """
 
     def reaction(q: Array) -> Array:

@@ -226,7 +226,7 @@ class CodeFiles:
 
 
 def _time_written(path: Path) -> float:
-    """Return the time at which a file was written, s, or 0 if another process has removed the file."""
+    """Return the time when a file was written, s, or 0 if another process has removed the file."""
     try:
         return path.stat().st_mtime
     except OSError:
@@ -303,7 +303,7 @@ def n_compiled() -> int:
 
 
 def cache_folder(package: types.ModuleType) -> Path | None:
-    """Return the folder in which the machine code of a package is cached, or None if no folder can be written."""
+    """Return the folder for cached machine code of a package, or None if no folder can be written."""
 
     def placeholder() -> None:
         pass

@@ -357,7 +357,7 @@ def entry_point(function: Dispatcher) -> Any:
     return compiled.entry_point
 
 
-# addresses of the machine code of compiled functions, each of which has one signature
+# addresses of the machine code of compiled functions; each function has one signature
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 

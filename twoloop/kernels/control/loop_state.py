@@ -75,7 +75,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     H_LIMIT,  # present upper limit of the step size, s; a failed step lowers it for LIMIT_MEMORY accepted steps
     LIMIT_AGE,  # number of accepted steps since the last failed step
     NEXT_OUTPUT,  # index of the next output time
-    T_START,  # start time of the run, s, at which the grid of steps of fixed size begins
+    T_START,  # start time of the run, s; the grid of steps of fixed size begins there
     N_FIXED,  # number of completed steps of this grid
     FAILURE_CODE,  # code of the last failed attempt, which explains short steps; DONE: no attempt failed recently
     H_FAILED,  # size of the last failed step, for messages, s

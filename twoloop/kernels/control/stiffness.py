@@ -74,7 +74,7 @@ QUIET_FACTOR = 10.0  # steps at the stability limit excite oscillations with vel
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # the explicit method is tried again if h rho is below this multiple of LIMIT
-# factor on errors of the implicit method during its trial: its order is lower than that of the explicit method, and it
+# factor on errors of the implicit method during its trial: its order is lower than the explicit method's order, and it
 # must not win by larger errors
 TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # every step updates the mean step size: weight of the previous mean
@@ -100,10 +100,10 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     PHASE,  # EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps in this phase
     MAY_ESTIMATE,  # 1: rho may be estimated, because the last attempted step was accepted
-    NEXT_ESTIMATE,  # number of evaluations since the start of the run at which rho is estimated again
+    NEXT_ESTIMATE,  # rho is estimated again after this number of evaluations since the start of the run
     ESTIMATES_TO_WAIT,  # number of estimates before the next trial may begin
     WAIT,  # value of ESTIMATES_TO_WAIT after the last trial
-    T_BEGIN,  # time from which the cost per second is measured, s
+    T_BEGIN,  # beginning of the measurement of the cost per second, s
     COST_BEGIN,  # cost of the run at the time T_BEGIN, in evaluations
     COST_PER_SECOND,  # cost of a second of motion, in evaluations, by the method used before the trial
     RATE,  # last estimate of rho, 1/s

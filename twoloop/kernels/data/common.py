@@ -97,11 +97,11 @@ class Work(NamedTuple):
     jacobian_values: Any  # entries of G
     is_independent: Any  # (n_c) 1 for independent rows, else 0
     factors: Any  # entries of the factors, at the indices that the program gives
-    pivot_sizes: Any  # (N) squared norms of the rows, to which pivots are compared, see linalg/sparse_ldl.py
+    pivot_sizes: Any  # (N) squared norms of the rows, for a comparison with pivots, see linalg/sparse_ldl.py
     unknowns: Any  # (N) right-hand side on entry to a solver, solution on return
-    solutions: Any  # (3 N) scratch, then (n_c) factors by which rows stiffen M, see linalg/sparse_ldl.py
+    solutions: Any  # (3 N) scratch, then (n_c) factors s of rows g that stiffen M, see linalg/sparse_ldl.py
 
-    sizes: Any = None  # value of `Sizes` (layout.py) for which the arrays are allocated
+    sizes: Any = None  # sizes of the arrays, see `Sizes` in layout.py
     address: Any = 0  # address of `table`
     table: Any = None  # addresses and shapes of the arrays above, for kernels
 

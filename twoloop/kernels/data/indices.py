@@ -57,7 +57,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     ORIENTATION,  # sign of det C_qd at the last accepted state with this partition; 0: not known yet
     ORIENTATION_NEW,  # sign of det C_qd at the end of the attempted step; 0: not known yet
     FAULT_KIND,  # index in Functions of the callback that returned a value that is not finite; -1: none known
-    FAULT_TIME,  # time at which a callback returned a value that is not finite, s
+    FAULT_TIME,  # time of the call of a callback that returned a value that is not finite, s
     GAMMA_REQUIRED,  # required relative accuracy of Gamma by differences, see evaluation/constraints.py
     GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to largest_difference_step
     GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_STEP_RATIO was chosen
@@ -65,8 +65,8 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     REUSE,  # the factors of C_qd are not renewed if the last correction of positions is at most this
     ROUNDED,  # rounding error of positions, which replaces REUSE for states that may be accepted
     GENERATION,  # number of partitions that have been chosen in the run
-    RANK,  # rank of C_q, stored if it differs from the rank for which the workspace is allocated
-    RANK_V,  # rank of C_q and A together, stored if it differs from the rank for which the workspace is allocated
+    RANK,  # rank of C_q, stored if the workspace is allocated for another rank
+    RANK_V,  # rank of C_q and A together, stored if the workspace is allocated for another rank
     CONTRADICTION,  # index of a row that is violated although it counted as redundant
     PIVOT,  # smallest pivot of the last full pivoting, for rows scaled to 1; small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check for singular positions
@@ -78,7 +78,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     EXPLICIT_STEP,  # 1: the last attempted step of a pair of methods was explicit
     DEFECT,  # largest defect of the attempted step, relative to the allowed defect; -1: not evaluated
     LARGEST_DEFECT,  # largest value of DEFECT in the accepted steps
-    UNCHECKED,  # number of accepted steps for which no defect was evaluated
+    UNCHECKED,  # number of accepted steps without an evaluation of the defect
     WIDEST_GAP,  # longest time between two evaluations within accepted steps, s
     LAST_JUMP,  # time of the last known jump of C_t or b, s
     NEXT_JUMP,  # time of the next known jump of C_t or b, s

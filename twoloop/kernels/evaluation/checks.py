@@ -65,7 +65,7 @@ def _fit_row_units(columns, rows, mask, logs):
 
 @kernel(types.void(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR))
 def column_units(matrix, typical, columns, mask, logs, rows, scratch):
-    """Store in `columns` (n_q) the units of the coordinates in which the entries of C_q (`matrix`) have similar sizes.
+    """Store in `columns` (n_q) units of the coordinates that make the entries of C_q (`matrix`) similar in size.
 
     The units minimize the sum over all entries of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2. The
     units have a common factor, so that their median ratio to `typical` (n_q) is 1. A coordinate without entries gets

@@ -38,7 +38,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
 
 RANK_TOLERANCE = 1e-11  # pivots up to this size count as zero, for rows scaled to 1
 PARTITION_CHANGED = -1  # code that replaces DONE if a new partition was adopted
-# largest number of rows of G for which min_pivot_ratio does an elimination; with more rows, this would take too long
+# min_pivot_ratio does an elimination up to this number of rows of G; with more rows, it would take too long
 MAX_ROWS_ELIMINATED = 200
 SENSITIVITY_GROWTH = 3.0  # a partition is poor once max|C_qd^-1 C_qi| has grown by more than this factor
 

@@ -30,12 +30,12 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     UNIT,  # unit of time of a series, s
     H,  # size of the step, s
     X,  # time from the beginning of the step to the state to be computed, s
-    ACTIVE,  # 1 in lanes in which the next task has to run; a task that fails in a lane sets 0 there
+    ACTIVE,  # 1 in lanes where the next task has to run; a task that fails in a lane sets 0 there
     DEFECT,  # defect at the end of the step, relative to the allowed defect
     PREDICTION_ERROR,  # difference of predicted and projected positions, over its limit, see step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
     LONGEST,  # largest allowed step size, s
-    REQUESTED,  # 1 in lanes that begin a run, or in which a state within the step is to be computed
+    REQUESTED,  # 1 in lanes that begin a run, or need a state within the step
     WORST_DEFECT,  # largest defect within the step, relative to the allowed defect
     N_REJECTED,  # number of successive rejected steps
     RUNNING,  # 1 in lanes with a run
@@ -51,7 +51,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     H_LIMIT,  # upper limit of step sizes after a failed step, s; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
     JUMP_END,  # end of the last step that was rejected with an error above SUDDEN_ERROR, s
-    SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
+    SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
     EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
     PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
     _MORE_PAST,
@@ -234,7 +234,7 @@ def _pivot_magnitude(work, entry, imaginary, k):
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
     """Exchange rows so that entry (c, c), the pivot, is the largest one from row c on in column c; store its inverse.
 
-    Clear ACTIVE in lanes in which the pivot is zero.
+    Clear ACTIVE in lanes where the pivot is zero.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)

@@ -104,7 +104,7 @@ def block_offset(memory, n, s, block):
 
 @merged
 def _weights_offset(memory, n, s):
-    """Return the offset of the weights (s, s) by which `predict_stages` multiplies the block PREVIOUS."""
+    """Return the offset of the weights (s, s): `predict_stages` multiplies the block PREVIOUS by them."""
     return memory + N_SINGLE_VECTORS + (N_VECTORS + N_BLOCKS * s) * n
 
 

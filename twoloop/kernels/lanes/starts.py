@@ -20,7 +20,7 @@ from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, offsets_in_work
 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
-ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, for which some eigenvalues of G G^T are zero
+ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, because some eigenvalues of G G^T are zero then
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # a combination of rows counts as redundant if its eigenvalue of G G^T is at most this
 # number of inverse iterations for each row of Z: few suffice, because redundant combinations have tiny eigenvalues
 N_REDUNDANT_ITERATIONS = 5
@@ -360,7 +360,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
 
 @compiled
 def _check_nearby_guesses(code, settings, control, pattern, moves, work):
-    """Clear RUNNING in lanes in which the projection of another guess is far from its linear prediction by C_q."""
+    """Clear RUNNING in lanes where the projection of another guess is far from its linear prediction by C_q."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     _, x, change, nearest, correction, weakest, displacement, _, factors, _, _ = _memory_offsets(

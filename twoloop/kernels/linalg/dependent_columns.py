@@ -49,7 +49,7 @@ def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
 def _is_pivot_block(R, block_columns, squared_norms, i, k, j, l, max_squares, min_sine_square):
     """Return whether rows i, k and columns j, l may be a pivot block; a single pivot has i == k and j == l.
 
-    `block_columns`: columns in which rows i and k have entries.
+    `block_columns`: columns of the entries of rows i and k.
     """
     total = 0.0
     if i == k:
@@ -72,7 +72,7 @@ def _is_pivot_block(R, block_columns, squared_norms, i, k, j, l, max_squares, mi
 
 @compiled
 def _merge_columns(columns, row_sizes, i, k, union):
-    """Store the columns in which rows i and k have entries in `union`, in ascending order; return their number."""
+    """Store the columns of the entries of rows i and k in `union`, in ascending order; return their number."""
     n, x, y = 0, 0, 0
     while x < row_sizes[i] or y < row_sizes[k]:
         j = columns[i, x] if x < row_sizes[i] else union.size

@@ -56,7 +56,7 @@ def values_size(r: int, may_be_dense: bool = True) -> int:
 
 
 def max_subtractions(r: int) -> int:
-    """Return the largest number of subtractions in a program of r rows, for which memory is allocated."""
+    """Return the largest number of subtractions in a program of r rows, for the size of its memory."""
     return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r)
 
 

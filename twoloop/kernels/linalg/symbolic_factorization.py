@@ -54,7 +54,7 @@ class _PartSupports:
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        # bodies with a single coordinate, to which a joint may fix a part as to the ground
+        # bodies with a single coordinate: a joint with such a body may fix a part, as a joint with the ground does
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
@@ -373,7 +373,7 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 
 @inlined
 def end_of_sections(program):
-    """Return the index at which the sections of a program end."""
+    """Return the index of the end of a program's sections."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     return begin + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 

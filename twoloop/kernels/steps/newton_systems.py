@@ -325,8 +325,8 @@ def _band_view(numbers, n, b):
 def _border_views(w, n, r, b):
     """Return views of three arrays stored after K: independent rows of C_q (r, n), D (n - r + 1, r), and indices (r).
 
-    C_q and D, a copy of w.D, belong to the state at which K was computed. The indices are those of the dependent
-    coordinates, to which the columns of D belong.
+    C_q and D, a copy of w.D, belong to the state where K was computed. The indices, one for each column of D, are
+    dependent coordinates.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)

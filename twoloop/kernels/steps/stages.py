@@ -140,7 +140,7 @@ N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
     HAS_JACOBIAN,  # 1: the stored derivatives may be used
     IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at the step's end
     PARTITION_NUMBER,  # number (GENERATION in data/indices.py) of the partition that the stored derivatives belong to
-    H_FACTORED,  # step size for which the systems are factored, s; 0: none
+    H_FACTORED,  # step size in the factored systems, s; 0: none are factored
     CONTRACTION,  # ratio of the last two corrections of Newton's method
     HAS_DAMPING,  # 1: forces depend on v; 0: J_v and D are zero
     IS_SYMMETRIC,  # kind of factors in diagonal_step.py. 1: L D L^T of a symmetric matrix; 0: L U

@@ -48,7 +48,7 @@ ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
 SUM_INDICES = N_SUMS  # index of an additional array of a list of sums: it tells where each sum is stored
-# positions, among the program's arrays, at which the two tables and the two lists of sums begin
+# first positions, among the program's arrays, of the two tables and of the two lists of sums
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
@@ -67,7 +67,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
     # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
     DISTANCE_FACTOR,
-    ATTEMPTS,  # number of attempts, which determines the times within a step at which the defect is evaluated
+    ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
     SUSPECTED,  # 1: the run has not passed the time SUSPECT yet
     SUSPECT,  # time within a rejected step at which the defect was too large, s
     N_MEMORY_SCALARS,
