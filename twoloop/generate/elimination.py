@@ -262,7 +262,7 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # add 0.25, because no digits are lost without a factor if parts of a mechanism differ by up to 1.25 steps
+    # add 0.25: if parts of a mechanism differ by up to 1.25 steps, no digits are lost even without a factor
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
@@ -316,7 +316,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # `_n_reduced`: operations of `reduced_program`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # operations of `reduced_program`: none yet
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._callback_terms("mass")
         rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]

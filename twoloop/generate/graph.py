@@ -182,7 +182,7 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return the square; `is_high_power`: whether it is a step to a power with an exponent above HIGH_EXPONENT."""
+        """Return the square; `is_high_power`: whether it is part of a power with an exponent above HIGH_EXPONENT."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 

@@ -448,7 +448,7 @@ class _Coordinate:
         return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Store q and v at a stage in NEW; return both. `weights`, `position_weights`: of accelerations in v, in q."""
+        """Store q and v at a stage in NEW; return both. `weights`: of accelerations in v; `position_weights`: in q."""
         emit, (q, v) = self.emit, self.old_state
         drift = float(weights.sum()) * v
         q = q + x * (drift + x * self.sum(position_weights))

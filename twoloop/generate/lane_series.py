@@ -62,7 +62,7 @@ class LaneEmitter(Emitter):
         return self.broadcast(super().load_constant(value))
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal, or a Coefficient loaded from memory, which is equal in all lanes unless it varies."""
+        """Return a literal, or a Coefficient loaded from memory: one number for all lanes, unless it varies."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
@@ -213,7 +213,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # for each product, factors of the sum that is carried over; `_shared_sums` calls `_factors`, which reads this
+        # for each product, factors of the sum that is carried over; `_factors`, called in `_shared_sums`, reads this
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))

@@ -468,7 +468,7 @@ class TraceCache:
         return traced.copy()
 
     def magnitudes(self, parameters: Array) -> Array:
-        """Return the magnitude of each class of parameters (entry class - 1) for `parameters` (n_p,) of a system."""
+        """Return the magnitudes of `parameters` (n_p,), one number for each class; class k has the index k - 1."""
         return np.abs(parameters[self._first_of_class])
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
@@ -476,7 +476,7 @@ class TraceCache:
         return self._tape.product_evaluator(self.magnitudes(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions, which must not change, for `parameters` (n_p,)."""
+        """Return a function that evaluates arrays of expressions for `parameters` (n_p,); arrays must not change."""
         product = self.product_evaluator(parameters)
 
         def evaluate(array: Any) -> Array:

@@ -77,7 +77,7 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.gamma_given == 0:  # twice: the first time sets the scale for Gamma's errors
+    if code == DONE and f.gamma_given == 0:  # again: the first evaluation has set the scale of Gamma's errors
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
@@ -325,7 +325,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the method's `factor` does not allow for `error_factor`
+        elif error_factor > 1.0 and error > 0.0:  # the method's `factor` lacks the effect of `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:

@@ -156,7 +156,7 @@ NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 # - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
 # - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
 # - `last_start`: the last start, see START; `start_rows`: indices of the independent rows at the last start
-# - `saved`, `saved_integers`: data of a run right after a start that was repeated, to repeat the start once more
+# - `saved`, `saved_integers`: data right after a start that was repeated; later runs from this start restore them
 RUN_ARRAYS = Reference(
     "RunArrays",
     {

@@ -387,7 +387,7 @@ def arrays_of(
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = DependentColumns(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.choose else (none, none, 0, np.zeros(0), none, none)
-    nonzero = np.flatnonzero(memory.view(np.int64))  # indices of numbers with nonzero bits, to be restored: -0.0, too
+    nonzero = np.flatnonzero(memory.view(np.int64))  # indices of numbers with nonzero bits (also -0.0), to restore
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     start_constants: tuple[float, ...]
     start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.checks_within else 1.0

@@ -231,7 +231,7 @@ class Interpolator:
         errors = np.zeros(len(groups))
         errors[is_divided] = self._estimate_residuals(divided, own_groups)
         errors[~is_divided] = self._estimate_residuals(table, undivided)
-        # an interval that its plan failed to divide is too long for a polynomial
+        # if the plan for its kind failed to divide an interval, the interval is too long for a polynomial
         errors[~is_divided & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
         is_accurate = errors <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
         self.accurate_intervals.update(table.t[groups[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
@@ -460,7 +460,7 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.fill_accelerations(times, rows, a_and_lam)
-        if interpolator.fixed_order is not None or interpolator.repair_plans:  # the workspace may not suit another run
+        if interpolator.fixed_order is not None or interpolator.repair_plans:  # its workspace may not suit another run
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 

@@ -349,7 +349,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, across: bool, n_steps: int) -> None:
-        """If `self.code` requires another plan, controls or kit for the next steps, change them; set code PAUSED."""
+        """Change plan, controls or kit for the next steps if `self.code` requires it; then set the code to PAUSED."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()

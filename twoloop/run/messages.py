@@ -139,7 +139,7 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
             direction += INITIAL_FACTOR * initial
         try:
             vibration, decay = _fastest_rates(kit, work, sample, directions)
-        except Exception:  # of a callback at a displaced state, which was not a state of the run
+        except Exception:  # raised by a callback at a displaced state, which is not a state of the run
             return ""
         h = sample.h
         samples.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))

@@ -90,7 +90,7 @@ class FileStore:
         return int(dtype.itemsize * np.prod(width, dtype=np.int64))
 
     def _write_header(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-        """Write the header; call this after writing rows, so that the file contains the old array until then."""
+        """Write the header of a file, after its rows: until this is done, the file still contains the old array."""
         header = repr({"descr": dtype.str, "fortran_order": False, "shape": shape})
         header = header.ljust(HEADER_SIZE - len(MAGIC) - 3) + "\n"
         file.flush()
@@ -520,7 +520,7 @@ class _Deferred:
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-for _field in fields(Record):  # not in the class: the decorator `dataclass` would treat a descriptor as a default
+for _field in fields(Record):  # here, because within the class, `dataclass` would take a descriptor for a default
     setattr(Record, _field.name, _Deferred(_field.name))
 
 

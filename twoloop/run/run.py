@@ -113,7 +113,7 @@ class Run:
         self.may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # size, s, of a step that ends as far beyond the position as it began before it
+        self.mirrored_size = 0.0  # size, s, of a step that begins and ends equally far from the position
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes, s, that are still to be tried
         self.larger_sizes: list[float] = []  # larger sizes, s, to try if too few nodes are beyond the position
@@ -140,7 +140,7 @@ class Run:
         return new_run
 
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Return a copy of this run at another start; None if its ranks differ, or its accelerations are unknown.
+        """Return a copy of this run at another start; None if ranks differ there, or accelerations cannot be computed.
 
         The run must not use the fixed-order form of linear algebra.
         """
@@ -280,7 +280,7 @@ class Run:
             clock[a.FAILURE_CODE] = indices.DONE
         state = self.state.copy()
         code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if code == indices.RANK_DIFFERS:  # the rank may be higher than at a start with dependent rows
+        if code == indices.RANK_DIFFERS:  # rows that were dependent at the start may be independent now
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # convert largest_pivot to the new form

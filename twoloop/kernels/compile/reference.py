@@ -179,7 +179,7 @@ class _FieldTypes(AttributeTemplate):
 
 
 def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    """Emit code for the address of an array element that is an attribute."""
+    """Emit code for the address of the array element that the attribute `field` stands for."""
     array, index = typ.elements[field]
     item_type = context.get_data_type(typ.arrays[array].dtype)
     data = _load_word(context, builder, pointer, typ.offsets[array], item_type.as_pointer())
@@ -188,7 +188,7 @@ def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: 
 
 @lower_setattr_generic(Reference)
 def _store_element(context: Any, builder: Any, sig: Any, args: Any, field: str) -> None:
-    """Emit code that stores a number in an array element that is an attribute."""
+    """Emit code that stores a number in the array element that the attribute `field` stands for."""
     pointer, value = args
     builder.store(value, _element_address(context, builder, sig.args[0], pointer, field))
 

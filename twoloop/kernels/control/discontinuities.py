@@ -36,7 +36,7 @@ N_PARTS = 12  # number of equal parts of an interval; C_t and b are sampled at t
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
-TIME_ROUNDING = 5e3  # error of the twelfth difference by rounding of t, over the slope of C_t or b times np.spacing(t)
+TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, over np.spacing(t) times their slope
 STEEPNESS = 4.0  # a part of a step is a ramp if the slope of C_t or b there exceeds this multiple of the mean slope
 MAX_RAMP_SHARE = 0.125  # a step has to end at a ramp if the ramp takes at most this fraction of the step
 MIN_SPACINGS = 8.0  # bisection ends at an interval of this length, in spacings of floating-point numbers
@@ -94,7 +94,7 @@ def _allowed_error(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest difference, in tolerances, of a velocity change and h times the mean acceleration."""
+    """Return the largest difference, in tolerances, between a velocity change and h times the mean acceleration."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]

@@ -50,7 +50,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
     TRIAL_STEPS,  # stop with SWITCH_METHOD if one of the first TRIAL_STEPS steps proposes a next size of at most GAP
     MAY_JUMP,  # 1: C_t or b may jump
-    JUMP_RATIO,  # near a jump of a force, the error may be this multiple of its estimate, see SUDDEN_ERROR (advance.py)
+    JUMP_RATIO,  # largest ratio of a step's error to its estimate if a force jumps in the step
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
     TIME_SPACING,  # largest spacing, s, of samples in time alone (these are taken ahead of short steps, too)
     # 1: samples follow the motion; 0: samples stay at the state, because a callback raised an error along the motion

@@ -184,7 +184,7 @@ def prediction_error(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Project (q1, v1), predicted by a step of size h from (q, v); return a code, and `prediction_error`."""
+    """Project (q1, v1), predicted by a step of size h from (q, v); return a code, and the `prediction_error`."""
     store_prediction(w, q1)
     code = restore_constraints(f, w, t, q1, v1, inner_tol)
     return code, prediction_error(w, tolerances, h, q, v, q1) if code == DONE else 0.0

@@ -58,7 +58,7 @@ class Work(NamedTuple):
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of G that have been nonzero, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; empty without the augmented form
     places: Any  # (n_c + n_a + 1) index of the first entry of each row of G, then the columns of all entries
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the present time step, and with the previous step
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: with twice the time step, and with the previous time step
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b at later times, see discontinuities.py
     Q: Any  # (n_q) force

@@ -110,7 +110,7 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW onto the constraints; if its change, in tolerances, is larger than ERROR, store this change in ERROR.
+    """Project NEW onto the constraints; if NEW changes by more than ERROR, in tolerances, store the change in ERROR.
 
     Velocities change by more than the tolerances if a drive jumps or bends between stages. `predicted_v` is scratch.
     """
@@ -216,7 +216,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
             work[at.X * LANES + k] = work[at.X * LANES + k] / work[at.UNIT * LANES + k]
         code.evaluate_series(order, control, work)
         return
-    for k in range(LANES):  # end runs with too many steps: in stiff motion, any tolerance may need many
+    for k in range(LANES):  # end runs with too many steps: stiff motion may need many at any tolerance
         if work[at.RUNNING * LANES + k] == 1.0 and n_steps[int(work[at.RUN * LANES + k])] >= MAX_STEPS:
             remove_run(work, status, k, at.MANY_STEPS)
     code.compute_series(order, control, work)

@@ -80,19 +80,19 @@ def row_exchanges_of(index):
 
 @merged
 def index_of_upper_begins(r):
-    """Return the position in `index` of the list that tells the first entry of each row of U."""
+    """Return the position in `index` of the list of the first entries of the rows of U."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return the position in `index` of the list that tells the end of each row of U."""
+    """Return the position in `index` of the list of the ends of the rows of U."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return the position in `index` of the list that tells the first entry of each row of L, and the end of L."""
+    """Return the position in `index` of the list of the first entries of the rows of L, followed by the end of L."""
     return N_HEAD + 5 * r
 
 

@@ -109,7 +109,7 @@ def norm_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept, coefficients, norms):
-    """Return whether the rows order[:n] are independent; if they are, express the other rows as their combinations.
+    """Return whether the rows order[:n] are independent; if so, express the other rows as combinations of these.
 
     n is the number of rows of `chosen_rows`, which receives the rows order[:n]. Row i of `coefficients` receives the
     coefficients, by least squares, of row order[n + i] in terms of these rows; `norms` receives the norms of `rows`.
@@ -132,7 +132,7 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
 def singular_values_exceed(rows, ratio, gram):
     """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one, s.
 
-    This is so if rows rows^T - (ratio s)^2 I is definite; the Frobenius norm, a bound of s, is used. `gram`: scratch.
+    This is so if rows rows^T - (ratio s)^2 I is definite; the Frobenius norm, a bound, replaces s. `gram`: scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):

@@ -149,7 +149,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_redundant_stiffness(program, jacobian, is_independent, stiffness, c, right):
-    """Add s g^T c_g to `right` in place for each redundant row g that stiffens M; c_g: entry of g in c = [r, c]."""
+    """Add s g^T c_g to `right` in place for each redundant row g that stiffens M; `c`: the vector [r, c] of c_g."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)
     product_rows, first, second, _ = stiffening_products_of(program)

@@ -36,7 +36,7 @@ def options_array(
 ) -> NDArray[np.float64]:
     """Return the array `options` of an implicit Runge-Kutta method with the tableau A, b, c.
 
-    `outer_test`: 1 if test (32) of the paper also covers dependent coordinates; `extrapolation`, `power`: see above.
+    `outer_test`: 1 if test (32) of the paper also covers dependent coordinates; else see EXTRAPOLATION and POWER.
     """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])

@@ -62,7 +62,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     NEXT_UNIT,  # unit of time of the series about the end of the last attempt, s
     ALLOWED_SIZE,  # step size that the current series allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
-    TRIED,  # 1: the last attempt has computed the series about its end, which becomes the current one if it is accepted
+    TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
     PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
     TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
     # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
