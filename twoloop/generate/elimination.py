@@ -316,7 +316,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # operations of `reduced_program`: none yet
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: number recorded by `reduced_program`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._callback_terms("mass")
         rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]
@@ -377,7 +377,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return the solution a, lam (independent rows) of M a + G^T lam = r, G a = c, and conditions: `solve_refined`.
+        """Solve M a + G^T lam = r, G a = c for a and lam (independent rows); see `solve_refined` for the conditions.
 
         `c`: one entry for each row of G.
         """

@@ -468,7 +468,7 @@ class TraceCache:
         return traced.copy()
 
     def magnitudes(self, parameters: Array) -> Array:
-        """Return the magnitudes of `parameters` (n_p,), one number for each class; class k has the index k - 1."""
+        """Return the magnitude that all `parameters` of a class share, by class; class k has the index k - 1."""
         return np.abs(parameters[self._first_of_class])
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:

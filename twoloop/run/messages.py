@@ -256,7 +256,7 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
-        at_singular_start = t == run.t0 and run.starts_singular  # positions and velocities at the start are given
+        at_singular_start = t == run.t0 and run.starts_singular  # velocities there are given, not computed
         if t >= end or at_singular_start or certainly_exceed(run.near_threshold, system.rows(t, q), run.rank):
             continue
         error_ratio = _velocity_error_ratio(run, t, q, v)

@@ -109,7 +109,7 @@ class ParametricRun:
         self.system.functions, self.system.derived = self._functions, self._initial_cache.copy()
         self.system.within_bounds.update(self.shared.trace_cache.within_bounds)
         self.system.checked, self._mass_agrees = False, not system.constant_mass
-        self.system.bandwidth = None  # the banded form is not used by these runs
+        self.system.bandwidth = None  # parametric runs do not use banded storage
         for traced in self.run.traced:
             traced.is_trusted = False
 

@@ -131,7 +131,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return (arguments, value) of a compiled force at the start; for Python functions, clear their samples instead."""
+    """Return (arguments, value) of a compiled force at the start; for Python functions, discard their samples."""
     if functions := python_functions(system):
         functions.restart()
         return None

@@ -160,7 +160,7 @@ class SampledRun:
         if self._step_failed:
             self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
-        self._step_failed = True  # set to False when the end is reached: a callback may raise an exception before that
+        self._step_failed = True  # until the step is complete: a callback may raise an exception before
         with signals_of(self.system):
             self._step_to(end)
         self.cpu_time += time.process_time() - began

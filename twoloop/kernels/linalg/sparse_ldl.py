@@ -75,7 +75,7 @@ def load_matrix(program, mass, jacobian, values, stiffness, scratch):
 def factor(program, is_independent, values, sizes, min_sine_square):
     """Replace the matrix in `values` by its factors, with 1/pivot on the diagonal; return the smallest squared sine.
 
-    The squared sine of a row is minus its pivot over its squared norm, which is stored in `sizes`. `is_independent` is
+    The squared sine of a row is -pivot / (squared norm of the row), with norms from `sizes`. `is_independent` is
     0 for redundant rows, and becomes 0 for rows with a squared sine up to `min_sine_square`; these rows do not affect
     the result. Return NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
     """
@@ -149,7 +149,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_redundant_stiffness(program, jacobian, is_independent, stiffness, c, right):
-    """Add s g^T c_g to `right` in place for each redundant row g that stiffens M; `c`: the vector [r, c] of c_g."""
+    """For each redundant row g that stiffens M, add s g^T c_g to `right` in place; `c`: vector [r, c], contains c_g."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)
     product_rows, first, second, _ = stiffening_products_of(program)

@@ -492,7 +492,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[at.DIAGONAL_OFFSET])
         _, A_stage, a_end = stage_views(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # evaluating F there would add Newton's residual times the stiffness
+        copy(A_stage[s - 1], a_end)  # F at the new state would differ by the stiffness times the rest of Newton's error
         memory[at.IS_FRESH] = 0.0
 
 
