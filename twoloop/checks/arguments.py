@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 
 FLOAT, ARRAY = np.dtype(np.float64), np.ndarray
 NUMBERS = (float, int)  # bool is excluded
-FAR = 1e300  # magnitude of times, s, below which they are certainly finite
-SURELY_APART = 1e-14  # duration of a span, relative to its ends, above which it is certainly long enough
+FAR = 1e300  # times of smaller magnitude, s, are certainly finite
+SURELY_APART = 1e-14  # a span is certainly long enough if its duration, relative to its ends, exceeds this number
 NEAR = 8.0  # difference, in spacings of floating-point numbers, below which two times cannot be distinguished
 # contents of arrays, for messages, by NumPy's kind
 HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}
@@ -25,7 +25,7 @@ SHOWN = 120  # largest number of characters of a given value in a message
 
 
 def shown(value: Any) -> str:
-    """Return the text of a value for a message: its repr, cut if it is long."""
+    """Return the text that represents a value in messages: its repr, cut if it is long."""
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 10**30:
         return f"an integer of {value.bit_length()} bits"  # more digits than Python writes
     try:
@@ -36,7 +36,7 @@ def shown(value: Any) -> str:
 
 
 def shaped(array: NDArray[Any]) -> str:
-    """Return the text, for a message, of an array that has an unexpected shape."""
+    """Return the text that represents an array of unexpected shape in messages."""
     if array.ndim == 0:
         return f"the number {shown(array.tolist())}"
     return f"shape {array.shape}, {shown(array.tolist())}"

@@ -29,7 +29,7 @@ OWN_MODULES = {
     *("twoloop.checks.callbacks", "twoloop.generate.graph", "twoloop.generate.trace"),
     *("twoloop.generate.parameter_expressions", "twoloop.bodies.system"),
 }
-# number of numbers appended to `parameters` after an index error: without an error then, `parameters` was too short
+# after an index error, this many numbers are appended to `parameters`: if the error vanishes, the array was too short
 N_APPENDED = 4096
 
 
@@ -115,7 +115,7 @@ def _compile_with_bounds_checks(function: types.FunctionType, _: Any) -> Any:
 
 
 def source_location(error: BaseException) -> str:
-    """Return the line and the file of a callback in which an error arose, as text; "" if Python does not know it."""
+    """Return, as text, the line and the file of the callback that caused an error; "" if Python does not know them."""
     trace, frames = error.__traceback__, []
     while trace is not None:
         module = trace.tb_frame.f_globals.get("__name__") or ""

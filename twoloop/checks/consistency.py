@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
-# relative difference up to which the ratios of two corrections to their limits are equal: the message then names the
-# first of the coordinates
+CONSISTENT = 1e-8  # largest correction that an initial state may need, relative to the size of the mechanism
+# if the ratios (correction / limit) of two coordinates differ relatively by at most this number, they count as equal,
+# and the message names the first coordinate
 TIED = 1e-6
 NEIGHBOURS = 4  # number of neighbouring positions at which constraints are evaluated to measure their rounding
 # largest rounding error of a constraint, relative to the largest coordinate times the largest entry of the row
 MOST_NOISE = 1e-11
-# singular value of M in units of the inertia, relative to the largest one, below which it counts as zero
+# a singular value of M in units of the inertia counts as zero if it is below this fraction of the largest one
 NO_INERTIA = 1e-12
 ROUNDING = 64.0  # allowed rounding error of the state, in spacings of floating-point numbers
 
 
 def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
-    """Return whether values are no larger than the rounding of their terms; then no scales need to be computed.
+    """Return whether `values` are no larger than the rounding of their terms; then no scales need to be computed.
 
-    Scales need full matrices, which rows given by entries avoid. Each of their entries counts as the largest entry of
-    its row, which includes rounding of the entries.
+    Scales need full matrices, which this test avoids for sparse rows. In it, each entry of `rows` counts as the largest
+    entry of its row, which allows for rounding of the entries.
     """
     if isinstance(rows, SparseRows):
         terms = rows.largest() * (rows.pattern() @ np.abs(state)) + np.abs(rate)
@@ -110,7 +110,7 @@ class Violation:
 
         def change(
             neighbour: Array,
-        ) -> Array:  # shows whether C is a difference of large terms
+        ) -> Array:  # its rounding shows whether C is a difference of large terms
             return system.constraint(t, neighbour) - values - jacobian @ (neighbour - q)
 
         noise = _noise(q, change, jacobian, float(size.max(initial=0.0)))
@@ -185,7 +185,7 @@ class Violation:
 
 
 def is_consistent(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Return whether a state, at which all callbacks are finite, is consistent; for the limits see `Violation`."""
+    """Return whether a state with finite values of all callbacks is consistent; for the limits see `Violation`."""
     rows, C, rate = system.rows(t, q), system.constraint(t, q), system.rates(t, q)
     jacobian, scales = rows[: system.n_c], scales_of(system, t, q, rows)
     if not is_at_rounding(C, jacobian, q):
@@ -270,7 +270,7 @@ def check_start(
 
 
 class StartEvaluation:
-    """Evaluation of compiled callbacks at one start after another, with its arrays and the results at the last start.
+    """Evaluation of compiled callbacks at one start after another; its arrays hold the results at the last start.
 
     `pattern` is 1 where the rows C_q and A have entries at the start or nearby.
     """
@@ -316,6 +316,6 @@ def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) 
     place = (t, q.tobytes())
     system.remember_at("pattern", place, evaluation.pattern)
     system.remember_at("mass and rows", place, (evaluation.mass, evaluation.rows))
-    if bits & (flags.DEFINITE | flags.INDEFINITE):  # neither if M is constant, or if rounding would decide
+    if bits & (flags.DEFINITE | flags.INDEFINITE):  # neither is set if M is constant, or if rounding would decide
         system.remember_at("definite mass", mass_key(system, t, q), bool(bits & flags.DEFINITE))
     return bool(bits & flags.CONSISTENT)

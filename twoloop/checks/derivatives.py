@@ -92,8 +92,8 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
 
     A formula may be right at the start only. One direction in which all coordinates and the time change covers all
     entries, with nine calls of `constraint`, sixteen of `jacobian`, ten of `constraint_rate` and one of `gamma` for any
-    n_q. After a difference, the entries are compared one by one, as at the start. Tangents are not checked: they decide
-    whether Newton's method converges, not to which result.
+    n_q. If these differ, the entries are compared one by one, as at the start. Tangents are not checked: they affect
+    whether Newton's method converges, but not its result.
     """
     jacobian, rate = system.sparse_rows(t, q), system.rates(t, q)
     if jacobian.size == 0 or not (is_finite(jacobian) and np.isfinite(rate).all()):
@@ -218,7 +218,7 @@ def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[
     """Describe the wrong entry of C_q or C_t, or return None."""
     jacobian, rate = system.sparse_rows(t, q)[: system.n_c], system.constraint_rate(t, q)
     if not (is_finite(jacobian) and np.isfinite(rate).all()):
-        return None  # outside the domain of the callbacks; at a state of the run partition.py reports it
+        return None  # outside the domain of the callbacks; at a state of the run, partition.py reports this
     if isinstance(jacobian, SparseRows):
         wrong = _wrong_group(system, t, q, jacobian)
     else:
@@ -255,7 +255,7 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
 
 
 def _varies(function: Callable[[Array], Array], x: Array) -> bool:
-    """Return whether a function changes along one direction; this costs less than differences of all columns."""
+    """Return whether a function changes along one direction, which costs less than differences of all columns."""
     values = [defined(lambda part=part: function(part * x)) for part in (1.0, 1.001, 2.0, 0.0, 1e3)]  # type: ignore[misc]
     known = [value for value in values if value is not None]
     return any(bool((value != known[0]).any()) for value in known)
@@ -292,9 +292,9 @@ def _wrong_column(
 
 
 def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: SparseRows) -> str | None:
-    """Compare C_q given by entries, in groups of columns without common rows, which are displaced together.
+    """Compare C_q given by entries with differences; columns without common rows are displaced together, as a group.
 
-    If a group has a difference, its columns are compared one by one, to name the entry. This also finds entries that
+    If a group is wrong, its columns are compared one by one, to name the entry. This also finds entries that
     `jacobian_entries` does not name: they add to another column, or to a row without entries in the group.
     """
     noise = EPS * (abs(jacobian) @ np.abs(q))

@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 # largest speed of a drive, in sizes of the mechanism per second; if it seems faster, C_q is nearly zero
 FASTEST = 1e9
 EPS = float(np.finfo(np.float64).eps)
-DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # displacements in units of the coordinates, for the curvature of the constraints
+DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # in units of the coordinates, for the curvature of the constraints
 ROUNDS = 3  # number of iterations that find units: the first units may be off by 1e5
 MOST_PLACES = 16  # largest number of positions whose sizes are kept
 NONE = np.zeros(0)
-# distance in units over which a row changes by much more than its norm if it is short only at this position
+# a row whose norm is small only at this position changes by much more than its norm over this distance, in units
 TURNS = 0.1
 
 
@@ -55,7 +55,7 @@ class Scales:
         return jacobian * self.columns / self.rows[:, None]
 
     def by_coordinate(self, per_row: Array, jacobian: Array) -> Array:
-        """Return for each coordinate, in its unit, the smallest value of its constraints, or of all if it has none."""
+        """Return the smallest value `per_row` of each coordinate's constraints (all, if it has none), in its unit."""
         values = np.where(jacobian != 0.0, per_row[:, None], np.inf).min(axis=0, initial=np.inf)
         return self.columns * np.where(np.isfinite(values), values, per_row.min(initial=np.inf))
 
@@ -249,15 +249,15 @@ SLOPES: dict[int, Array] = {  # slopes of the polynomials at the point, by the s
 FIRST = 2.0**-5  # first half-width, relative to the scale
 RATIO = 16.0  # ratio of successive half-widths
 N_SMALLER, N_LARGER = 11, 8  # numbers of smaller and larger half-widths that are tried
-# for intervals that must confirm that an entry is wrong: ratio of half-widths, and numbers of wider and narrower ones
+# intervals that must confirm that an entry is wrong: ratio of successive half-widths, numbers wider and narrower
 CONFIRM_RATIO, N_WIDER, N_NARROWER = 4.0, 8, 24
 BESIDE = (0.55, 1.8, 3.1)  # half-widths that confirm an estimate first, relative to its own
 RIPPLES = 3  # number of narrower intervals after which a smooth function shows only rounding
 LEAST_SPACINGS = 256.0  # smallest half-width, in spacings of floating-point numbers at the point
-SETTLED = 2e-7  # no other half-width is tried if difference and estimated error are below this fraction of the entry
+SETTLED = 2e-7  # no further half-width is tried if difference and estimated error are below this fraction of the entry
 AGREEMENT = 3e-7  # an entry is not wrong if the difference is below this fraction of it
 DECAYED = 0.01  # the points resolve a function if its last coefficients are at most this fraction of the first
-# a function has a ripple if its last two coefficients exceed this multiple of those before, unless all are rounding
+# a function has a ripple if its last two coefficients exceed this multiple of the previous ones and rounding errors
 RIPPLE = 0.2
 CONSTANT = 100.0  # a function counts as constant if it varies by less than this number of rounding errors
 SAFETY = 5.0  # ratio of the allowed difference to the estimated error of the difference
@@ -277,7 +277,7 @@ class Estimate:
     side: int  # side of the interval, see `differentiate`
 
     def disagrees(self, given: Array, rounding: Array) -> Array:
-        """Return |given - slope| over its limit, (m,); where it exceeds 1 the given value is wrong."""
+        """Return the ratio of |given - slope| to its limit, (m,); given values with a ratio above 1 are wrong."""
         allowed = SAFETY * self.error + AGREEMENT * np.abs(given) + SAFETY * rounding
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.abs(given - self.slope) / allowed
@@ -327,7 +327,7 @@ def _window(function: Function, place: float, width: float, side: int, noise: Ar
 
 
 def _widths(scale: float, spacing: float) -> Iterator[float]:
-    """Yield the half-widths to try: first a share of the scale, then smaller and larger ones alternately."""
+    """Yield the half-widths to try: first a fraction of the scale, then smaller and larger ones alternately."""
     least = LEAST_SPACINGS * spacing
     first = max(FIRST * scale, least)
     yield first
@@ -395,7 +395,7 @@ def differentiate(
             zero = (np.abs(given) <= TINY * largest) & (difference <= 4.0 * best.error)
             if (confirmed | (zero & (best.error <= SETTLED * largest)) | still).all():
                 return best
-        if tried:  # the function is defined on this side: others would hide a kink at the place
+        if tried:  # the function is defined on this side; intervals on another side would hide a kink at the place
             return best
     return Estimate(np.zeros(m), np.full(m, np.inf), np.full(m, np.inf), 0)
 
@@ -403,7 +403,7 @@ def differentiate(
 def confirms(
     function: Function, place: float, entry: int, best: Estimate, given: float, noise: Array, spacing: float = 0.0
 ) -> bool:
-    """Return whether other intervals, wider and narrower, also show that an entry differs from the given one.
+    """Return whether other intervals, wider and narrower, also show that the value `given` for an entry is wrong.
 
     One disagreement may be an accident, and a small fast part of a function (a fine ripple on a long slope) appears on
     narrow intervals only. If an interval gives another derivative, the entry counts as correct.

@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-RANK_TOLERANCE = 1e-11  # pivot, relative to the largest diagonal entry of R, below which it counts as zero
+RANK_TOLERANCE = 1e-11  # a pivot counts as zero below this fraction of the largest diagonal entry of R
 SHOWN = 5  # largest number of dependent rows whose equations are written out
 # largest number of other rows that a message names with coefficients, and largest number that it names at all
 MOST_TERMS, MOST_NAMED = 3, 8
-WEAK = 1e-9  # singular value, relative to the largest, above which a direction certainly is in the pseudo-inverse
-NO_DIRECTION = 1e-12  # remainder of a row, relative to the row, without its dependent components, that counts as zero
+WEAK = 1e-9  # directions with a larger singular value, relative to the largest, are certainly in the pseudo-inverse
+NO_DIRECTION = 1e-12  # a row minus its dependent components counts as zero below this fraction of the row
 
 
 def certainly_exceed(ratio: float, rows: Array, rank: int) -> bool:
@@ -96,7 +96,7 @@ def describe_equations(redundant: list[int], others: list[int], shares: Array, l
 
 
 NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # displacements, relative to the coordinates, at which the pattern of C_q is sampled
-SINGULAR_MASS = 1e-12  # ratio of the smallest eigenvalue to the largest entry below which M may have no inverse
+SINGULAR_MASS = 1e-12  # M may have no inverse if its smallest eigenvalue is below this fraction of its largest entry
 
 
 def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
@@ -180,10 +180,10 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
 
 
 NEAR = 1e-3  # displacement from the start, relative to the coordinates, at which no symmetry hides terms
-# allowed difference of C between two callbacks, in rounding errors of its terms, in addition to SAME
+# allowed difference of the values of C from two callbacks, in rounding errors of its terms, in addition to SAME
 ROUNDED = 100.0
 MAX_ENTRIES = 1_000_000  # largest number of entries of Jacobians that are evaluated together
-ROUNDING = 1e-12  # rounding error of a difference, relative to the largest entry over the displacement
+ROUNDING = 1e-12  # rounding error of a difference quotient, relative to (largest entry) / displacement
 
 
 def run_inconsistency(
@@ -243,7 +243,7 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
 
 
 def _compared(system: ConstrainedSystem, kit: Kit, t: float, q: Array, v: Array) -> tuple[bool, Array, Array]:
-    """Return whether kinematics agrees with the separate callbacks, and C_t and C_q of the latter."""
+    """Return whether `kinematics` agrees with the separate callbacks, and C_t and C_q from the separate callbacks."""
     from twoloop.kernels.evaluation.checks import kinematics_agree
 
     n, n_c = system.n_q, system.n_c
@@ -264,7 +264,7 @@ def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: A
 
 
 def _mass_at(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """Return M, or the values of its entries if the system gives these."""
+    """Return M, or the values of its entries if the system has `mass_values`."""
     kind = "mass_values" if "mass" in system.entries else "mass"
     (values,) = system.arrays_of(kind)
     getattr(system.functions, kind)(t, np.ascontiguousarray(q), system.functions.p, values)

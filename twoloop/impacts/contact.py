@@ -24,7 +24,7 @@ from twoloop.run.singular_start import Branch, branch_at
 
 
 class Gap(NamedTuple):
-    """Gaps of k stops, their rates, their second derivatives without the terms in v', and gradients (k, n_q)."""
+    """Gaps g of k stops, their rates u, second derivatives without the terms in v' (bias), and gradients W (k, n_q)."""
 
     g: Array
     u: Array
@@ -118,10 +118,10 @@ class ContactSystem:
     closed : list of int
         Indices of the closed stops.
     sticking : dict
-        Displacements along the surface that remain constant, by indices of slides: these are constraints as well.
+        Constant displacements of sticking stops along the surface, by index of the slide; they are constraints, too.
     slipping : list of (int, int, float)
-        For each stop that slides: its index in `closed`, the index of its slide, and its coefficient of friction, with
-        the sign of the sliding.
+        For each stop that slides: its index in `closed`, the index of its slide, and its coefficient of friction times
+        the direction of sliding (1 or -1).
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class ContactSystem:
         self._derived = derive_callbacks(system, accept_traces)[0] if slipping else system
 
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
-        """Return a field of the `Gap` of closed stops, followed by the same field for constant displacements."""
+        """Return one field of the `Gap` of the closed stops, followed by this field for the constant displacements."""
         rows = getattr(self._gaps.evaluate(t, q, v), part)[self._closed]
         if not self._sticking:
             return rows
@@ -167,12 +167,12 @@ class ContactSystem:
         return np.append(self._system.constraint_rate(t, q), self._rows("u", t, q, self._zero_velocity))
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
-        """Evaluate the right-hand side of C_q a = gamma, followed by that of the gaps."""
+        """Evaluate the right-hand side of C_q a = gamma, followed by the right-hand sides of the gaps."""
         right_sides = self._call("gamma", t, q, v) if self._system.n_c else np.zeros(0)
         return np.append(right_sides, -self._rows("bias", t, q, v))
 
     def force(self, t: float, q: Array, v: Array) -> Array:
-        """Evaluate Q, and the friction of the stops that slide, which follows from their forces."""
+        """Evaluate Q plus the friction of the sliding stops, which is proportional to the forces of these stops."""
         Q = self._call("force", t, q, v)
         if not self._slipping:
             return Q
@@ -181,7 +181,7 @@ class ContactSystem:
         right_sides = [system.gamma(t, q, v)] if system.n_c else []
         right_sides += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
         n, first_stop = system.n_q, system.n_q + system.n_c + system.n_a
-        # the friction of sliding stops is proportional to their unknown forces: it changes the matrix
+        # the friction of sliding stops is proportional to the unknown forces of the stops, so it changes the matrix
         K = np.block([[self._call("mass", t, q), rows.T], [rows, np.zeros((len(rows),) * 2)]])
         for place, k, coefficient in self._slipping:
             K[:n, first_stop + place] -= coefficient * slides[k]

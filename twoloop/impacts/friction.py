@@ -18,16 +18,16 @@ from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, scaled_equations
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
-Signs = list[int | None]  # for each joint its sliding direction, STICKS or IDLE
-STICKS, IDLE = 0, None  # states of a joint at rest: held by its own friction; held by stops and other joints
-MIN_COMPLIANCE = 1e-9  # smallest compliance of a joint that can slide while others are held, relative to a free joint
+Signs = list[int | None]  # for each joint: its sliding direction (1 or -1), STICKS or IDLE
+STICKS, IDLE = 0, None  # states of a joint at rest: STICKS, held by its own friction; IDLE, held by other contacts
+MIN_COMPLIANCE = 1e-9  # smallest ratio of compliances, other joints held / free, of a joint that can slide by itself
 REST_RATE = 1e-10  # largest rate that counts as zero, relative to the largest velocities of the last arc
-COUPLING_TOLERANCE = 1e-6  # tolerance of coefficients, 0, 1 or -1, by which one displacement follows from others
+COUPLING_TOLERANCE = 1e-6  # largest error with which a coefficient between two displacements counts as 0, 1 or -1
 EVEN_WEIGHT = 1e-6  # relative weight of the regularisation that distributes a shared load evenly
 SOLVER_SCALE = 1e3  # factor on the equations, so that their gradients exceed the tolerance of the solver
 MAX_SOLVER_ITERATIONS = 1000
 MAX_LOAD_ITERATIONS = 200  # largest number of fixed-point iterations for the loads that bound the friction
-LOAD_TOLERANCE = 1e-10  # change of the loads that ends these iterations, relative to the largest load
+LOAD_TOLERANCE = 1e-10  # change of the loads that ends the fixed-point iteration, relative to the largest load
 MAX_OUTSIDE = 1e-9  # largest component of b outside the range of D that counts as rounding, relative to max|b|
 CLOSING_TOLERANCE = 1e-6  # largest acceleration (or rate) with which a stop may still close, relative to max|c|
 SLIDING_TOLERANCE = 1e-9  # largest acceleration that counts as rounding, relative to the sum of its terms
@@ -38,7 +38,7 @@ class Undetermined(ValueError):
 
 
 class Tangents(NamedTuple):
-    """Tangents of stops with friction: the rows of their normals, coefficients, directions of sliding (0: at rest)."""
+    """Stops with friction: the index of the row of each normal, the coefficient, the sliding direction (0: at rest)."""
 
     normal: NDArray[np.int64]
     coefficient: Array
@@ -60,7 +60,7 @@ def solve_complementarity(D: Array, b: Array) -> Array:
     if not len(b):
         return np.zeros(0)
     x = nnls(*_least_squares_form(D, b))[0]
-    # nnls finds the active set; the forces are then computed from D, without the rounding of its square root
+    # nnls finds the active set; the forces are then computed from D itself, because B, its root, has rounding errors
     is_active = x > 0.0
     x[is_active] = np.linalg.lstsq(D[np.ix_(is_active, is_active)], -b[is_active], rcond=NEGLIGIBLE_RATIO)[0]
     return np.maximum(x, 0.0)
@@ -69,8 +69,8 @@ def solve_complementarity(D: Array, b: Array) -> Array:
 def solve_bounded(D: Array, c: Array, n: int, limit: Array) -> Array:
     """Return forces that minimise x^T D x / 2 + c^T x subject to bounds: D x + c vanishes where no bound is active.
 
-    The first n forces, at stops, are non-negative; those of friction are bounded by `limit`. The sum of x^2 / limit is
-    added with a small weight, so that a load that could be shared in any proportion is shared evenly.
+    The first n forces, at stops, are non-negative; the others, of friction, are bounded by `limit`. The sum of
+    x^2 / limit is added with a small weight: a load that could be shared in any proportion is then shared evenly.
     """
     tiny = np.finfo(np.float64).tiny
     B, y = _least_squares_form(D, c)
@@ -97,11 +97,11 @@ def holding_forces(D: Array, c: Array, n: int, limit: Array) -> Array:
 
 
 def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tuple[Array, NDArray[np.int64]]:
-    """Return forces (at stops, in joints at rest, of friction at stops), and the directions in which stops slide.
+    """Return forces x (of stops, of joints at rest, of friction at stops), and the directions in which stops slide.
 
     The forces of stops are non-negative and complementary to the accelerations (or velocities) D x + c. Friction
-    opposes sliding with its coefficient times the force of the stop; at rest it is smaller. A fixed-point
-    iteration finds these bounds from the forces. Once the state of each contact is known, the equations are linear.
+    opposes sliding with its coefficient times the force of the stop; at rest, this product is a bound. A fixed-point
+    iteration finds the bounds. Once it is known which contacts slide, stick or open, the equations are linear.
     """
     n_tangents = len(tangents.normal)
     n = len(c) - len(limit) - n_tangents
@@ -131,7 +131,7 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
 
 
 def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) -> Array:
-    """Solve the linear equations of contacts whose states are known; forces of joints remain unchanged."""
+    """Solve the linear equations for the forces at stops whose states are known; forces of joints remain unchanged."""
     tangent_rows = np.arange(len(c) - len(tangents.normal), len(c))
     is_pushing = np.append(x[:n] > 0.0, np.zeros(len(c) - n, dtype=bool))
     loads = np.zeros((len(c), len(c)))  # x = loads @ y; y: forces of stops, and of friction at rest
@@ -153,8 +153,8 @@ def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) ->
 def _least_squares_form(D: Array, b: Array) -> tuple[Array, Array]:
     """Return B and y with B^T B = D and B^T y = -b.
 
-    With dependent rows of stops, b may have a component outside the range of D, for example if parallel stops close at
-    different rates. B has a small row for it.
+    If the rows of stops are dependent, b may have a component outside the range of D, for example if parallel stops
+    close at different rates. A small extra row of B represents this component.
     """
     values, vectors = np.linalg.eigh(0.5 * (D + D.T))
     components, threshold = vectors.T @ b, NEGLIGIBLE_RATIO * values.max(initial=0.0)
@@ -164,7 +164,7 @@ def _least_squares_form(D: Array, b: Array) -> tuple[Array, Array]:
 
 
 def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents, law: str | None = None) -> Array:
-    """Return the impulses at k stops, followed by those of friction, for rates u before the impact.
+    """Return the impulses at k stops, followed by the impulses of friction, for rates u before the impact.
 
     J. J. Moreau, Unilateral contact and dry friction in finite freedom dynamics, CISM 302 (1988): u+ + e u- >= 0, the
     impulse is non-negative, and their product is zero; the impulse of friction opposes the rate of sliding after the
@@ -212,7 +212,7 @@ class Modes:
         return self.system, {}
 
     def row_sign(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
-        """Return the sign that a sticking joint's row has relative to its sliding direction."""
+        """Return 1 if the row of a sticking joint has the sense of its sliding direction, -1 if it is opposite."""
         return float(np.sign(system.jacobian(t, q)[row] @ self.gradients(q, k)))
 
 
@@ -261,7 +261,7 @@ class FrictionModes(Modes):
                 )
 
     def sliding_system(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
-        """Return the system with some joints sliding and the others without friction."""
+        """Return the system in which joints with a direction in `signs` slide, and the others have no friction."""
         key = tuple(signs)
         if key not in self._sliding_systems:
             self._sliding_systems[key] = self._build(self._problem.name, signs, {}, t, q)[0]
@@ -276,7 +276,7 @@ class FrictionModes(Modes):
         return np.array([self.row_sign(k, system, rows[k], t, q) * (R[rows[k]] @ a - gamma[rows[k]]) for k in resting])
 
     def mode_system(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
-        """Return the system with some joints sliding and the others held in place, and the rows of the latter."""
+        """Return the system in which joints slide or are held in place, and the row of each joint that is held."""
         if not {STICKS, IDLE} & set(signs):
             return self.sliding_system(signs, t, q), {}
         names = [name for name, sign in zip(self._names, signs, strict=True) if sign == STICKS]
@@ -312,7 +312,7 @@ class Mode(NamedTuple):
     sliding_stops : dict
         Direction of sliding (1 or -1) by stop.
     sticking_groups : dict
-        Groups of stops that stick together, by one stop of each group.
+        Groups of stops with equal displacements that stick together; key: one stop of the group.
     """
 
     signs: Signs
@@ -341,7 +341,7 @@ class StopFriction:
     def contact_rows(
         self, closed: Sequence[int], t: float, q: Array, v: Array, speeds: Array
     ) -> tuple[list[int], Gap, Tangents]:
-        """Return those of the closed stops that have friction, the Gap of their displacements, and their Tangents."""
+        """Return the closed stops that have friction, the Gap of their displacements, and their Tangents."""
         stops = [k for k in closed if k in self.slide_index]
         slides = Gap(*(part[[self.slide_index[k] for k in stops]] for part in self.slides.evaluate(t, q, v)))
         at_rest = np.array([k in self.resting_stops or k in self.released_stops for k in stops], dtype=bool)

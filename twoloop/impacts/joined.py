@@ -113,7 +113,7 @@ class ArcSolution:
 
 
 def system_multipliers(lam: Array, n_c: int, n_rows: int) -> Array:
-    """Return the multipliers without those of closed stops, which stand between those of C and of all other rows."""
+    """Return `lam` without the multipliers of closed stops, which follow the n_c multipliers of C."""
     return np.vstack([lam[:n_c], lam[len(lam) - (n_rows - n_c) :]])
 
 

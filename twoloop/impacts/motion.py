@@ -59,20 +59,20 @@ if TYPE_CHECKING:
 
 REBOUND_HEIGHT = 0.01  # height of a rebound, relative to atol, below which the stop stays closed
 MIN_EVALUATIONS = 2000  # smallest number of evaluations of gaps, forces and rates of sliding in a motion
-PRESSED_RATIO = 1e3  # squared rate, over (rebound height times acceleration), up to which stops may press together
+PRESSED_RATIO = 1e3  # largest squared rate of stops that may press together, over rebound height times acceleration
 ROUNDING = 1e-13  # rounding errors of gaps and rates, relative to max(1, |q|)
 FIRST_STEP_RATIO = 1e-9  # smallest first step size of an arc, relative to max(1 s, t)
 MIN_TIME_LIMIT = 1e-6  # time limit, s, of an arc that begins after the time limit of the motion
-NEGLIGIBLE_VALUE = 1e-20  # coordinate (m or rad) or rate (m/s or rad/s) below which it is a rounding error
+NEGLIGIBLE_VALUE = 1e-20  # a coordinate (m or rad) or rate (m/s or rad/s) below this value is a rounding error
 MAX_STALLED_TIME = 1e-13  # longest duration of a stalled arc, relative to max(1 s, t)
 MAX_STALLED_ARCS = 30  # number of stalled arcs in a row that ends the motion
-RELEASE_REDUCTION = 1e-7  # relative reduction of the static friction of a joint just released, against chattering
-STICKING_MARGIN = 1e-9  # relative tolerance in comparing the friction that a joint needs with what is available
+RELEASE_REDUCTION = 1e-7  # relative reduction of the static friction of a joint just released, to avoid chattering
+STICKING_MARGIN = 1e-9  # relative tolerance in the comparison of the friction that holds a joint with its bound
 EQUAL_GAPS = 4e-15  # largest rounding difference of gaps that close at the same time, relative to max(1, |q|)
-TIED_GAPS = 0.01  # largest gap, in rebound heights, of stops whose order of closing is below the tolerance
-MAX_DISPLACEMENT = 10.0  # largest motion, in rebound heights, in a sequence of impacts that is not integrated
+TIED_GAPS = 0.01  # largest gap, in rebound heights, of stops whose order of closing the tolerances leave open
+MAX_DISPLACEMENT = 10.0  # largest motion, in rebound heights, during a sequence of impacts without integration
 MAX_GAP = 1e4  # largest gap, in rebound heights, of stops in a sequence of impacts
-MIN_RATE_RATIO = 1e-13  # rate in a sequence of impacts, relative to the velocities, below which it is rounding
+MIN_RATE_RATIO = 1e-13  # smallest rate, relative to the velocities, that is no rounding error in a sequence of impacts
 MAX_DIFFERENCE = 1e-6  # largest difference, relative to velocities, at which two laws of impact count as equal
 TOUCHING_EVENT = "an impact reaches stops that touch"
 MAX_LISTED = 100  # largest number of impacts of a sequence that are listed one by one
@@ -207,10 +207,10 @@ class Motion:
             for _ in range(MAX_STALLED_ARCS if near_stops.size else 0):
                 is_slow = self._apply_impulses(gap, near_stops)
                 gap = self.gaps.evaluate(self.t, self.q, self.v)
-                # the law may let a stop close that had opened: it is hit next
+                # by the law, a stop that had opened may be closing again: its impact is next
                 if not (gap.u[near_stops] < -REST_RATE * (np.abs(gap.W[near_stops]) @ self.speeds)).any():
                     break
-            # an opened stop has no force
+            # a stop that has just opened has no force
             is_slow = is_slow[: near_stops.size] & ~np.isin(near_stops, self.opened_stops)
         closing_stops = near_stops[is_slow]
         signs, resting_joints = self._sliding_directions(self.v)
@@ -258,7 +258,7 @@ class Motion:
     def _stick_or_idle(self, k: int, force: float, D: Array, row: int, basis: list[int], n_pushing: int) -> int | None:
         """Return STICKS, or IDLE if pushing stops and sticking joints already hold the joint.
 
-        The friction of an idle joint is constant until one of these releases it; it is zero if stops alone hold it.
+        The friction of an idle joint is constant until a stop or joint releases it; it is zero if stops alone hold it.
         """
         weights = np.linalg.lstsq(D[np.ix_(basis, basis)], D[basis, row], rcond=NEGLIGIBLE_RATIO)[0]
         if D[row, row] - D[row, basis] @ weights > MIN_COMPLIANCE * D[row, row]:
@@ -300,10 +300,10 @@ class Motion:
         self.friction.resting_stops, self.friction.released_stops = set(), set()
 
     def _follow_impacts(self, gap: Gap, near: NDArray[np.int64]) -> bool:
-        """Follow impacts that succeed one another too fast for an integration between them; return whether any do.
+        """Follow impacts that succeed one another too fast for an integration between them; return whether any did.
 
-        Stops that close at the same time share an impact by Moreau's law. All others are hit in the order in which they
-        close, however soon, because another order or a shared impact would result in other velocities.
+        Stops that close at the same time share an impact by Moreau's law. All others are hit in the order of their
+        closing, however soon, because another order or a shared impact would result in other velocities.
         """
         rounding = MIN_RATE_RATIO * np.abs(gap.W).sum(axis=1) * float(self.speeds.max())
         at_rest = REST_RATE * (np.abs(gap.W) @ self.speeds) + rounding
@@ -368,7 +368,7 @@ class Motion:
         return True
 
     def _has_low_rebound(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
-        """Return a mask of the stops that rebound by less than `rebound_height`, pressed by forces and other stops."""
+        """Return a mask of the stops that, pressed by forces or other stops, rebound by less than `rebound_height`."""
         signs, resting_joints = self._sliding_directions(v)
         a, c_joints = self._free_accelerations(signs, resting_joints, v)
         gap = self.gaps.evaluate(self.t, self.q, v)
@@ -495,7 +495,7 @@ class Motion:
         """Return the velocities at the end of an arc that ends in an impact.
 
         In short steps the slope of the interpolating polynomial magnifies rounding of q. If this error may exceed the
-        tolerance and explains the difference from velocities by Simpson's rule, the latter are returned.
+        tolerance, and explains the difference from velocities by Simpson's rule, velocities by this rule are returned.
         """
         v, h = arc.v[:, -1].copy(), float(arc.t[-1] - arc.t[-2]) if arc.t.size > 1 else 0.0
         noise = ROUNDING * max(1.0, float(np.abs(arc.q[:, -1]).max()))
@@ -519,7 +519,7 @@ class Motion:
         self.v = self.v - np.linalg.lstsq(rows, violation, rcond=NEGLIGIBLE_RATIO)[0]
 
     def _gap_event(self, k: int, start: Gap) -> Any:
-        """Return the event of a gap that is open or about to open; its zero is where the gap has closed again."""
+        """Return the event of a gap that is open or about to open: its function is zero when the gap closes again."""
         g0, u0, t0, low = float(start.g[k]), float(start.u[k]), self.t, self.rebound_height
         opens = u0 > 0.0 and u0 * u0 > low * 1e-6
         noise, closing = self.noise, u0 < -REST_RATE * float(np.abs(start.W[k]) @ self.speeds)
@@ -540,14 +540,14 @@ class Motion:
         """Return the event that ends the state of a joint: sliding, sticking or idle."""
         if sign is IDLE:
             return make_terminal(lambda t, q, v: 1.0)
-        if sign != STICKS:  # sliding: the event is rest; if sliding has just begun, its rate is zero initially
+        if sign != STICKS:  # the event is the end of sliding; the rate is zero at first if sliding has just begun
             u0 = sign * float(self.modes.gradients(self.q, k) @ self.v)
             offset = u0 - self.rebound_height if k in self.resting_joints or k in self.released_joints else 0.0
             return make_terminal(lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset)
         return make_terminal(self._slip_event(lambda t, q, v: (friction(k, t, q, v), self.modes.static_friction[k])))
 
     def _stop_rest_event(self, k: int, sign: int) -> Any:
-        """Return the event at which a stop ceases to slide; if sliding has just begun, its rate is zero initially."""
+        """Return the event at which a stop ceases to slide; the rate is zero at first if sliding has just begun."""
         slide, slides = self.friction.slide_index[k], self.friction.slides
         u0 = sign * float(slides.evaluate(self.t, self.q, self.v).u[slide])
         offset = u0 - self.rebound_height if k in self.friction.resting_stops | self.friction.released_stops else 0.0

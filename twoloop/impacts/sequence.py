@@ -66,7 +66,7 @@ class Impacts:
     noise : float
         Largest gap that counts as closed; stops with such gaps close at the same time.
     min_rates : ndarray (k,)
-        Smallest rates of the stops that are not rounding errors.
+        For each stop, the smallest rate that is not a rounding error.
     law : str or None
         Law of an impact that several stops share, see `impulses`.
     """
@@ -78,7 +78,7 @@ class Impacts:
         self.noise, self.min_rates, self.n_stops = noise, min_rates, len(restitution)
 
     def joint_impulses(self, stops: NDArray[np.int64], rates: Array, restitution: Array) -> Array:
-        """Return the impulses (k + n_tangents,) of one impact that all of these stops share."""
+        """Return the impulses (k + n_tangents,) of one impact that all `stops` share."""
         P = np.zeros(len(rates))
         index_of_stop = {int(k): i for i, k in enumerate(stops)}
         friction_indices = [i for i, k in enumerate(self.tangents.normal.tolist()) if k in index_of_stop]

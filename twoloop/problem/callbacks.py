@@ -24,7 +24,7 @@ from twoloop.kernels.compile.linking import Dispatcher
 Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # row and column indices
 
-LARGE = 64  # number of coordinates from which on entries are faster than dense matrices (from 36 on for chains of bars)
+LARGE = 64  # from this number of coordinates, entries are faster than dense matrices (from 36 for chains of bars)
 # for the kind of callback that returns a dense matrix, the kind that returns the values of its entries
 VALUES_OF = {"mass": "mass_values", "jacobian": "jacobian_values"}
 
@@ -77,14 +77,14 @@ def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatche
 
 @dataclass(frozen=True, eq=False)
 class DenseFunction:
-    """Plain function of a dense matrix, by the plain function `values` of its entries with the same arguments."""
+    """Plain function that returns a dense matrix; it calls the plain function `values`, which returns its entries."""
 
     values: Callable[..., Any]
     entries: Entries
     shape: tuple[int, int]
 
     def __call__(self, t: float, q: Any, *p: Any) -> Any:
-        """Return the matrix; of symbols if the function returns symbols."""
+        """Return the matrix; its entries are symbols if `values` returns symbols."""
         values = np.asarray(self.values(t, q, *p))
         if values.shape != self.entries[0].shape:
             return values  # `store` refuses this shape
@@ -98,7 +98,7 @@ class DenseFunction:
 FIRST_DISPLACEMENT = 2.0**-6
 SHRINKAGE = 0.125  # factor on a displacement over which the constraints are too nonlinear
 N_DISPLACEMENTS = 9  # largest number of displacements that are tried
-AGREEMENT = 1e-11  # difference of the formulas of order 6 and 8, relative to an entry, up to which h is accepted
+AGREEMENT = 1e-11  # h is accepted if formulas of order 6 and 8 differ by at most this, relative to the entry
 ROUNDING = 1e-14  # rounding error of a constraint, relative to its largest value at the displaced points
 
 # weights of (f(k h) - f(-k h)) / h, k = 1 ... 4, in formulas of order 8 and 6 for the derivative of f at 0
@@ -164,7 +164,7 @@ KIND_NAMES = tuple(KINDS)
 _ARRAYS: dict[Address, Array] = {}  # cached arrays by address and shape: the arrays of a run do not move
 MAX_ARRAYS = 1000  # largest number of cached arrays
 REAL_DTYPES = "fiu"  # kinds of real dtypes; durations, which NumPy counts as integers, are excluded
-HANDLE_BITS = 52  # random bits of a handle: a float64 represents it exactly, and those of two processes differ
+HANDLE_BITS = 52  # random bits of a handle: a float64 represents it exactly, and two processes get different handles
 
 
 class PythonFunctions:
@@ -184,7 +184,7 @@ class PythonFunctions:
 
     def restart(self) -> None:
         """Discard the samples, at the beginning of a run."""
-        # arguments and value of calls of force whose numbers grow by a quarter: computed again at the end of a run
+        # (arguments, value) of a few calls of force, each 1.25 times as late as the last: repeated at the end of a run
         self.samples: list[tuple[tuple[Any, ...], Any]] = []
         self._calls, self._next = 0, 1
 
@@ -325,7 +325,7 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
     in_place = wrappers[len(KINDS[kind].state) > 1][takes_p]
     watched = digests_of(in_place)
     code = user.py_func.__code__
-    # numba stores machine code beside the file that the code object names: name that of the user's function
+    # numba stores machine code beside the file that the code object names: name the file of the user's function
     in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
     in_place.__qualname__ = f"{user.py_func.__qualname__}.{kind}"
     return compile_callback(kind, in_place, watched, named_function=user.py_func)
@@ -345,8 +345,8 @@ class ConstantMatrix:
 def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -> bool:
     """Return whether a function that returns its array takes `p` after the arguments of its kind.
 
-    If the system has `parameters`, it does, unless this argument is missing, or has a default and another name. Raise
-    TypeError if the function names its arguments in another order, or takes another number of them.
+    If the system has `parameters`, it does, unless the last argument is missing, or has a default and another name.
+    Raise TypeError if the function names its arguments in another order, or takes another number of them.
     """
     expected = ("t", *KINDS[kind].state)
     try:
@@ -413,7 +413,7 @@ def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, 
 
 
 def _is_left_out(kind: str, callbacks: dict[str, Any]) -> bool:
-    """Return whether a kind of callback is missing, None, or the zero callback that replaces a missing one."""
+    """Return whether a callback of this kind is missing, None, or the zero callback that replaces a missing one."""
     entry, given = KINDS[kind], callbacks.get(kind)
     if given is None:
         return kind not in callbacks or entry.optional or kind == "mass"  # mass_values may replace it
@@ -434,7 +434,7 @@ def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, ja
 
 
 class PlainFunctions(NamedTuple):
-    """Plain functions by kind, entries whose values they return, and the kinds `taking` the parameters p."""
+    """Plain functions by kind, the matrix entries that they return, and `taking`, the kinds that take parameters p."""
 
     functions: dict[str, Any]
     entries: dict[str, Entries]
@@ -446,7 +446,7 @@ class PlainFunctions(NamedTuple):
 def plain_functions(
     functions: dict[str, Any], sizes: tuple[int, int, int], entries: tuple[Any, Any], parameters: Any, name: str
 ) -> PlainFunctions:
-    """Return checked plain functions of a system; `sizes`: n_q, n_c, n_a; `entries`: those of M and C_q, or None."""
+    """Return checked plain functions of a system; `sizes`: n_q, n_c, n_a; `entries`: of M and of C_q, or None."""
     n_q, n_c, n_a = sizes
     if functions.get("kinematics") is not None:
         raise TypeError(

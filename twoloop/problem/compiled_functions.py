@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GeneratedCode:
-    """Source code of the callbacks of a mechanism and of its energy."""
+    """Source code of the callbacks of a mechanism, and of its energy."""
 
     key: str  # digest of the equations
     source: str  # one function for each callback, named by its kind, and energy(t, q, v, p)
@@ -97,7 +97,7 @@ def _functions(code: GeneratedCode) -> dict[str, Any]:
 
 
 def module_of(name: str, path: Path, text: str, missing: bool, names: dict[str, Any]) -> dict[str, Any]:
-    """Execute source `text` as a module with globals `names`; return its namespace; write its file if `missing`."""
+    """Execute source `text` as a module with globals `names`; return its namespace. If `missing`, write its file."""
     if missing:
         _write(path, text)
     module = types.ModuleType(name)
@@ -123,7 +123,7 @@ def _head(source: str) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file atomically; warn if the folder is not writable, as every process then compiles again."""
+    """Write a file atomically; warn if the folder is not writable, because then every process compiles again."""
     unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
     try:
         make_trusted_folder(path.parent)
@@ -170,7 +170,7 @@ class FrozenValues:
         self.any = bool(cells or names or arrays)
 
     def change(self) -> Change | None:
-        """Return the first change of a value, or None; this is fast, because every call of `solve_dae` checks it."""
+        """Return the first change of a value, or None; this must be fast: every call of `solve_dae` calls it."""
         for cell, value, kind, name in self._cells:
             if cell.cell_contents is not value and _differ(cell.cell_contents, value):
                 return Change(kind, name, value, cell.cell_contents)

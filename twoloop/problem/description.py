@@ -109,7 +109,7 @@ class Description:
     joint_coordinates: tuple[Any, ...] = ()  # angles and displacements of the joints of a model
 
     def with_parameters(self, p: NDArray[Any]) -> Description:
-        """Return the description for other parameters, without an energy or a drawing that may enclose the old ones."""
+        """Return the description for other parameters; drop energy and drawing if they may enclose the old values."""
         if not isinstance(self.energy, GeneratedEnergy):
             return Description(self.coordinates)
         return Description(self.coordinates, replace(self.energy, parameters=tuple(p.tolist())), self.conserved)

@@ -11,7 +11,7 @@ import numpy as np
 
 from twoloop.checks.arguments import Array, check_call, shown
 
-SAMPLES = 4  # smallest number of equal parts of a step at whose ends the signs of event functions are checked
+SAMPLES = 4  # smallest number of equal parts of a step; signs of event functions are checked at the end of each part
 WHOLE = 1.0 - 1e-9  # factor on the number of parts before rounding up, so that rounding errors do not add a part
 PRECISION = 4.0 * float(np.finfo(float).eps)  # relative precision of the time of an event, as in SciPy
 # largest number of iterations of Brent's method, which at zeros of high order may need 53 to halve the interval
@@ -27,7 +27,7 @@ class Event:
     number: int
     function: Callable[..., Any]
     terminal: float  # number of occurrences after which the run ends; infinite: never
-    direction: float  # sign of the slope at zeros that count; 0: both
+    direction: float  # only zeros where the slope has this sign count; 0: all zeros count
 
     @property
     def name(self) -> str:
@@ -90,7 +90,7 @@ def _event(number: int, function: Any) -> Event:
 
 
 class EventSearch:
-    """Search for the events of a run from t0 and `row`, [q, v] there, step by step.
+    """Search step by step for the events of a run that begins at t0 with `row`, the state [q, v].
 
     Two samples are at most `every` seconds apart, unless an event function has an attribute `every` of its own.
     """
@@ -109,10 +109,10 @@ class EventSearch:
     def search(
         self, states: Callable[[Array], Array], row_function: Callable[[float], Callable[[float], Array]], ends: Array
     ) -> None:
-        """Search the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event.
+        """Search the steps from ends[0] to ends[1], from ends[1] to ends[2], ...; stop at a terminal event.
 
-        `states(times)` returns the rows [q, v] at sorted times, and `row_function(t)` a function of time that returns
-        the row, for the step that contains t.
+        `states(times)` returns the rows [q, v] at sorted times. `row_function(t)` returns a function of time that
+        returns the row at any time of the step that contains t.
         """
         self._states, self._row_function = states, row_function
         if len(ends) < 2 or self.ended is not None:
@@ -141,7 +141,7 @@ class EventSearch:
             self.found = [[(t, row) for t, row in events if t <= self.reached] for events in self.found]
 
     def _with_turns(self, times: Array, rows: Array) -> tuple[Array, Array]:
-        """Return times and rows with samples added where a gap is smallest: it may be closed only between samples."""
+        """Return times and rows with samples added where a gap is smallest, as it may close only between samples."""
         states_at = zip(times.tolist(), *np.split(rows, 2, axis=1), strict=True)
         values = np.array([[rate(*state) for rate in self._rates] for state in states_at])
         turns = [
@@ -178,7 +178,7 @@ class EventSearch:
                 self.reached, end = end, next(steps, np.inf)
 
     def _record(self, roots: list[tuple[float, Array, Event]]) -> None:
-        """Record the events up to the first terminal one, and others at the same time."""
+        """Record the events up to the first terminal event, and other events at the time of the terminal event."""
         for t, row, event in roots:
             if self.ended is not None and t > self.ended[1]:
                 return
@@ -190,7 +190,7 @@ class EventSearch:
     def _root(
         self, event: Callable[..., float], ends: tuple[float, float], values: tuple[float, float]
     ) -> tuple[float, Array]:
-        """Return the time between `ends` at which an event is zero, and the row; `values`: the event at `ends`."""
+        """Return the time and the row of an event between `ends`; `values`: the event function at `ends`."""
         from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
 
         values_at_ends = dict(zip(ends, values, strict=True))

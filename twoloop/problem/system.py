@@ -73,7 +73,7 @@ def _method(kind: str) -> Callable[..., Any]:
 
 
 def _with_entries(text: str | None, plain: bool) -> str | None:
-    """Return a docstring with the callbacks in place of PLACEHOLDER; None if `text` is None (python -OO)."""
+    """Return a docstring, `text`, with PLACEHOLDER replaced by the callbacks; None if `text` is None (python -OO)."""
     return text and PLACEHOLDER.sub(lambda match: "".join(_entry(kind, plain, match[1]) for kind in KINDS), text)
 
 
@@ -389,7 +389,7 @@ class ConstrainedSystem:
         return {} if self._python is None else self._python.functions
 
     def parameters_for(self, kind: str) -> tuple[Array, ...]:
-        """Return the arguments of a plain function of a kind after its state: a copy of the parameters, or none."""
+        """Return the last arguments of a plain function, after its state: a copy of the parameters, or none."""
         return (self.parameters.copy(),) if self.takes_parameters(kind) else ()
 
     def takes_parameters(self, kind: str) -> bool:
@@ -407,7 +407,7 @@ class ConstrainedSystem:
         return self.remembered(("kit", id(self.functions)), lambda: Kit(self.functions))
 
     def remembered(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()`, cached for these parameters; not cached for Python functions, which may change."""
+        """Return `make()`, cached with this system; not cached for Python functions, which may change."""
         if self._python is not None:
             return make()
         if key not in self.derived:
@@ -469,7 +469,7 @@ class ConstrainedSystem:
     def check_returned(self, t: float, q: Array, v: Array) -> None:
         """Check the arrays that functions given with `compile=True` return at (t, q, v).
 
-        Machine code can only say that a shape is wrong, not which.
+        Machine code can only report that a shape is wrong, but not which shape it is.
         """
         for kind, function in self._returning.items():
             states = {"q": q, "v": v, "lam": np.ones(self.n_c)}
