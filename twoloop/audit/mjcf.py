@@ -80,7 +80,7 @@ class MujocoModel:
         heavy, moving = sum(body.inertia.any() for body in model.bodies), np.flatnonzero(engine.body_jntnum > 0)
         if len(moving) != heavy:
             raise ValueError(f"MuJoCo has {len(moving)} bodies with joints, the model {heavy}")
-        # the body of MuJoCo for each of the model, of which massless ones move with its first joints only
+        # for each body of the model, the body in MuJoCo; massless bodies of the model move with its first joints only
         following = np.cumsum([0, *(body.inertia.any() for body in model.bodies)])[:-1]
         self.bodies = moving[following]
         self.n_joints = [
@@ -212,13 +212,13 @@ class MujocoModel:
         return int(self.engine.body_jntadr[self.bodies[k]]) + self.n_joints[k] - 1
 
     def _later_dofs(self, k: int) -> list[int]:
-        """Return the velocities in MuJoCo of the joints of a body that do not move a massless one before it."""
+        """Return the velocities in MuJoCo of those joints of a body that do not move a massless body before it."""
         engine = self.engine
         own = engine.dof_bodyid == self.bodies[k]
         return np.flatnonzero(own & (engine.dof_jntid > self._joint(k))).tolist() if self.n_joints[k] else []
 
     def compare(self, problem: ModelProblem, start: Array) -> None:
-        """Raise ValueError if masses, forces, dampers or loops differ from those of the model of rigid joints.
+        """Raise ValueError if masses, forces, dampers or loops differ from the model of rigid joints.
 
         Mass matrices and generalised forces of the tree are compared in MuJoCo's coordinates at a displaced position,
         and the admissible velocities of the loops at the start.
@@ -306,7 +306,7 @@ class MujocoModel:
 
     @property
     def stiff_solver(self) -> tuple[int, int, float]:
-        """Return the constraint solver settings for stiff loops: those of the file, unless they are worse."""
+        """Return the constraint solver settings for stiff loops: the file's settings, unless they are worse."""
         _, iterations, tolerance = self.solver
         newton = int(self.mujoco.mjtSolver.mjSOL_NEWTON)
         return newton, max(iterations, ITERATIONS), min(tolerance, TOLERANCE)
@@ -543,12 +543,12 @@ def _label(settings: Settings, integrator: str) -> str:
 
 
 def _advice(mujoco_model: MujocoModel, audits: list[Audit]) -> str:
-    """Return the settings that reach the error: the cheapest, or the one with fewer changes if it costs little more."""
+    """Describe the settings that reach the error: the cheapest, or others that change less and cost little more."""
     costs = {choice: run.cpu_s for choice, audit in enumerate(audits) if (run := audit.reaching)}
     if not costs:
         return ""
     limit = CHANGE_FACTOR * min(costs.values())
-    choice = next(choice for choice, cost in costs.items() if cost <= limit)  # the fewest changes
+    choice = next(choice for choice, cost in costs.items() if cost <= limit)  # `costs` begins with the fewest changes
     audit, run, settings = audits[choice], audits[choice].reaching, (Settings(), *CANDIDATES)[choice]
     assert run is not None
     option = f'timestep="{run.step:.6g}" integrator="{settings.integrator or mujoco_model.integrator}"'

@@ -20,12 +20,12 @@ Simulate = Callable[[ModelProblem, Array, float], Any]
 POINT_JOINTS = ("revolute", "spherical", "universal", "fixed")  # kinds of joints that keep two points coincident
 INSTANTS = 50  # comparison times after the start
 REFERENCE_TOLERANCE = 1e-12  # tolerance of both references
-LOST = 0.1  # larger errors mean that the motion is a different one
+LOST = 0.1  # larger errors (m, or components of axes) mean that the motion is a different one
 FLAT = 1.5  # errors that decrease by less than this factor count as a floor
-COARSEST, SETTLED, FINEST = 8.0, 0.25, 2.0**-12  # relative to the step given; a floor needs a step <= SETTLED
-TARGET_SHARE = 0.1  # relative to the requested error
+COARSEST, SETTLED, FINEST = 8.0, 0.25, 2.0**-12  # steps, relative to the given step; a floor needs a step <= SETTLED
+TARGET_SHARE = 0.1  # steps are halved until the error, relative to the requested error, is at most this
 START_TOLERANCE = 1e-6  # tolerance of the initial poses, m and components of axes
-CPU_LIMIT = 4.0  # CPU time, s, up to which the next run is attempted
+CPU_LIMIT = 4.0  # the next run is attempted if its estimated CPU time, s, is at most this
 MAX_FIRST_STEPS = 100_000  # limit for the first run, when the cost of a step is unknown
 REFERENCE_TIME_LIMIT = 60.0  # s: time limit of each reference
 RESOLVED = 0.1  # largest difference of the references, relative to the requested error

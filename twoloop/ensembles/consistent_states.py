@@ -98,7 +98,7 @@ def consistent_states(
                 )
             if not is_valid[run]:
                 new_q[run], new_v[run], is_valid[run] = *projected, True
-    # callbacks that were not traced may write beyond their arrays, which only single calls check: call traced ones only
+    # callbacks that were not traced may write beyond their arrays, which only single calls detect: do not call them
     traced = np.flatnonzero(is_valid)
     projections = Starts(t, new_q[traced], new_v[traced], starts.parameters[traced])
     is_valid[traced] = ~is_inconsistent(writable_kit(system), projections)
@@ -110,7 +110,7 @@ def consistent_states(
 class _LaneProjection:
     """Generated code that projects guesses onto the constraints of a system, in SIMD lanes.
 
-    Raise Untraceable if code cannot be generated, or does not pay; the message says why.
+    Raise Untraceable if code cannot be generated, or is not worth its compilation; the message says why.
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts):

@@ -101,7 +101,7 @@ Flags = NDArray[np.bool_]
 
 MAX_DISTANCE = 1e5  # largest distance of a run in lanes from the first run, in tolerances, unless the motion is chaotic
 CALL = 1e-3  # time, s, that a call of solve_dae takes besides its steps
-# largest ratio of the time to compile to that of single runs; it may exceed 1, as code is cached for later calls
+# largest ratio of compilation time to the time of single runs; it may exceed 1, as code is cached for later calls
 MAX_COMPILATION = 20.0
 
 
@@ -127,7 +127,7 @@ class LaneEnsemble:
         self.method_of = np.full(n_runs, -1, dtype=np.int8)  # index in `methods` for each run in lanes; -1: none
         self.reasons: dict[int, str] = {}  # why runs were left to `solve_dae`, by their numbers
         self.messages: dict[int, str] = {}  # messages of the runs that failed, by their numbers
-        self.refusal = ""  # why no run was integrated in lanes, or why the first method integrated none
+        self.refusal = ""  # why no run was integrated in lanes, or why the first method integrated no run
         self.deadline = np.inf  # time of `time.monotonic` at which runs stop; compilation delays it
 
     @property
@@ -140,7 +140,7 @@ class LaneEnsemble:
         """Integrate the runs that can be integrated in lanes, by the methods of a preset.
 
         `first` is the first run, integrated by `solve_dae`. It shows whether the motion is stiff and what runs cost,
-        and its end is compared with that of the same run in lanes. Raise ValueError if a start is not consistent.
+        and its end is compared with the end of the same run in lanes. Raise ValueError if a start is not consistent.
         """
         stiff = (first.stats.n_jacobians or 0) > 0
         series_is_costly = method == "auto" and not stiff and is_series_costly(generic_system(self.system, self.starts))
@@ -205,7 +205,7 @@ class LaneEnsemble:
         is_valid[0] = False
         n, valid_runs = len(inner_times), numbers[is_valid]
         for states, new_states, start in ((self.q, q, starts.q), (self.v, v, starts.v)):
-            if len(numbers) == len(states):  # a masked copy is twice as fast as one by indices
+            if len(numbers) == len(states):  # a copy by a mask is twice as fast as a copy by indices
                 np.copyto(states[:, :, len(times) - n :], new_states[:, :, :n], where=is_valid[:, None, None])
             else:
                 states[valid_runs, :, len(times) - n :] = new_states[is_valid, :, :n]
@@ -236,7 +236,7 @@ def add_run_number(run: int, error: ValueError) -> ValueError:
 MAX_LISTED = 5  # largest number of runs that a message names
 FIRST_RUN_REASON = "the first, which checks the system"  # reason for which the first run is not in lanes
 N_ROUNDS = 3  # number of attempts for a run that is integrated singly, with increasing time limits
-# smallest time limit of a single run, as a share of the remaining time, or a multiple of the longest single run so far
+# a single run may take at least this share of the remaining time, and this multiple of the longest single run so far
 MAX_SHARE, MAX_MULTIPLE = 0.1, 3.0
 MAX_FIRST_SHARE = 0.5  # largest share of the time limit that the first run takes
 TIME_LIMIT_MESSAGE = (

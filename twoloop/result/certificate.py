@@ -18,18 +18,18 @@ from twoloop.run.rerun import IndependentRerun, RerunPiece
 from twoloop.run.signals import SignalHandlers
 
 PIECES = 200  # smallest number of intervals into which the run is divided; also limits the step size of reruns
-LIMIT = 100.0  # largest defect of a step, and largest error of a state, in tolerances, of a run that passes
-FASTEST = 10.0  # largest rate, 1/s, by which errors of velocities are divided; untested velocities: by this rate
+LIMIT = 100.0  # a run passes if defects of steps and errors of states are at most this many tolerances
+FASTEST = 10.0  # largest rate, 1/s, by which velocity errors are divided; errors of untested velocities: by this rate
 TOLERANCE_FACTOR = 0.1  # ratio of the tolerances of a reintegration to those of the run
 FINEST = 1e-13  # smallest tolerance of a reintegration, relative or absolute: rounding hides smaller errors
 SECOND_RUN_FACTOR = 0.1  # factor on the tolerances of the second run, because its errors grow over the whole run
-STIFF = 4  # number of explicit steps per step of the run above which the run did not resolve untested velocities
-CHAOTIC = 10.0  # largest ratio of an error to the growth of an initial error of one tolerance that explains this error
+STIFF = 4  # a run did not resolve untested velocities if its steps take more than this number of explicit steps each
+CHAOTIC = 10.0  # the growth of an initial error of one tolerance explains errors of up to this multiple of the growth
 ROUNDING = 1e-14  # deviation attributed to rounding, relative to the largest coordinate or velocity
-SPLIT = 100.0  # defect of an interval, in tolerances, above which the steps in it are checked one by one
+SPLIT = 100.0  # if the defect of an interval, in tolerances, is larger, the steps in it are checked one by one
 MAX_WRONG = 3  # number of wrong steps after which the rest of an interval is skipped
-NEGLIGIBLE = 1e-10  # singular value of the constraint rows, relative to the largest, below which it counts as zero
-USUAL_GROWTH = 10.0  # growth of errors over an interval above which the defect is divided by this growth
+NEGLIGIBLE = 1e-10  # a singular value of the constraint rows counts as zero below this fraction of the largest
+USUAL_GROWTH = 10.0  # if errors grow over an interval by a larger factor, the defect is divided by this factor
 MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # largest number of attempts in an interval: first + second * steps
 LOOSER = (10.0, 100.0)  # factors on the tolerances with which a failed reintegration is repeated
 
@@ -166,7 +166,7 @@ def _certify(result: Record, rtol: float | None, atol: ArrayLike | None, handler
     faults = tuple(field_faults(result, result.system, checker.rtol, checker.atol, LIMIT))
     defect, t_worst, unseen = _local_errors(checker)
     error, t_error, t_grown = checker.errors() if defect <= LIMIT else (defect, t_worst, np.inf)
-    if t_grown < np.inf:  # the growth of a small initial error explains the error: the steps may be right
+    if t_grown < np.inf:  # the growth of a small initial error explains the largest error: the steps may be right
         unseen = [*((start, end) for start, end in unseen if end <= t_grown), (t_grown, float(checker.t[-1]))]
     end = end_of_run(result)
     last_time = max(float(result.t[-1]), *(float(t[-1]) for t in result.t_events or () if len(t)), -np.inf)
@@ -217,7 +217,7 @@ class _Checker:
         self.handlers = handlers
         self.result, self.sol, self.system, self.rtol, self.atol = result, result.sol, system, rtol, atol
         every_t, self.every_state = all_states(result)  # all states [q, v], of which several may have equal times
-        # times, all different, and the states there; index in `t` of every state
+        # all different times, the states at these times, and the index in `t` of every state
         self.t, first, self.place = np.unique(every_t, return_index=True, return_inverse=True)
         self.states = self.every_state[first]
         self.n_steps, self.untested = self._steps(result)
@@ -242,7 +242,7 @@ class _Checker:
         return last_step - first_step + 1, n_untested[last_step + 1] > n_untested[first_step]
 
     def pieces(self) -> Iterator[tuple[int, int, float]]:
-        """Yield indices of first and last state, and defect, of each interval; inf if reintegration fails."""
+        """Yield, for each interval, the indices of its first and last state, and its defect (inf: rerun failed)."""
         for i, j in self._intervals():
             defect = self._defect(i, j)
             if SPLIT < defect < np.inf and j > i + 1:
@@ -253,7 +253,7 @@ class _Checker:
                 yield i, j, defect
 
     def _intervals(self) -> Iterator[tuple[int, int]]:
-        """Yield the indices of first and last state of intervals of at most `self.longest` s, or of one step."""
+        """Yield indices of first and last states of intervals, which last one step or up to `self.longest` s."""
         i, last = 0, len(self.t) - 1
         while i < last:
             j = i + 1
@@ -263,10 +263,10 @@ class _Checker:
             i = j
 
     def errors(self) -> tuple[float, float, float]:
-        """Return the largest error of a state, in tolerances, its time, and the time from which growth explains errors.
+        """Return the largest error of a state, in tolerances; its time; and when growth begins to explain errors.
 
         Errors are distances from a second run, which starts from the first state and uses no other stored state. The
-        last time is infinite if no error exceeds the limit, or if growth does not explain the errors.
+        last of these times is infinite if no error exceeds the limit, or if growth does not explain the errors.
         """
         reference, tested = self._second_run(self.states[0])
         with np.errstate(invalid="ignore"):  # states that are not finite give NaN
@@ -287,9 +287,9 @@ class _Checker:
         return float(largest.max()), float(t[worst_index]), np.inf
 
     def _second_run(self, start: Array) -> tuple[Array, Array]:
-        """Return the states (n, 2 n_q) of a second run from `start`, and the weights (n,) of its errors of velocities.
+        """Return the states (n, 2 n_q) of a second run from `start`, and the weights (n,) of its velocity errors.
 
-        After a failure, e.g. near a singular position, this run continues from the stored state (see `pieces`).
+        After a failure, e.g. near a singular position, the second run continues from the stored state (see `pieces`).
         """
         states, weights = np.empty_like(self.states), np.full(len(self.t), 1.0 / self._rate())
         states[0] = start
@@ -309,12 +309,12 @@ class _Checker:
         return states, weights
 
     def _rate(self) -> float:
-        """Return the rate of the motion, 1/s: an estimate of errors of velocities over errors of positions."""
+        """Return the rate of the motion, 1/s: an estimate of the ratio of velocity errors to position errors."""
         largest = [np.abs(np.nan_to_num(x, posinf=0.0, neginf=0.0)).max() for x in (self.result.a, self.result.v)]
         return float(np.clip(largest[0] / max(largest[1], np.finfo(float).tiny), 1.0, FASTEST))
 
     def _single_steps(self, i: int, j: int) -> Iterator[tuple[int, int, float]]:
-        """Yield the indices of first and last state, and the defect, of each step in a wrong interval i to j."""
+        """Yield, for each step in a wrong interval i to j, the indices of its first and last state, and its defect."""
         n_wrong = 0
         for k in range(i, j):
             defect = self._defect(k, k + 1)
@@ -348,7 +348,7 @@ class _Checker:
         return np.inf
 
     def _defect_by(self, method: str, factor: float, i: int, j: int) -> float:
-        """Return the defect from state i to state j by one method, with tolerances times `factor`."""
+        """Return the defect from state i to state j, measured by one method with `factor` times the tolerances."""
         between, end = self._check_time(i, j), float(self.t[j])
         times = np.array([between, end] if self.t[i] < between < end else [end])
         rerun = self._rerun(method, factor, self.states[i], i, j, times)
@@ -364,7 +364,7 @@ class _Checker:
         if self.sol is None or not self.t[i] < t < self.t[j]:
             return 0.0
         table = self.sol.table
-        # interpolation is less accurate than the states in these intervals
+        # in intervals of this kind, interpolation is less accurate than the states
         if table.kinds[np.searchsorted(table.t, t) - 1] == SEPARATE:
             return 0.0
         interpolated = self.sol(t)
@@ -393,7 +393,7 @@ class _Checker:
         return np.tile(self.atol, 2) + self.rtol * np.abs(state) + self.rounding
 
     def _distance(self, state: Array, reference: Array, i: int, j: int) -> float:
-        """Return the largest difference of two states in tolerances, without velocities if a step did not test them."""
+        """Return the largest difference of two states, in tolerances; velocities that no step tested do not count."""
         with np.errstate(invalid="ignore"):  # states that are not finite give NaN
             error = np.abs(state - reference) / self._allowed(reference)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
@@ -402,7 +402,7 @@ class _Checker:
         """Integrate from `start`, at the time of state i, to the time of state j; land on `times`; None on failure."""
         key = (method, factor)
         if key not in self.reruns:
-            # the rank of the rows is too small at a start in a singular position, where lam is not known
+            # a start in a singular position, where lam is unknown, would show too small a rank of the rows
             lam = np.asarray(self.result.lam)
             first = int(lam.ndim == 2 and np.isnan(lam[:, :1]).any())
             q, v = self.states[first].reshape(2, -1).copy()

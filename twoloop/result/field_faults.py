@@ -14,7 +14,7 @@ from twoloop.run.singular_start import Branch, branch_at
 
 Array = NDArray[np.float64]
 
-NEAR = 1e-9  # difference of times, relative to the duration of the run, up to which they count as equal
+NEAR = 1e-9  # times count as equal if they differ by at most this, relative to the duration of the run
 ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
 SINGULAR_START = 1e-5  # largest error of the accelerations at a start in a singular position, relative to the largest
 PATTERNS = 3  # number of sign patterns of the perturbations by which the effect of a tolerance is measured

@@ -10,7 +10,7 @@ from twoloop.problem.description import Joint
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
 
-NEGLIGIBLE = 1e-6  # largest change of a unique reaction by unit multipliers with C_q^T lam = 0, relative to the rows
+NEGLIGIBLE = 1e-6  # a reaction is unique if unit lam with C_q^T lam = 0 change it by at most this, relative to rows
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _force_and_torque(joint: Joint, q: Array, point: Array, generalized: Array) 
         from twoloop.bodies.rotation import half_spin, rotated  # compiled on import
 
         torque = 0.5 * np.stack(rotated.py_func(*angles, *half_spin.py_func(*angles, *moments)))
-    else:  # each column of the matrix rotates like a lever arm
+    else:  # each column of the rotation matrix moves like a lever arm
         torque = np.cross(angles.reshape(3, 3, -1), moments.reshape(3, 3, -1), axis=1).sum(axis=0)
     return force, torque - np.cross(arm, force, axis=0)
 

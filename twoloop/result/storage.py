@@ -44,7 +44,7 @@ def fields_of(result: Record, inside: bool = True) -> tuple[dict[str, NDArray[An
     metadata |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events, "method": result.method}
     metadata |= {"compiled": result.compiled, "changes": result.changes}
     metadata |= {name: getattr(result, name) for name in NUMBERS}
-    if result.sol is not None and not result.arcs:  # the solution of a joined result consists of those of its arcs
+    if result.sol is not None and not result.arcs:  # the solution of a joined result consists of its arcs' solutions
         interpolator, table = result.sol.interpolator, result.sol.table
         arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
         metadata |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}
@@ -121,7 +121,7 @@ MIN_INTERIOR = 2  # smallest number of stored states of a divided interval: its 
 
 
 def read_fields(path: Path, system: ConstrainedSystem | None) -> dict[str, Any]:
-    """Return the validated fields of a saved result by name; wrong ones could crash compiled code."""
+    """Return the validated fields of a saved result by name; invalid fields could crash compiled code."""
     arrays, metadata = _read_folder(path) if path.is_dir() else _read_file(path)
     saved = SavedFields(str(path), arrays, metadata)
     if system is not None:

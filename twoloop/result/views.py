@@ -84,7 +84,7 @@ def plot(result: Record, path: str | os.PathLike[str] | None = None) -> Any:
     file = None if path is None else check_path(path)
     if result.t.size == 0:
         raise ValueError(f"plot needs a result with output; this one has none: {result.message}")
-    # without pyplot: needs no display and leaves the user's backend alone
+    # a figure without pyplot needs no display, and does not affect the user's backend
     figure_class = needed("matplotlib.figure", "matplotlib", "plot").Figure
     units: dict[str, list[int]] = {}
     for k, coordinate in enumerate(result.coordinates):
