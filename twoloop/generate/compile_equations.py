@@ -38,7 +38,7 @@ from twoloop.problem.system import ConstrainedSystem
 DOUBLE_POINTER = f"{DOUBLE}*"
 # generated code is used if accelerations at the start have at most this relative error; in runs it grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions that are tried for this measurement, and their distance
+MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions where this error is measured, and distance between them
 
 
 def write_accelerations(

@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return missing C_q and Gamma by kind of callback, as expressions by index in the flattened array."""
+    """Return, for each `missing` kind of callback, its expressions; keys: indices in the flattened array."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):

@@ -47,22 +47,22 @@ Array = NDArray[np.float64]
 SINGULAR_MASS = 1e-10  # rows of G are added to M if M has a smaller ratio of the smallest to the largest eigenvalue
 RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is below this fraction of the row
 PIVOT_FRACTION = 0.01  # the pivot of a row of G must be at least this fraction of the smallest pivot at the start
-# possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to its pivot without
-# the other rows. If pivots were below the last of these values, rounding errors would dominate
+# possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to the pivot that this
+# row has without the other rows. With pivots below the last value, rounding errors would dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
 # MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] at most the smallest pivot at the start; without such an
 # i, MIN_PIVOTS[-1] is chosen
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 N_FEW_COORDINATES = 24  # with more coordinates, MIN_INDEX_MANY replaces MIN_INDEX_FEW
-# if pivots are so small that their index in MIN_PIVOTS is at least this limit, all rows of G may be added to M.
-# MIN_INDEX_FEW: limit with up to N_FEW_COORDINATES coordinates. MIN_INDEX_FEW_SINGULAR: if M is also singular, because
-# Euler parameters lose two digits even in sound models. MIN_INDEX_MANY: for more coordinates, because code gets longer
+# all rows of G may be added to M if pivots are small: if the index of their limit in MIN_PIVOTS is at least
+# MIN_INDEX_FEW, for up to N_FEW_COORDINATES coordinates; MIN_INDEX_FEW_SINGULAR, if M is also singular, because Euler
+# parameters lose two digits even in sound models; MIN_INDEX_MANY, for more coordinates, because code gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # if s G^T G is added to M, approximate ratio of its largest entry to the largest entry of M
 MAX_PIVOT_RATIO = 1e5  # solutions need refinement if an entry of M with added rows exceeds this multiple of its pivot
 SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large step, so that they rarely depend on the start
 DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
-MIN_GAIN = 2  # rows are added only if they decrease the index in MIN_PIVOTS by at least this number
+MIN_GAIN = 2  # rows are added to M only if this makes min_pivot larger, by at least this number of places in MIN_PIVOTS
 # dependent coordinates are eliminated if G has at least this number of rows per coordinate; with fewer rows, the linear
 # system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
@@ -467,7 +467,7 @@ class Elimination:
 
     @cached_property
     def projection(self) -> Program:
-        """Return the program for projected "q" and "v", and for "a" and "lam" at this v; "lam" has the least norm."""
+        """Return the program for the projected "q" and "v", and "a" and "lam" with this "v"; "lam" has least norm."""
         arrays = self.basic_projection.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
         lam = multipliers_of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
@@ -476,7 +476,7 @@ class Elimination:
 
     @cached_property
     def basic_projection(self) -> Program:
-        """Return the program for projected "q" and "v", and "a" and "lam" at this v; "lam" is 0 for dependent rows."""
+        """Return the same program as `projection`, except that "lam" is 0 for dependent rows, not of least norm."""
         n, position = self.system.n_q, self.position_projection.arrays
         v = [(u + change).as_term() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
         solution, conditions = self._accelerations(v)

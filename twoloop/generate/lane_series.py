@@ -255,7 +255,7 @@ class LaneSeries:
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
-        """Return the Operations of a table whose first result is `quantity`."""
+        """Return the Operations of a table; `quantity`: index of the quantity that its first operation computes."""
         firsts, seconds = (self._expressions(each, range(len(each.column))) for each in (table.first, table.second))
         operations = []
         for kind, begin, end in table.groups[:, :3].tolist():
@@ -371,7 +371,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for the results of operations at order 0; store factors that are known by now in `row`."""
+        """Write code for coefficients of order 0 of the results; store in `row` the factors that later orders use."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation

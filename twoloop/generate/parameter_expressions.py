@@ -26,7 +26,7 @@ CANCELLATION_LIMIT = 8.0 * 2.0**-52
 NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY_FUNCTIONS, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # functions that use only operators of Python, by the names in NumPy
+OPERATORS: dict[str, Callable[..., Any]] = {  # substitutes that use only Python's operators; keys: names in NumPy
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,

@@ -223,7 +223,7 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return the key of a product, its constant factor, and both factors; the second one is normalized."""
+    """Return the key of a product, its constant, and its two factors, of which the second is normalized."""
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier
 

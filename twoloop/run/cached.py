@@ -563,7 +563,7 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of a system, from `trace_cache_of` at the first call, then as the system remembers it."""
+    """Return the TraceCache of a system: the first call gets it from `trace_cache_of`, later calls from the system."""
     cache: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
     return cache
 

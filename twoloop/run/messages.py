@@ -459,7 +459,7 @@ def _describe_near_singular(run: "Run", t1: float) -> str:
 
 
 def describe_not_finite(run: "Run") -> str:
-    """Return words that name the callback whose value is not finite, or that say where to look for it."""
+    """Return a phrase that names the callback whose value is not finite, or says where to look for this callback."""
     kind, fault_time = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
         name = run.kit.functions._fields[kind]

@@ -416,7 +416,7 @@ def _describe_other_assembly(
 
 
 def _describe_change(before: Array, after: Array, scales: Scales) -> str:
-    """Return words about the coordinate that changes most, with enough digits of both its values to show the change."""
+    """Describe the change of the coordinate that changes most, with enough digits of both values to show the change."""
     j = int(np.abs((after - before) / scales.columns).argmax())
     magnitude, change = max(abs(float(before[j])), abs(float(after[j]))), abs(float(after[j] - before[j]))
     digits = min(17, 3 + max(0, math.ceil(math.log10(magnitude / change)))) if change > 0.0 else 3

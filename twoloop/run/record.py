@@ -162,12 +162,12 @@ class Recorder:
     ):
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps = 0  # number of steps searched for events so far; the last one may contain a terminal event
-        self.last_step_size = 0.0  # time, s, from the beginning of this last step to the terminal event
+        self.last_step_size = 0.0  # time, s, from the beginning of the run's last step to the terminal event
         self.interrupted = False  # whether Ctrl-C interrupted the search for events, or the interpolation
         # states at the ends of intervals that are still to be searched, and earlier nodes of the polynomials in these
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
-        self._next_interval = 0  # index (in these arrays) of the first interval that is still to be searched
+        self._next_interval = 0  # index, in `_t` and `_kinds`, of the first interval that is still to be searched
         self._n_outputs = 0
         may_end_run = request.events is not None and any(event.terminal < np.inf for event in request.events)
         self._max_pending = 0 if may_end_run or request.store.append_only else MAX_PENDING_STATES

@@ -107,7 +107,7 @@ def _check_derivatives(run: Run, states: Array, first_state: Array, status: Stat
 
 
 def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
-    """Return words if two calls of a Python force at one of `states` (rows [t, q, v]) return two values, else None."""
+    """Describe the error if two calls of a Python force at one of `states` (rows [t, q, v]) differ; None: no error."""
     n, forces = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -141,7 +141,7 @@ def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> t
 
 
 def describe_changed_force(run: Run) -> str | None:
-    """Return words if the force, for the same arguments, now differs from a value earlier in the run, else None.
+    """Describe the error if the force now differs from an earlier value for equal arguments; None: no error.
 
     Two calls after the run do not reveal a force that changes slowly (with the clock) or once (after 1000 calls).
     """

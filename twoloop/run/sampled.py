@@ -160,7 +160,7 @@ class SampledRun:
         if self._step_failed:
             self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
-        self._step_failed = True  # until the step is complete: a callback may raise an exception before
+        self._step_failed = True  # remains True if a callback raises an exception before the step is complete
         with signals_of(self.system):
             self._step_to(end)
         self.cpu_time += time.process_time() - began

@@ -111,7 +111,7 @@ def describe_velocity_jump(
         threshold = (
             min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / largest_q)) if largest_q > 0.0 else LOST_RANK_RATIO
         )
-        # without crossing steps, the run's own steps may have left the branch: use the ratio at the last state only
+        # the run's own steps across the position may have left the branch: use the ratio at the last state only
         here, there = (t0, first), (t1, last)
         ratio = _least_ratio_between(system, here if across else there, there, rank, unit_free_ratio)
         if ratio >= threshold:

@@ -46,14 +46,14 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     # 1: stop with NEAR_SINGULAR near a singular position; 0: do not stop; SUSPENDED: do not stop near the present
     # singular position; the value is 1 again after the run has left this position
     MAY_CROSS,
-    SHORTEST,  # smallest allowed step size, s; steps of at most EQUAL_SPACINGS spacings of t are too short as well
+    SHORTEST,  # smallest allowed step size, s; steps of up to EQUAL_SPACINGS spacings of t are not allowed, either
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
     TRIAL_STEPS,  # stop with SWITCH_METHOD if one of the first TRIAL_STEPS steps proposes a next size of at most GAP
     MAY_JUMP,  # 1: C_t or b may jump
     JUMP_RATIO,  # largest ratio of a step's error to its estimate if a force jumps in the step
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
     TIME_SPACING,  # largest spacing, s, of samples in time alone (these are taken ahead of short steps, too)
-    # 1: samples follow the motion; 0: samples stay at the state, because a callback raised an error along the motion
+    # 1: samples ahead follow the motion; 0: samples use the present q and v, because a callback failed along the motion
     SAMPLE_MOTION,
     BY_TIME,  # 1: forces may change suddenly with time
     BY_STATE,  # 1: forces may change suddenly with position or velocity; short steps also need samples along the motion

@@ -80,7 +80,7 @@ TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # every step updates the mean step size: weight of the previous mean
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # a trial succeeds if a second of motion cost at least this multiple before the trial
+MIN_GAIN = 1.2  # a trial succeeds if it divides the cost of a second of motion by at least this factor
 N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial
@@ -302,7 +302,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate rho and decide whether to try the other method; return the phase that begins with a trial, or -1."""
+    """Estimate rho and decide whether to try the other method; if so, return the phase that begins now, else -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)

@@ -118,7 +118,7 @@ WINDOW = 4  # number of states that a polynomial of dense output interpolates
     VELOCITIES,  # q and v in one polynomial and its derivative: a contains the noise of stiff modes
     ACCELERATIONS,  # q, v and a in one polynomial and its derivatives
     ACROSS,  # same as ACCELERATIONS, for a step across a singular position
-    JUMP,  # no polynomial: velocities jump within a few spacings of floating-point numbers
+    JUMP,  # no polynomial: the interval is a few spacings of floating-point numbers long, and velocities jump in it
 ) = range(5)
 # columns of the table of intervals, which has one row for each interval that contains output times. FIRST_OWN and
 # LAST_OWN: indices of the states at the ends of the interval. KIND: kind of the interval. FIRST_TIME and END_TIME - 1:

@@ -63,7 +63,7 @@ def step_views(memory, s, n):
 
 @inlined
 def rounding_errors_of(memory, s, n, tolerances):
-    """Return a view of the rounding errors in `memory`: (N_ROUNDING, n), or with step-size control empty, (0, n)."""
+    """Return a view of the rounding errors in `memory`, (N_ROUNDING, n), or (0, n) with step-size control."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + ROUNDING) * n, N_ROUNDING if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 

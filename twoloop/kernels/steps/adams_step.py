@@ -169,7 +169,7 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict_state(memory, h, k, old, new, state, q1, v1, n):
-    """Store the predicted state in q1 and v1, and the differences predicted by table `old` in the table `new`."""
+    """Predict the state (q1, v1) from the differences in the table `old`; store predicted differences in `new`."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
