@@ -20,14 +20,14 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.projection import consistent_state, dependence, project_sparsely
 
 SINGULAR = 1e-9  # singular values of the scaled Jacobian below this fraction of the largest count as zero
-PERTURBATION = 0.02  # relative to max(1, |q|): displacement at which the rank is determined a second time
-VELOCITY_CHANGE = 0.1  # relative to the largest velocity given: largest change that the joints may require
-ROUNDING = 8.0 * np.finfo(np.float64).eps  # relative to the sum of the absolute terms of a constraint
+PERTURBATION = 0.02  # displacement, relative to max(1, |q|), at which the rank is determined a second time
+VELOCITY_CHANGE = 0.1  # largest change that the joints may require, relative to the largest given velocity
+ROUNDING = 8.0 * np.finfo(np.float64).eps  # rounding error of a constraint, relative to the sum of its |terms|
 FULL_RANK_RCOND = 1e-12  # C_q C_q^T has full rank if its reciprocal condition number exceeds this
-DIFFERENCE_STEP = 1e-4  # relative to the scales of the coordinates: step of the central difference of C_q
-DRIVE_STEP = 0.05  # rad or m: continuation step towards the initial value of a drive
-NEWTON_ITERATIONS = 5  # per continuation step
-OPEN_TOLERANCE = 1e-7  # relative to the size of the model: a larger residual means that a joint does not close
+DIFFERENCE_STEP = 1e-4  # step of the central difference of C_q, relative to the scales of the coordinates
+DRIVE_STEP = 0.05  # continuation step, rad or m, towards the initial value of a drive
+NEWTON_ITERATIONS = 5  # largest number of iterations in a continuation step
+OPEN_TOLERANCE = 1e-7  # a joint does not close if its residual, relative to the size of the model, is larger
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,9 @@ def follow_drives(system: ConstrainedSystem, t: float, start: Array, keep: Seque
 def velocities(
     system: ConstrainedSystem, t: float, q: Array, given: Array, is_given: NDArray[np.bool_], coordinates: Sequence[str]
 ) -> Array:
-    """Return velocities that satisfy the constraints: those given, and for the others the least kinetic energy.
+    """Return velocities that satisfy the constraints, include the given ones, and have the least kinetic energy.
 
-    Raises ValueError if the velocities given, or those of the drives, violate the constraints.
+    Raises ValueError if the given velocities, or the velocities of the drives, violate the constraints.
     """
     if system.n_c + system.n_a == 0 or not (is_given.any() or system.rates(t, q).any()):
         return np.where(is_given, given, 0.0)
@@ -126,7 +126,7 @@ def velocities(
         )
     v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
     near = np.where(is_given, target, 0.0)
-    at_rest = np.where(np.abs(v - near) < ROUNDING * np.abs(v).max(), near, v)  # rounding errors removed
+    at_rest = np.where(np.abs(v - near) < ROUNDING * np.abs(v).max(), near, v)  # removes rounding errors
     rates = system.rates(t, q) / scales.rows
     terms = ROUNDING * (np.abs(scaled) @ np.abs(at_rest) + np.abs(rates))
     if (np.abs(scaled @ at_rest + rates) <= np.maximum(np.abs(scaled @ v + rates), terms)).all():
@@ -165,7 +165,7 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
 def _freedom_of_large(
     system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tuple[int, ...]]
 ) -> Freedom | None:
-    """Return the freedom of a large sparse system by its factors; None if the dense test is needed."""
+    """Return the freedom of a large sparse system, from sparse factors; None if the dense test is needed."""
     rows_here = dependence(system, t, q)
     if rows_here is None:
         return None
@@ -183,7 +183,7 @@ def _freedom_of_large(
     groups: list[set[str]] = []
     for row, share in rows_here.coefficients.items():
         involved = [row, *np.flatnonzero(np.abs(share) > 1e-6 * np.abs(share).max()).tolist()]
-        joined = {of_row[k] for k in involved if k in of_row}  # rows of Euler parameters belong to no joint
+        joined = {of_row[k] for k in involved if k in of_row}  # rows e.e = 1 of Euler parameters belong to no joint
         joined = joined.union(*(group for group in groups if group & joined))
         groups = [group for group in groups if not group & joined] + [joined]
     redundant = tuple(tuple(name for name in rows if name in group) for group in groups)
@@ -224,7 +224,7 @@ def _has_full_rank_sparse(system: ConstrainedSystem, t: float, q: Array) -> bool
 
 
 def _has_full_rank(scaled: Array) -> bool:
-    """Return True if the rows certainly have full rank; much cheaper than the rank itself."""
+    """Return True if the rows certainly have full rank; this test is much cheaper than the rank itself."""
     if len(scaled) > scaled.shape[1]:
         return False
     square = scaled @ scaled.T
@@ -253,7 +253,7 @@ def _redundant(
     return tuple(tuple(name for name in rows if name in group) for group in groups)
 
 
-MOVED = 1e-6  # relative to the largest coordinate: smaller displacements are not reported
+MOVED = 1e-6  # smallest displacement that is reported, relative to the largest coordinate
 ROUNDED = 0.01  # relative tolerance of the triangle inequality, for moments of inertia rounded to a few digits
 TURN = 2.0 * np.pi
 
@@ -269,7 +269,7 @@ def note_of(
 ) -> str:
     """Return remarks on degrees of freedom, redundant rows and possible mistakes.
 
-    The coordinates are those given, those with all joints closed, and those with the drives at their initial values.
+    `given`, `closed`, `start`: given coordinates; with all joints closed; with drives at their initial values, too.
     """
     remarks = [*_freedom(freedom), *_moved(given, closed, coordinates), *_forgotten(model)]
     remarks += (*_inertias(model, tables), *_turns(model, tables, start))

@@ -1,7 +1,7 @@
 """Evaluate the callbacks of models, in the plane and in space alike, from their parameters (see `parameter_layout`).
 
-In space the first rows are e.e = 1 for each body, followed by those of the joints, and the mass matrix has rank 6 of 7
-for each body, because 4 G^T J G has rank 3.
+In space the rows e.e = 1 of the bodies come before the rows of the joints, and the block of each body in the mass
+matrix, 7 by 7, has rank 6, because 4 G^T J G has rank 3.
 """
 
 import math
@@ -56,7 +56,7 @@ def driven_direction(p, at, results, first_result):
 
 @merged
 def direction(q, p, w, kind, i, at, results, first_result):
-    """Return the direction of body i of a row that has one, in its axes and in space."""
+    """Return the direction of body i in a row that has one, in the axes of the body and in space."""
     if kind == layout.ANGLE_DRIVE:
         a, _, _ = driven_direction(p, at, results, first_result)
         return a, vector(q, w, i, a)
@@ -68,10 +68,10 @@ def direction(q, p, w, kind, i, at, results, first_result):
 
 @merged
 def put_row(q, v, p, w, results, k, C, Cq, Qd, first, c_i, c_j):
-    """Evaluate row k of the table of joints in those of C, C_q and gamma that are not None.
+    """Evaluate row k of the table of joints: its entries of C, C_q and gamma, except arrays that are None.
 
-    Most rows are n . d = m: n is a direction of body i, d the vector from a point of i to one of j, or a direction of
-    j, and m the motion. `first`: the row in C_q; c_i and c_j: the columns where the coordinates of the bodies begin.
+    Most rows are n . d = m: n is a direction of body i; d a vector from a point of i to a point of j, or a direction of
+    j; m the motion. `first`: the row in C_q; c_i and c_j: the columns where the coordinates of the bodies begin.
     """
     kind, row, i, at_i, j, at_j, more, motion = joint_at(p, k)
     if kind == layout.RATE_FUNCTION:
@@ -163,7 +163,7 @@ def put_row(q, v, p, w, results, k, C, Cq, Qd, first, c_i, c_j):
 
 @merged
 def put_rate(q, p, w, results, k, Ct):
-    """Evaluate C_t of joint row k, which only drives have."""
+    """Evaluate C_t of row k of the table of joints; it is nonzero only for drives."""
     kind, row, i, at_i, j, at_j, _, first_result = joint_at(p, k)
     if first_result >= 0 and kind == layout.ANGLE_DRIVE:
         _, rate, _ = driven_direction(p, at_i, results, first_result)
@@ -174,7 +174,7 @@ def put_rate(q, p, w, results, k, Ct):
 
 @helper
 def fill_rows(q, v, p, results, C, Cq, Ct, Qd):
-    """Evaluate those of C, C_q, C_t and gamma that are not None; `results`: those of the program of motions."""
+    """Evaluate C, C_q, C_t and gamma, except arrays that are None; `results`: results of the program of motions."""
     w = coordinates_of(p)
     if w != PLANAR:
         for body in range(n_bodies(p)):
@@ -196,7 +196,7 @@ def fill_rows(q, v, p, results, C, Cq, Ct, Qd):
 
 @helper
 def put_mass(q, p, body, M, first):
-    """Evaluate the diagonal block of M of a body in space, from row and column `first` on."""
+    """Evaluate the diagonal block of M for a body in space; the block begins at row and column `first`."""
     m, k = inertia_at(p, 7, body), 7 * body + 3
     e0, e1, e2, e3 = q[k], q[k + 1], q[k + 2], q[k + 3]
     columns = ((-e1, -e2, -e3), (e0, -e3, e2), (e3, e0, -e1), (-e2, e1, e0))  # columns of G
@@ -221,7 +221,7 @@ def fill_values(q, p, results, values):
             begin = put_entries(p, columns, results, first_result + 3, values, begin)
         elif kind != layout.RATE_FUNCTION:
             skipped, n_rows = 0, 1
-            if kind in (layout.ANGLE, layout.PERPENDICULAR, layout.ANGLE_DRIVE):  # these depend on rotations only
+            if kind in (layout.ANGLE, layout.PERPENDICULAR, layout.ANGLE_DRIVE):  # rows that depend on rotations only
                 skipped = w - (1 if w == PLANAR else 4)
             elif kind == layout.POINT:
                 n_rows = 2 if w == PLANAR else 3
@@ -235,7 +235,7 @@ def fill_values(q, p, results, values):
 
 @inlined
 def motion_results(t, q, v, p):
-    """Return the results of drives and of rows that are functions; p in their place if there are none."""
+    """Return the results of the program of motions (drives, and rows that are functions); p if there is no program."""
     place = int(p[p.size - layout.HEAD + layout.MOTION_PROGRAM])
     if place < 0:
         return p

@@ -44,15 +44,15 @@ class Pose:
     R: Array
 
     def then(self, inner: Pose) -> Pose:
-        """Return the pose, in the outer frame, of a frame given relative to this one."""
+        """Return the pose, in the outer frame, of a frame whose pose in this frame is `inner`."""
         return Pose(self.x + self.R @ inner.x, self.R @ inner.R)
 
     def point(self, place: Array) -> Array:
-        """Return a point of this frame in the outer one."""
+        """Transform a point from this frame to the outer frame."""
         return np.asarray(self.x + self.R @ place)
 
     def inverse(self) -> Pose:
-        """Return the pose of the outer frame in this one."""
+        """Return the pose of the outer frame in this frame."""
         return Pose(-self.R.T @ self.x, self.R.T)
 
 
@@ -66,13 +66,13 @@ class Lump:
     axes: Array | None = None
 
     def transformed(self, pose: Pose) -> Lump:
-        """Return the same mass in the frame in which `pose` is given."""
+        """Transform the mass from the frame with the pose `pose` to the outer frame."""
         axes = None if self.axes is None else pose.R @ self.axes
         return Lump(self.mass, pose.point(self.centre), pose.R @ self.J @ pose.R.T, axes)
 
 
 def combined(lumps: list[Lump]) -> Lump:
-    """Return the combination of several masses; without mass at the origin."""
+    """Return the combination of several masses; if the total mass is zero, its centre is the origin."""
     mass = sum(lump.mass for lump in lumps)
     if not mass > 0.0:
         return Lump(0.0, np.zeros(3), np.zeros((3, 3)))
@@ -87,10 +87,10 @@ def combined(lumps: list[Lump]) -> Lump:
 
 
 def principal_axes(J: Array, tolerance: float = 1e-15) -> Array:
-    """Return the principal axes (3, 3) of a tensor, as columns, by Jacobi's rotations of the largest product.
+    """Return the principal axes (3, 3) of a tensor, as columns, by Jacobi's rotations, each of the largest product.
 
     Products within a tolerance, relative to the largest entry, are left. Where moments are equal, axes are ambiguous,
-    and the forces of a medium depend on them: these are MuJoCo's, which begins with the axes of the body.
+    but forces of a medium depend on them: as in MuJoCo, the iteration begins with the axes of the body.
     """
     axes, pairs, least = np.eye(3), ((1, 2), (0, 2), (0, 1)), tolerance * float(np.abs(J).max())
     for _ in range(100):
@@ -124,7 +124,7 @@ def parsed(path: Path) -> Element:
     """
     try:
         root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the latter two: of encodings
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # wrong encodings raise the last two
         text = path.read_bytes().decode(errors="replace").strip("\ufeff")
         text = re.sub(r"<!--.*?-->|<\?.*?\?>", "", text, flags=re.DOTALL).strip()
         text = re.sub(r"&(?!#?\w+;)", "&amp;", text)
@@ -139,7 +139,7 @@ def parsed(path: Path) -> Element:
     return root
 
 
-# what is ignored, in the order of its effect on the motion: by the words that its name contains
+# ignored parts, in the order of their effect on the motion: words that the name of a part contains
 EFFECTS = (
     ("the mass of", "for the mass", "armature of", "align of"),
     ("equality", "joints of", "mimic of", "loop_joint", "constraint"),
@@ -152,7 +152,7 @@ EFFECTS = (
 
 
 def by_effect(ignored: list[str]) -> list[str]:
-    """Return what is ignored in the order of its effect on the motion, unknown things last."""
+    """Sort names of ignored parts by the effect on the motion; parts with an unknown effect come last."""
 
     def effect(what: str) -> int:
         known = (k for k, words in enumerate(EFFECTS) if any(word in what for word in words))
@@ -162,14 +162,14 @@ def by_effect(ignored: list[str]) -> list[str]:
 
 
 def record_ignored(path: str | os.PathLike[str], model: Any, ignored: list[str]) -> None:
-    """Record in the model what was ignored in its file, and warn the caller of the caller."""
+    """Record in the model which parts of its file were ignored, and warn the user, who called the reader."""
     model.ignored = tuple(by_effect(ignored))
     if ignored:
         warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(model.ignored)}", IgnoredWarning, stacklevel=3)
 
 
 def name_of(element: Element) -> str:
-    """Return an element as messages name it."""
+    """Return the name of an element for messages."""
     return f"{element.tag} {element.get('name')!r}" if element.get("name") else element.tag
 
 
@@ -256,7 +256,7 @@ def geom_lump(given: Mapping[str, str], what: str, degrees: bool, sequence: str)
             f"size of {what} must be {needed} positive numbers for a {kind}; given {given.get('size', '')!r}"
         )
     shell = given.get("shellinertia", "false") == "true" and kind in _SURFACES
-    volume, moments = (_SURFACES if shell else _VOLUMES)[kind](size)  # density is then mass per area
+    volume, moments = (_SURFACES if shell else _VOLUMES)[kind](size)  # of a shell, the area: density is mass per area
     mass = float(given["mass"]) if "mass" in given else float(given.get("density", DENSITY)) * volume
     return Lump(mass, np.zeros(3), mass * np.diag(moments), np.eye(3)).transformed(pose)
 
@@ -285,7 +285,7 @@ def _cylinder(size: Array) -> tuple[float, Array]:
 
 
 def _capsule(size: Array) -> tuple[float, Array]:
-    """Return those of a cylinder and two half balls, whose centres of mass are 3/8 of the radius from its ends."""
+    """Return volume and moments of a cylinder and two half balls, with centres 3/8 of the radius from its ends."""
     r, h = size[:2]
     whole, (across, _, along) = _cylinder(size)
     ball = 4.0 / 3.0 * np.pi * r**3
@@ -315,14 +315,14 @@ def _cylinder_surface(size: Array) -> tuple[float, Array]:
 
 
 def _capsule_surface(size: Array) -> tuple[float, Array]:
-    """Return those of a tube and two half spheres, whose centres are half of the radius from its ends."""
+    """Return area and moments of a tube and two half spheres, with centres half of the radius from its ends."""
     r, h = (float(x) for x in size[:2])
     ends = 4.0 * np.pi * r * r, (r * r / 3.0, r * r / 3.0, r * r / 3.0 + h * h + h * r)
     return _surface((4.0 * np.pi * r * h, (0.5 * r * r, 0.5 * r * r, h * h / 3.0)), ends)
 
 
 def _ellipsoid_surface(size: Array) -> tuple[float, Array]:
-    """Return those that MuJoCo takes: Thomsen's area, which is within 1.1 %, and the moments of a layer of 1 um."""
+    """Return area and moments as in MuJoCo: Thomsen's area (error up to 1.1 %), and the moments of a layer of 1 um."""
     inner, outer = (_ellipsoid(size[:3] + layer) for layer in (0.0, 1e-6))
     moments = (outer[0] * outer[1] - inner[0] * inner[1]) / (outer[0] - inner[0])
     powers = (size[:3].prod() / size[:3]) ** 1.6075
@@ -346,8 +346,8 @@ SAME = 1e-9  # tolerance of directions, and of positions in m
 class FileJoint:
     """A joint of MJCF or URDF: kind (hinge, slide, ball, free), position and axis in space, and other attributes.
 
-    `position` and `rate` are those of the start, from the reference pose of the file: numbers of a hinge or slide, a
-    rotation matrix and an angular velocity in body axes of a ball, a pose and both velocities of a free joint.
+    `position` (from the reference pose of the file) and `rate`, at the start: numbers for a hinge or slide; a rotation
+    matrix and an angular velocity in body axes for a ball; a pose and both velocities for a free joint.
     """
 
     name: str
@@ -359,11 +359,11 @@ class FileJoint:
     rate: Any = None
     start_at: Array = field(default_factory=lambda: np.zeros(3))  # position and axis at the start
     start_axis: Array = field(default_factory=lambda: np.zeros(3))
-    joint: ModelJoint | None = None  # of the model; None: the body is free
+    joint: ModelJoint | None = None  # the joint in the model; None: the body is free
 
     @property
     def displacement(self) -> float:
-        """Return the angle or displacement at the start, from the reference pose."""
+        """Return the angle or displacement from the reference pose to the start."""
         return 0.0 if self.position is None else float(self.position)
 
 
@@ -396,7 +396,7 @@ def body_of(model: Any, part: Part | None) -> Body:
 
 
 def start_point(part: Part | None, point: Array) -> Array:
-    """Return a point of a part, given in the reference pose, at the start."""
+    """Return the position at the start of a point of a part; `point`: its position in the reference pose."""
     if part is None:
         return point
     assert part.start is not None
@@ -404,7 +404,7 @@ def start_point(part: Part | None, point: Array) -> Array:
 
 
 def start_pose(part: Part | None, pose: Pose) -> Pose:
-    """Return a frame of a part, given in the reference pose, at the start."""
+    """Return the pose at the start of a frame of a part; `pose`: its pose in the reference pose of the file."""
     if part is None:
         return pose
     assert part.start is not None
@@ -412,7 +412,7 @@ def start_pose(part: Part | None, pose: Pose) -> Pose:
 
 
 def place(part: Part) -> None:
-    """Compute the pose and the velocities of a part at the start from those of its parent."""
+    """Compute the pose and the velocities of a part at the start from the pose and the velocities of its parent."""
     still = Pose(np.zeros(3), np.eye(3))
     outer, moving = (still, still) if part.parent is None else (part.parent.pose, part.parent.start)
     assert moving is not None

@@ -21,8 +21,8 @@ from twoloop.bodies.parts import Body
 from twoloop.bodies.rotation_rates import rate_of_vector, spin_of
 from twoloop.bodies.tendons import smooth_size
 
-ROUNDED = 1e-8  # m/s and rad/s: below, |v| v is smooth, as equations have no branches; it changes by less than 1e-16
-LEAST_MOMENT = 1e-15  # kg m^2: bound of MuJoCo for what gives the square of an edge
+ROUNDED = 1e-8  # below this rate, m/s or rad/s, |v| v is smoothed without a branch; it changes by less than 1e-16
+LEAST_MOMENT = 1e-15  # kg m^2: MuJoCo's lower bound for the moment from which it computes an edge of the box
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Medium:
     wind: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def act(self, model: Any, body: Body, lump: Lump, names: list[str]) -> None:
-        """Add force and torque on a mass, which is given in the axes of a body; `names`: of force and torque."""
+        """Add force and torque on a mass given in the axes of a body; `names`: names of the force and the torque."""
         assert lump.axes is not None
         axes = lump.axes
         J = np.diag(axes.T @ lump.J @ axes)
@@ -53,7 +53,7 @@ class Medium:
 
 @dataclass(frozen=True, eq=False)
 class _Resistance:
-    """Evaluate the force against the velocity of a point of a body, or without a point the torque against its spin."""
+    """Evaluate the force against the velocity of a body's point or, if `point` is None, the torque against its spin."""
 
     body: Body
     axes: tuple[tuple[float, ...], ...]

@@ -39,7 +39,7 @@ FARTHEST = -math.cos(0.95 * math.pi)  # 0.95 of a turn
 
 @merged
 def value(p, more, results, first_result, i):
-    """Return a number of a force, or its function value if it is a function."""
+    """Return number i of a force, from p or, if the force is a function, from `results`."""
     if first_result >= 0:
         return results[first_result + i]
     return p[more + i]
@@ -47,7 +47,7 @@ def value(p, more, results, first_result, i):
 
 @merged
 def tension_of(length, rate, p, more, results, first_result):
-    """Return the force of a spring and damper, or its function value if it is a function."""
+    """Return the force of a spring and damper, from p or, if the force is a function, from `results`."""
     if first_result >= 0:
         return results[first_result]
     return p[more] * (length - p[more + 2]) + p[more + 1] * rate
@@ -65,8 +65,8 @@ def joint_force(kind, rate, p, more, results, first_result):
 def torsion(q, w, i, j, p, at_i, zero, stiffness, angle):
     """Return the torque of a spring on the rotation of body j about an axis (3 numbers in p) of body i, minus an angle.
 
-    In space the rotation is measured from the relative Euler parameters stored at `zero` in p. These are unique only
-    within one turn to either side, where the angle would jump; the torque is NaN shortly before.
+    In space the rotation is measured from the relative Euler parameters stored at `zero` in p. They determine the angle
+    only within one turn to either side, where it would jump; shortly before a whole turn, the torque becomes NaN.
     """
     if w == PLANAR:
         return stiffness * (angle_of(q, j) - angle_of(q, i) - angle)
@@ -83,7 +83,7 @@ def torsion(q, w, i, j, p, at_i, zero, stiffness, angle):
 
 @merged
 def slip(q, v, w, i, j, b, arm):
-    """Return a point of body j from the centre of body i, and its velocity as seen from body i."""
+    """Return the vector from the centre of body i to a point of body j, and this point's velocity seen from body i."""
     d = minus(plus(centre(q, w, j), arm), centre(q, w, i))
     velocity = plus(centre(v, w, j), rate_of(q, v, w, j, b, arm))
     return d, minus(velocity, plus(centre(v, w, i), cross(spin(q, v, w, i), d)))
@@ -97,7 +97,7 @@ def hinge_rate(q, v, w, i, j, n):
 
 @merged
 def ends(q, w, i, at_i, j, at_j, p):
-    """Return the points of a spring in the axes of their bodies, their arms in space, and their difference."""
+    """Return the ends of a spring in the axes of their bodies, their arms in space, and the vector between them."""
     a, b = numbers(p, w, at_i), numbers(p, w, at_j)
     arm_i, arm_j = vector(q, w, i, a), vector(q, w, j, b)
     return a, arm_i, b, arm_j, minus(plus(centre(q, w, j), arm_j), plus(centre(q, w, i), arm_i))
@@ -105,7 +105,7 @@ def ends(q, w, i, at_i, j, at_j, p):
 
 @merged
 def stretch_rate(q, v, w, i, a, arm_i, j, b, arm_j, d):
-    """Return d times the velocity of the point of body j relative to that of body i."""
+    """Return d times the velocity of the point of body j relative to the point of body i."""
     u_i = plus(centre(v, w, i), rate_of(q, v, w, i, a, arm_i))
     u_j = plus(centre(v, w, j), rate_of(q, v, w, j, b, arm_j))
     return dot(d, minus(u_j, u_i))
@@ -113,7 +113,7 @@ def stretch_rate(q, v, w, i, a, arm_i, j, b, arm_j, d):
 
 @merged
 def spring_length(q, v, p, k):
-    """Return the length, angle or displacement of a spring and its rate."""
+    """Return the length, angle or displacement of a spring, and its rate."""
     kind, i, at_i, j, at_j, more, _, point_i = force_at(p, k)
     w = coordinates_of(p)
     if kind == layout.TORSION_SPRING:
@@ -136,7 +136,7 @@ def has_spring_function(p, k):
 
 @merged
 def n_spring_functions(p):
-    """Return the number of such springs."""
+    """Return the number of springs whose force is a function of their length and rate."""
     n = 0
     for k in force_places(p):
         if has_spring_function(p, k):
@@ -158,7 +158,7 @@ def fill_spring_lengths(q, v, p, extended_q, extended_v):
 
 @inlined
 def force_results(t, q, v, p):
-    """Return the results of the functions that give forces; p in their place if there are none."""
+    """Return the results of the functions that give forces; p if there are no such functions."""
     place = int(p[p.size - layout.HEAD + layout.FORCE_PROGRAM])
     if place < 0:
         return p
@@ -183,7 +183,7 @@ def inertia(p, at, a):
 
 @merged
 def inertia_at(p, w, body):
-    """Return the index in p of mass and moments of a body; the components of gravity come before those of all."""
+    """Return the index in p of the mass and moments of a body; the masses follow the components of gravity."""
     if w == PLANAR:
         return 2 + layout.PLANAR_BODY * body
     return 3 + layout.SPATIAL_BODY * body
@@ -221,7 +221,7 @@ def put_forces(q, v, p, results, Q):
                 size = joint_force(kind, rate, p, more, results, first_result)
             twist_row(q, Q, w, j, times(size, n))
             twist_row(q, Q, w, i, times(-size, n))
-        elif kind in (layout.AXIAL_FORCE, layout.AXIAL_SPRING, layout.AXIAL_FRICTION):  # on both at the point of j
+        elif kind in (layout.AXIAL_FORCE, layout.AXIAL_SPRING, layout.AXIAL_FRICTION):  # on both bodies, at j's point
             _, n = axis(q, w, i, p, at_i)
             b = numbers(p, w, at_j)
             arm_j = vector(q, w, j, b)
@@ -250,7 +250,7 @@ def put_forces(q, v, p, results, Q):
 
 @helper
 def fill_force(q, v, p, results, Q):
-    """Evaluate Q; `results`: those of the program of forces."""
+    """Evaluate Q; `results`: results of the program of forces."""
     w = coordinates_of(p)
     for body in range(n_bodies(p)):
         m = inertia_at(p, w, body)

@@ -99,7 +99,7 @@ class Function:
     Attributes
     ----------
     name : str
-        Names the argument and its owner in messages.
+        Name of the argument and its owner, for messages.
     function : callable
     n_arguments : int
         1: t; 2: length and rate, see `SpringFunction`; 3: t, q and v.
@@ -177,7 +177,7 @@ def spring_function(name: str, given: Any) -> SpringFunction:
 
 
 def with_arguments(functions: Sequence[Any], n_q: int, q: Any, v: Any) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield functions with their parts of q and v, where lengths and rates of laws follow the first n_q, in order."""
+    """Yield each function with its q and v; lengths and rates for SpringFunctions follow the first n_q, in order."""
     index = n_q
     for each in functions:
         if isinstance(each, SpringFunction):
@@ -265,7 +265,7 @@ def is_constant(function: Function | RowFunction) -> bool:
 
 
 def n_arguments(name: str, function: Any, allowed: tuple[int, ...], called: str = "") -> int:
-    """Return how many arguments a function takes, of the numbers that are allowed; `called`: how it is called."""
+    """Return how many arguments a function takes: one of the `allowed` numbers; `called`: how it is called."""
     expected = called or " or ".join(ARGUMENTS[n] for n in allowed)
     try:
         parameters = inspect.signature(function).parameters.values()

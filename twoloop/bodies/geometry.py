@@ -1,10 +1,10 @@
 """Evaluate points, vectors and generalised forces of bodies, in the plane and in space: helpers of compiled callbacks.
 
-Vectors are tuples of three numbers; in the plane the third one is zero, and that of an axis is one. `w` is the number
+Vectors are tuples of three numbers; in the plane the third one is zero, or one for an axis. `w` is the number
 of coordinates of a body: 3 in the plane (x, y of the centre of mass and the angle), 7 in space (x, y, z and the Euler
-parameters, see `rotation`). A vector of a body is given twice: in the axes of the body, from which rates and gradients
-are computed in space, and in space, from which they are computed in the plane. Gradients are added to a row from column
-`c` on, where the coordinates of the body begin; it is -w for the ground.
+parameters, see `rotation`). A vector of a body is given twice: in the axes of the body (rates and gradients of bodies
+in space need it), and in space (rates and gradients in the plane need it). Gradients are added to a row from column `c`
+on, where the coordinates of the body begin; c is -w for the ground.
 """
 
 import math
@@ -16,9 +16,9 @@ from twoloop.bodies.rotation import half_spin, pulled, rotated, rotated_rate, tu
 from twoloop.kernels.compile.linking import HelperCompiler
 from twoloop.kernels.data.common import OPTIONS
 
-# Inlined by LLVM: a call with several arrays takes longer than most of these functions, and once it knows the number of
-# coordinates of a body in one place, it drops the branches of the other dimension. Floating-point operations keep
-# their order, so that the callbacks that share these functions give equal numbers.
+# LLVM inlines these functions: a call with several arrays takes longer than most of them, and where LLVM knows the
+# number of coordinates of a body, it drops the branches of the other dimension. Floating-point operations keep their
+# order, so that the callbacks that share these functions give equal numbers.
 _KEPT = {"fastmath": False, "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 merged = njit(**{**OPTIONS, **_KEPT, "pipeline_class": HelperCompiler})
 
@@ -107,7 +107,7 @@ def bias_of(v, w, body, a, arm):
 
 @merged
 def centre(q, w, body):
-    """Return the centre of mass, or its velocity from v."""
+    """Return the centre of mass; with v in place of q, its velocity."""
     if body < 0:
         return 0.0, 0.0, 0.0
     k = w * body
@@ -116,7 +116,7 @@ def centre(q, w, body):
 
 @merged
 def angle_of(q, body):
-    """Return the angle of a body in the plane, or its rate from v."""
+    """Return the angle of a body in the plane; with v in place of q, its rate."""
     if body < 0:
         return 0.0
     return q[3 * body + 2]
@@ -124,9 +124,9 @@ def angle_of(q, body):
 
 @merged
 def axis(q, w, body, p, at):
-    """Return a direction of a body in its axes and in space; in the plane p has its angle from the x axis.
+    """Return a direction of a body in its axes and in space; in the plane p contains its angle from the x axis.
 
-    A hinge in the plane has no numbers of a direction: its axis is perpendicular to the plane.
+    For a hinge in the plane, p contains no direction: its axis is perpendicular to the plane.
     """
     if w == PLANAR:
         if at < 0:
@@ -165,14 +165,14 @@ def turn_row(q, row, w, body, c, a, arm, f):
 
 @merged
 def push_row(q, row, w, body, c, a, arm, f):
-    """Add to a row the gradient of f . (point of a body), i.e. the generalised force of f there."""
+    """Add to a row the gradient of f . (point of a body), i.e. the generalised force of f at this point."""
     move_row(row, w, c, f)
     turn_row(q, row, w, body, c, a, arm, f)
 
 
 @merged
 def put_point_rows(q, rows, first, w, body, c, a, arm, sign):
-    """Store the derivatives of a point of a body, or minus these, in two or three rows."""
+    """Store the derivatives of a point of a body, times `sign`, in two or three rows."""
     if body < 0:
         return
     if w == PLANAR:

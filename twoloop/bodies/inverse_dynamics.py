@@ -1,4 +1,4 @@
-"""Find the forces of actuators that make a motion which drives prescribe elsewhere."""
+"""Find the forces of actuators that cause the same motion as drives in other joints."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
 
 SINGULAR = 1e-9  # singular values below this fraction of the largest count as zero
-CANNOT = 1e-6  # relative to the forces of the drives: what actuators may leave of them
+CANNOT = 1e-6  # largest part of the drives' forces, relative to them, that actuators may fail to replace
 
 
 def actuator_forces(
     system: ConstrainedSystem, result: Any, drives: Sequence[int], actuators: Sequence[JointCoordinate]
 ) -> Array:
-    """Return the forces of actuators (n, n_t) that have the effect of the drives, whose rows of C are given.
+    """Return the forces u of actuators (n, n_t) that have the same effect as the drives; `drives`: their rows of C.
 
-    On all motions that the other rows permit, both have the same power: N^T B^T u = -N^T G^T lam, where the columns of
-    N span these motions, and B and G are the gradients of the coordinates of the actuators and of the drives. NaN at
-    singular positions, where the actuators do not determine the motion.
+    In all motions that the other rows permit, actuators and drives have the same power: N^T B^T u = -N^T G^T lam. The
+    columns of N span these motions; B and G are the gradients of the coordinates of the actuators and of the drives.
+    At singular positions, where the actuators do not determine the motion, u is NaN.
     """
     forces = np.full((len(actuators), len(result.t)), np.nan)
     others = np.setdiff1d(np.arange(system.n_c + system.n_a), drives)

@@ -1,7 +1,7 @@
 """Assemble a model at given joint coordinates and rates.
 
-What is given becomes further rows. Of all states that satisfy these and the joints, the one is taken in which the other
-joints move least: in an open chain they do not move at all, in a loop they move as little as closing it takes.
+Given values become further rows. Of all states that satisfy these rows and the joints, the state is taken in which the
+other joints move least: they do not move at all in an open chain, and in a loop as little as closing the loop takes.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from twoloop.bodies.spanning_tree import SpanningTree
 from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
 
-STEP = 0.25  # rad, or of the size of the model: first continuation step towards the positions given
-LEAST_STEP = 1e-3  # of the way: shortest continuation step
-ITERATIONS, LAST_ITERATIONS = 8, 60  # of Newton's method in each continuation step, and in the last one
-LONGEST = 0.5  # rad, or of the size of the model: longest Newton step, shorter than from one branch to another
-CONVERGED = 1e-13  # relative: a shorter Newton step is rounding
+STEP = 0.25  # first continuation step towards the given positions, rad or in sizes of the model
+LEAST_STEP = 1e-3  # shortest continuation step, as a fraction of the whole way
+ITERATIONS, LAST_ITERATIONS = 8, 60  # largest numbers of Newton iterations: in a continuation step, in the last one
+LONGEST = 0.5  # longest Newton step, rad or in sizes of the model: shorter than the distance of two branches
+CONVERGED = 1e-13  # shorter Newton steps, rad or in sizes of the model, are rounding errors
 SINGULAR = 1e-9  # singular values below this fraction of the largest count as zero
-OFF = 1e-6  # relative: largest difference from a value given, of which six digits may come from a table
-MOVES = 1e-6  # rad, or of the size of the model: smaller displacements count as none
-STIFF = 1e3  # weight of displacements of the other joints against their changes in a Newton step
+OFF = 1e-6  # largest relative difference from a given value, which may be rounded to six digits
+MOVES = 1e-6  # displacements below this value, rad or in sizes of the model, count as zero
+STIFF = 1e3  # in a Newton step, weight of the other joints' displacements from the start, relative to their changes
 
 
 @dataclass(frozen=True)
 class Request:
     """Hold the values given for some coordinates of joints, and the coordinates that are not given."""
 
-    name: str  # of the model
+    name: str  # name of the model
     given: tuple[JointCoordinate, ...]
     values: Array
     others: tuple[JointCoordinate, ...]
-    joints: tuple[ModelJoint, ...]  # that are not drives
+    joints: tuple[ModelJoint, ...]  # all joints that are not drives
     turning: NDArray[np.bool_]  # which coordinates of bodies are rotations
 
     def scales(self, q: Array) -> tuple[Array, float]:
-        """Return the units of the coordinates of bodies, and the length among them."""
+        """Return the units of the bodies' coordinates: 1 for rotations, a length otherwise; also return the length."""
         places = np.abs(q[~self.turning]).max(initial=0.0)
         points = [np.abs((*each.point_a.values, *each.point_b.values)).max() for each in self.joints]
         length = float(max(places, *points, 1e-6)) if points else float(max(places, 1.0))
@@ -54,7 +54,7 @@ class Request:
 def positions(
     system: ConstrainedSystem, t: float, start: Array, request: Request, tree: SpanningTree, keep: Sequence[int]
 ) -> Array:
-    """Return the coordinates of the bodies at which the joints have the positions given.
+    """Return coordinates of the bodies for which the joints have the given positions.
 
     `start` closes all joints; the coordinates in `keep` do not change. Raises ValueError, with the name of a joint, if
     the joints do not permit the positions, or do not determine where the bodies are.
@@ -65,7 +65,7 @@ def positions(
     begin, others_begin = _positions(request.given, start), _positions(request.others, start)
 
     def solved(q: Array, target: Array, iterations: int) -> tuple[Array, float]:
-        """Return the coordinates after iterations of Newton's method, and how far they are from joints and targets."""
+        """Return the coordinates after Newton's method, and the largest residual of joints and of target values."""
         last = np.inf
         for _ in range(iterations):
             rows = np.vstack([system.jacobian(t, q), _gradients(request.given, q) / sizes[:, None]]) * columns
@@ -75,7 +75,7 @@ def positions(
             step *= min(1.0, LONGEST / max(float(np.abs(step).max()), LONGEST))
             q = q + columns * step
             size = float(np.abs(step).max())
-            if size < CONVERGED or (size < OFF and size > 0.5 * last):  # or rounding errors are left
+            if size < CONVERGED or (size < OFF and size > 0.5 * last):  # second case: only rounding errors are left
                 break
             last = size
         return q, max(_open(system, t, q) / max(1.0, length), _off(request, q, target, sizes))
@@ -85,7 +85,7 @@ def positions(
     if closes and _off(request, carried, request.values, sizes) <= OFF:
         start = carried
     chosen = [] if start is carried else _independent(system, t, start, request, columns)
-    if 0 < len(chosen) < len(request.given):  # along a straight way to all values they contradict each other
+    if 0 < len(chosen) < len(request.given):  # intermediate values on a straight way would contradict each other
         given = tuple(request.given[k] for k in chosen)
         start = positions(system, t, start, replace(request, given=given, values=request.values[chosen]), tree, keep)
         carried = start
@@ -97,12 +97,12 @@ def positions(
         new, left = solved(q, begin + to * (request.values - begin), ITERATIONS)
         if left <= OFF and np.abs((new - q) / units).max() <= LONGEST:
             q, done = new, to
-        else:  # perhaps towards another branch
+        else:  # the step is too long, and may lead to another branch
             part *= 0.5
     reached = [_positions(request.given, q)]
     if done == 1.0:
         q, _ = solved(q, request.values, LAST_ITERATIONS)
-    for _ in range(ITERATIONS):  # the joints close, also where a value given has six digits
+    for _ in range(ITERATIONS):  # close the joints exactly, even if given values have six digits only
         rows = system.jacobian(t, q) * columns
         q = q - columns * np.linalg.lstsq(rows, system.constraint(t, q), rcond=SINGULAR)[0]
     if not _off(request, q, request.values, sizes) <= OFF or not _open(system, t, q) <= OFF * max(1.0, length):
@@ -116,7 +116,7 @@ def positions(
 
 
 def _carried(start: Array, request: Request, tree: SpanningTree) -> Array:
-    """Return the coordinates after the joints of the tree have moved, each carrying what follows it."""
+    """Return the coordinates after each joint of the tree has moved, together with all bodies that follow it."""
     number = {key: k for k, key in enumerate(tree.keys)}
     pitches = {joint.name: joint.pitch for joint in request.joints if joint.kind == "screw"}
     step = np.zeros(len(tree.keys))
@@ -131,7 +131,7 @@ def _carried(start: Array, request: Request, tree: SpanningTree) -> Array:
 
 
 def _independent(system: ConstrainedSystem, t: float, q: Array, request: Request, columns: Array) -> list[int]:
-    """Return which of the coordinates given do not follow from those before them."""
+    """Return the indices of given coordinates that do not follow from the given coordinates before them."""
     free = null_space(system.jacobian(t, q) * columns, rcond=SINGULAR)
     rows = _gradients(request.given, q) * columns @ free
     chosen: list[int] = []
@@ -159,9 +159,9 @@ def velocities(
     is_given: NDArray[np.bool_],
     of_bodies: Callable[[int], str],
 ) -> Array:
-    """Return the velocities at which the joints have the rates given, and bodies the velocities given with them.
+    """Return velocities for which the joints have the given rates, and bodies their given velocities.
 
-    Raises ValueError, with the name of a joint or body, if the joints do not permit them, or do not determine all.
+    Raises ValueError, with the name of a joint or body, if the joints do not permit these, or leave some undetermined.
     """
     units, length = request.scales(q)
     sizes, other_sizes = (_sizes(each, length) for each in (request.given, request.others))
@@ -190,7 +190,7 @@ def velocities(
 
 
 def _not_reached(request: Request, reached: Array, off: Array, what: str) -> str:
-    """Return the message that names the joint whose value is farthest from the one given."""
+    """Return the message that names the joint whose value is farthest from its given value."""
     worst = int(np.argmax(off))
     unit = request.given[worst].unit + ("/s" if what == "rates" else "")
     name = request.given[worst].name if what == "positions" else f"rate of the {request.given[worst].name}"
@@ -209,7 +209,7 @@ def _names(request: Request, but: int) -> str:
 def _check_determined(
     request: Request, q: Array, rows: Array, units: Array, sizes: Array, moved: Array, what: str
 ) -> None:
-    """Raise if joints that had to move could have moved otherwise."""
+    """Raise if joints had to move, but could have moved differently."""
     free = null_space(rows, rcond=SINGULAR)
     free = free[:, np.abs(free * units[:, None]).max(axis=0) > 0.0] if free.size else free
     if not free.shape[1] or not (moved > MOVES).any():
@@ -225,7 +225,7 @@ def _check_determined(
 
 
 def _least(rows: Array, right: Array, motions: Array, back: Array) -> tuple[Array, float]:
-    """Solve rows x = right with the least motions x - (back, 0), and then the least x; return also the residual."""
+    """Solve rows x = right with the least |motions x - (back, 0)|, then the least |x|; also return the residual."""
     lengths = np.linalg.norm(rows, axis=1)
     weights = 1.0 / np.where(lengths > 0.0, lengths, 1.0)
     x = np.linalg.lstsq(rows * weights[:, None], right * weights, rcond=SINGULAR)[0]
@@ -246,13 +246,13 @@ def _positions(coordinates: Sequence[JointCoordinate], q: Array) -> Array:
 
 
 def _gradients(coordinates: Sequence[JointCoordinate], q: Array) -> Array:
-    """Return the derivatives of coordinates by those of the bodies, (n, n_q): their rates at unit velocities."""
+    """Return derivatives of joint coordinates by coordinates of bodies, (n, n_q): the rates for unit velocities."""
     unit = np.eye(len(q))
     return np.array([each.rate(q, unit) for each in coordinates]).reshape(len(coordinates), len(q))
 
 
 def _motions(request: Request, q: Array, length: float, stiff: float) -> Array:
-    """Return the rows whose squares are minimised: rates of the other coordinates, and all motions in joints."""
+    """Return the rows whose sum of squares is minimised: rates of the other coordinates, and motions in all joints."""
     n_q, unit = len(q), np.eye(len(q))
     rows = [stiff * _gradients(request.others, q) / _sizes(request.others, length)[:, None]]
     for joint in request.joints:

@@ -1,8 +1,8 @@
 """Close the loops of a model from rough poses, or name the loop that does not close and its gap.
 
-The joints of a spanning tree are closed by their coordinates, the others by least squares in these coordinates within
-their limits. Of several assemblies the nearest to the start is taken, in the coordinates of the joints: those are the
-angles and displacements that the joints have in the poses given. Poses that may mean another assembly are refused.
+The unknowns are the coordinates of the joints of a spanning tree, so that these joints are closed. A least-squares
+method closes the other joints, within the limits of the unknowns. Of several assemblies, the nearest to the given poses
+is taken, measured by angles and displacements of the joints. Poses that may mean another assembly are refused.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.projection import consistent_state
 
-ROUNDING = 8.0 * np.finfo(np.float64).eps  # relative to the sum of the absolute terms of a constraint
-OPEN_TOLERANCE = 1e-7  # relative to the size of the model: a larger residual means that a joint does not close
-CLOSED = 1e-15  # relative to the size of the model: residual at which the iteration stops
-ITERATIONS = 100  # of Levenberg and Marquardt's method; most closures take four to ten
+ROUNDING = 8.0 * np.finfo(np.float64).eps  # rounding error of a constraint, relative to the sum of its |terms|
+OPEN_TOLERANCE = 1e-7  # a joint does not close if its residual, relative to the size of the model, is larger
+CLOSED = 1e-15  # the iteration stops at this residual, relative to the size of the model
+ITERATIONS = 100  # largest number of steps of Levenberg and Marquardt's method; most closures take four to ten
 SINGULAR = 1e-9  # singular values below this fraction of the largest count as zero
-WEAK = 1e-4  # the same where rows are dependent on the constraints, and beside them only nearly so
-STATIONARY = 1e-8  # relative: smaller gradients of the residual count as zero
-SUFFICIENT, SLOW = 1e-4, 1e-4  # relative decrease of the squared residual: the least of a step, and a slow one
-MOST_DAMPING = 1e12
-LONGEST = 0.5  # rad, or of the size of the model: longest step, shorter than from one branch to another
-CERTAIN = 1e-3  # norm of the change of the coordinates of the joints, below which poses mean one assembly
-EQUALLY = 0.2  # relative: another assembly that is farther by less is about as near
-WAY_STEPS, WAY_STEP, ARRIVED = 40, 0.2, 1e-3  # rad, or of the size of the model: a way between two states
-RESTARTS_OF_ONE, MOST_RESTARTS, LEAST_RESTARTS = 60, 12, 2  # of one coordinate: restarts cost the time of many
-RESTART_SPREAD = 0.15  # rad, or of the size of the model: standard deviation, times 1, 2, ...
-TIE = 1e-3  # relative: gaps closer than this count as equal
+WEAK = 1e-4  # like SINGULAR, for rows that are dependent in closed states, but only nearly so beside them
+STATIONARY = 1e-8  # gradients of the residual below this fraction of their bound count as zero
+SUFFICIENT, SLOW = 1e-4, 1e-4  # smallest decrease of the squared residual, as a part of the expected one; slow decrease
+MOST_DAMPING = 1e12  # the iteration ends if no step with less damping decreases the residual
+LONGEST = 0.5  # longest step, rad or in sizes of the model: shorter than the distance of two branches
+CERTAIN = 1e-3  # poses surely mean the closed state if the norm of the change of joint coordinates is below this
+EQUALLY = 0.2  # another assembly is about as near if its distance is larger by at most this fraction
+WAY_STEPS, WAY_STEP, ARRIVED = 40, 0.2, 1e-3  # way between two states: steps, step size (rad, sizes of the model), end
+RESTARTS_OF_ONE, MOST_RESTARTS, LEAST_RESTARTS = 60, 12, 2  # RESTARTS_OF_ONE / (number of unknowns), within two limits
+RESTART_SPREAD = 0.15  # standard deviation of restarts 1, 2, ... over 1, 2, ..., rad or in sizes of the model
+TIE = 1e-3  # gaps count as equal if they differ by at most this fraction
 
 
 class LoopClosure:
-    """Close the loops of a model by the coordinates of joints along a spanning tree, nearest to the start in these.
+    """Close the loops of a model by the coordinates of the joints of a spanning tree, with small changes of these.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class LoopClosure:
     rows : mapping of str to tuple of int
         Numbers of the rows of each joint.
     bounds : mapping of JointCoordinate to (float, float)
-        Bounds of coordinates of joints. Those of joints that close loops become further residuals.
+        Bounds of coordinates of joints. For joints outside the tree, which close loops, they become further residuals.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class LoopClosure:
         self.sizes = np.where(self.sizes > 0.0, self.sizes, 1.0)
 
     def start(self, given: Mapping[JointCoordinate, float]) -> TreeState:
-        """Return the state of the joints nearest to the guess, or at values given for some, within the bounds."""
+        """Return the state of the joints nearest to the guess within the bounds, with the `given` coordinates."""
         state, number = self.tree.state(self.guess), {key: k for k, key in enumerate(self.tree.keys)}
         step = np.zeros(len(state.x))
         for each, value in given.items():
@@ -111,7 +111,7 @@ class LoopClosure:
         return values, slopes
 
     def off_guess(self, state: TreeState) -> tuple[Array, Array]:
-        """Return how far the bodies are from the guess, and the derivatives."""
+        """Return the deviations of the bodies from the guess, and their derivatives by the coordinates of the tree."""
         q = self.tree.place(state, self.guess)
         return (q - self.guess) / self.of_bodies, self.tree.tangent(q) * self.units / self.of_bodies[:, None]
 
@@ -122,8 +122,8 @@ class LoopClosure:
     def least(self, evaluate: Callable[[TreeState], tuple[Array, Array]], state: TreeState) -> tuple[TreeState, float]:
         """Return the state after Levenberg and Marquardt's method within the bounds, and the largest residual.
 
-        Steps are the shortest ones of the coordinates, so that rows that depend on others, and freedoms, do no harm.
-        The damping goes with the square of the residual (Kanzow, Yamashita, Fukushima, J. Comput. Appl. Math., 2004).
+        Each step is the shortest of all equivalent steps, so that dependent rows and degrees of freedom do no harm. The
+        damping is proportional to the squared residual (Kanzow, Yamashita, Fukushima, J. Comput. Appl. Math., 2004).
         """
         values, slopes = evaluate(state)
         square, factor = float(values @ values), 1.0
@@ -226,9 +226,9 @@ def positions(
 ) -> Array:
     """Return positions that close all joints, nearest to rough poses in the coordinates of joints.
 
-    The system has no drives. Where the loops do not close from the poses, they start from the values given for some
-    coordinates of joints. Raises ValueError if a loop does not close (the message names its
-    joints and the gap), or if it is not clear which of two assemblies the poses mean.
+    The system has no drives. If the loops do not close from the poses, the iteration starts again from the values
+    `given` for some coordinates of joints. Raises ValueError if a loop does not close (the message names its joints and
+    the gap), or if it is not clear which of two assemblies the poses mean.
     """
     if system.n_c == 0 or _is_closed_to_rounding(system, t, guess, tree):
         return guess
@@ -263,13 +263,13 @@ def _is_closed_to_rounding(system: ConstrainedSystem, t: float, q: Array, tree: 
 
 
 def _nearest_assembly(closure: LoopClosure, start: TreeState) -> tuple[TreeState, float]:
-    """Return the closed state nearest to the start and its misfit; if there is none, the one with the least misfit.
+    """Return the closed state nearest to the start, and its misfit; without a closed state, the least misfit's state.
 
-    Two more starts check which assembly is meant: one as far on the other side, and the one that fits the positions of
-    the bodies as well as their angles. Raises ValueError if they lead to another assembly that is about as near.
+    Two more starts check which assembly is meant: the mirror image of the closed state about the start, and the best
+    fit to the bodies' positions and angles. Raises ValueError if they lead to another assembly that is about as near.
     """
     best, misfit = closure.closed(start)
-    found: list[tuple[TreeState, bool]] = []  # with whether it counts at any distance
+    found: list[tuple[TreeState, bool]] = []  # closed states, and whether each counts at any distance
     starts: Iterable[tuple[TreeState, bool]]
     if closure.is_closed(best, misfit):
         if closure.distance(best, start) <= CERTAIN:
@@ -328,7 +328,7 @@ def _open_loop_message(closure: LoopClosure, state: TreeState) -> str:
         for each, (low, high) in closure.beside.items():
             if not low - OPEN_TOLERANCE <= each.position(q) <= high + OPEN_TOLERANCE:
                 return f"{head}the loops close, but not with the {each.name} from {low:.6g} to {high:.6g} {each.unit}"
-    # the first of equal gaps, so that the message does not depend on rounding
+    # name the first of equal gaps, so that the message does not depend on rounding
     worst = next(joint for joint in tree.closing if sizes[joint.name] >= (1.0 - TIE) * max(sizes.values()))
     gap = " and ".join(
         f"{size:.3g} {unit}" for unit, size in gaps[worst.name].items() if size > TIE * sizes[worst.name]

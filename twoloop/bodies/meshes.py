@@ -1,6 +1,6 @@
 """Read triangle meshes (STL, OBJ, MSH, vertices in the file) and compute their masses.
 
-A mesh is taken as MuJoCo does: vertices without faces are those of their convex hull.
+As in MuJoCo, vertices without faces stand for their convex hull.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from twoloop.bodies.file_parts import Lump, Pose, numbers, pose_of, principal_axes
 from twoloop.checks.arguments import Array
 
-PRODUCTS = 1e-7  # products of inertia, relative to the largest entry, that MuJoCo neglects in the frame of a mesh
+PRODUCTS = 1e-7  # MuJoCo neglects products of inertia up to this fraction of the largest entry in a mesh's frame
 STL_HEAD, MSH_HEAD = 84, 16  # bytes before the triangles of an STL file, and before the numbers of an MSH file
 
 
@@ -49,9 +49,9 @@ def mesh_triangles(given: Mapping[str, str], folder: Path, what: str) -> Array |
 def mesh_lump(triangles: Array, inertia: str) -> Lump:
     """Return the mass of density 1 within triangles, or on them with the inertia "shell".
 
-    "legacy": as MuJoCo does by default, the pyramids from the centroid of the surface to the triangles are added up
-    with positive volumes, which is exact for convex meshes; mass and inertia are then those of the pyramids from the
-    centre so found.
+    "legacy", MuJoCo's default: pyramids from the centroid of the surface to the triangles are added up with positive
+    volumes, which is exact for convex meshes and yields the centre; mass and inertia are sums over pyramids from this
+    centre.
     """
     areas = 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
     origin, shell = (areas @ triangles.mean(axis=1)) / areas.sum(), inertia == "shell"
@@ -62,8 +62,8 @@ def mesh_lump(triangles: Array, inertia: str) -> Lump:
         volume, sums = float(volumes.sum()), corners.sum(axis=1)
         if not volume > 0.0:
             return Lump(0.0, np.zeros(3), np.zeros((3, 3)))
-        # integral of x x^T over a tetrahedron with a corner at the origin: volume / 20 (sum of c c^T + s s^T); over a
-        # triangle: area / 12 of the same
+        # integral of x x^T, with corners c and their sum s: volume / 20 (sum of c c^T + s s^T) over a tetrahedron with
+        # a corner at the origin; area / 12 (sum of c c^T + s s^T) over a triangle
         second = np.einsum("i,ijk,ijl->kl", volumes, corners, corners) + np.einsum("i,ik,il->kl", volumes, sums, sums)
         if not (repeated or shell):
             origin = origin + volumes @ sums / (4.0 * volume)
@@ -117,7 +117,7 @@ def _hull(vertices: Array) -> Array | None:
 
 
 def _stl(path: Path) -> tuple[Array, Any] | None:
-    """Read a binary STL file; text is not read by MuJoCo either."""
+    """Read a binary STL file; like MuJoCo, do not read STL files in text form."""
     data = path.read_bytes()
     n = int.from_bytes(data[STL_HEAD - 4 : STL_HEAD], "little") if len(data) >= STL_HEAD else 0
     if n == 0 or len(data) < STL_HEAD + 50 * n:
@@ -163,7 +163,7 @@ def _triangles(points: Array) -> list[list[int]]:
 
 
 def _msh(path: Path) -> tuple[Array, Any] | None:
-    """Read MuJoCo's own format: numbers of vertices, normals, texture coordinates and faces, then these."""
+    """Read MuJoCo's own format: the numbers of vertices, normals, texture coordinates and faces, then their values."""
     data = path.read_bytes()
     if len(data) < MSH_HEAD:
         return None

@@ -35,15 +35,15 @@ IMMEDIATE = 1e-15  # s, least time constant of MuJoCo: an activation without del
 
 
 def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
-    """Merge an actuator into its defaults, which all kinds share, and return it as a general one.
+    """Merge an actuator into its defaults, which all kinds share, and return it as a "general" actuator.
 
-    Its force is gain * command + bias_0 + bias_1 * length + bias_2 * velocity, where `gainprm` and `biasprm` count as
-    far as `gaintype` and `biastype` say; a positive bias_2 is a damping ratio.
+    The force is gain * command + bias_0 + bias_1 * length + bias_2 * velocity; `gaintype` and `biastype` tell which
+    numbers of `gainprm` and `biasprm` count. A positive bias_2 is a damping ratio.
     """
     law = {**inherited, **own}
     gain, bias = (_padded(key, inherited, own, default) for key, default in (("gainprm", "1"), ("biasprm", "0")))
     types = {"gaintype": "fixed", "biastype": "none", "dyntype": "none"}
-    stored = law.get(tag, "1 1 0 0 0" if tag == "cylinder" else "1 0 0")  # what defaults give this kind
+    stored = law.get(tag, "1 1 0 0 0" if tag == "cylinder" else "1 0 0")  # the parameters of this kind in the defaults
     first, last, constant, *more = (float(x) for x in stored.split())
     if tag == "general":
         types = {key: law.get(key, default) for key, default in types.items()}
@@ -79,21 +79,21 @@ def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str])
 
 
 def _padded(key: str, inherited: Mapping[str, str], own: Mapping[str, str], default: str) -> Array:
-    """Return three parameters, of which those that an element does not give are inherited."""
+    """Return three parameters of an element; it inherits the parameters that it does not give."""
     values, rest = ([float(x) for x in each.split()] for each in (own.get(key, ""), inherited.get(key, default)))
     return np.array([*values, *rest[len(values) :], 0.0, 0.0, 0.0][:3])
 
 
 class TendonsAndActuators:
-    """Add to a model the tendons and actuators of a file, by the reader of the file."""
+    """Add to a model the tendons and actuators of a file; `reader`: the reader of the file."""
 
     def __init__(self, reader: Any):
         self.reader, self.model, self.ignored = reader, reader.model, reader.ignored
         self.commands: dict[str, Any] = dict(reader.commands)
-        self.activations: dict[str, float] = {}  # at the start, where they are not zero
+        self.activations: dict[str, float] = {}  # activations at the start that are not zero
         self.inertia: Array | None = None  # mass matrix of the tree in the reference pose
-        self.tendons: dict[str, tuple[Any, float]] = {}  # with their lengths in the reference pose
-        self.ranges: dict[str, str] = {}  # of tendons
+        self.tendons: dict[str, tuple[Any, float]] = {}  # tendons, and their lengths in the reference pose
+        self.ranges: dict[str, str] = {}  # ranges of the lengths of tendons
         self.carriers: dict[str, list[tuple[Part | None, Array]]] = {}  # points of a path, in the reference pose
 
     def _of(self, part: Part | None) -> Body:
@@ -103,7 +103,7 @@ class TendonsAndActuators:
         return float(np.pi / 180.0) if self.reader.compiler(joint.attributes).degrees and joint.kind == "hinge" else 1.0
 
     def _inertia(self, joints: list[FileJoint], factors: list[float]) -> float:
-        """Return the inertia behind a combination of joints in the reference pose while all joints are free."""
+        """Return the effective inertia for a combination of joints, in the reference pose, with all joints free."""
         if self.inertia is None:
             self.inertia = tree_inertia(self.reader.parts, self.reader.ordered)
             for element in (each for group in self.reader.root.findall("actuator") for each in group):
@@ -171,7 +171,7 @@ class TendonsAndActuators:
         tendon.pull(self.model, SpringTension(stiffness, damping, rest[0], rest[-1]), tendon.joint)
 
     def _combination(self, name: str | None, pairs: list[Any]) -> tuple[Tendon | None, float]:
-        """Return a fixed tendon, and its length in the reference pose; None if one of its joints has no coordinate."""
+        """Return a tendon of kind "fixed", and its reference length; None if one of its joints has no coordinate."""
         if not pairs or not all(joint is not None and is_single(joint) for joint, _ in pairs):
             return None, 0.0
         parts = tuple((self.model.joint_coordinate(joint.joint), factor) for joint, factor in pairs)
@@ -182,7 +182,7 @@ class TendonsAndActuators:
         return Tendon(*head, parts, tuple(joint.joint for joint, _ in pairs), constant), reference
 
     def _path(self, element: Element) -> tuple[SitePath | None, float]:
-        """Return a spatial tendon, and its length in the reference pose; None if it winds about geoms."""
+        """Return a tendon of kind "spatial", and its length in the reference pose; None if it winds about geoms."""
         if any(each.tag not in ("site", "pulley") for each in element):
             return None, 0.0
         points: list[tuple[Body, Array]] = []
@@ -205,7 +205,7 @@ class TendonsAndActuators:
         return SitePath(name, "displacement", *ends, tuple(points), tuple(weights)), reference
 
     def _unstressed(self, tendon: Tendon | SitePath) -> float:
-        """Return the length of a tendon where its joints are at their springref."""
+        """Return the length that a tendon has when each of its joints is at its springref."""
         if isinstance(tendon, Tendon):
             rests = [self._unit(each) * float(each.attributes.get("springref", 0.0)) for each in self._joints(tendon)]
             return float(sum(factor * rest for (_, factor), rest in zip(tendon.parts, rests, strict=True)))
@@ -232,7 +232,7 @@ class TendonsAndActuators:
         return self._unit(joint) * float(joint.attributes.get("ref", 0.0))
 
     def _passive(self, element: Element) -> None:
-        """Add armature and damping of an actuator, which act also without commands."""
+        """Add the armature and damping of an actuator, which also act without commands."""
         given = self.reader.attributes(element, "main")
         inertia, damping = float(given.get("armature", 0.0)), trimmed(given.get("damping", "0"))
         if not inertia and not any(damping):
@@ -311,7 +311,7 @@ class TendonsAndActuators:
             return
         zero = self._reference(joint) + joint.displacement  # qpos at the start
         servo = k > 0.0 and gain[0] == -bias[1] and not bias[0] and not callable(command)
-        if servo:  # the command is where the spring has no force
+        if servo:  # the command is the position at which the spring has no force
             self._law(joint, k, c, command / gear[0] - zero, own_name)
             return
         if k or c:
@@ -321,7 +321,7 @@ class TendonsAndActuators:
         self.model.motor(joint.joint, torque, name=own_name)
 
     def _target(self, given: dict[str, str], gear: float) -> Tendon | SitePath | None:
-        """Return the joint or tendon on which an actuator acts, as a tendon whose length and rate it feels."""
+        """Return the joint or tendon on which an actuator acts, as a tendon with the actuator's length and rate."""
         if "tendon" in given:
             tendon, _ = self.tendons.get(given["tendon"], (None, 0.0))
             if isinstance(tendon, SitePath):
@@ -353,11 +353,11 @@ class TendonsAndActuators:
         return float(low), float(high)
 
     def _limits_of_force(self, joint: FileJoint, gear: float) -> tuple[float, float] | None:
-        """Return the limits that a joint sets to the force of its only actuator, or None."""
+        """Return the limits that a joint sets for the force of its only actuator, or None."""
         if not gear or not self._has_limited_force(joint):
             return None
         elements = [each for group in self.reader.root.findall("actuator") for each in group]
-        if sum(self._may_act_on(joint, self.reader.attributes(each, "main")) for each in elements) > 1:  # of their sum
+        if sum(self._may_act_on(joint, self.reader.attributes(each, "main")) for each in elements) > 1:  # of a sum
             self.ignored.append(f"actuatorfrcrange of joint {joint.name!r}")
             return None
         ends = numbers(joint.attributes["actuatorfrcrange"], 2, f"actuatorfrcrange of joint {joint.name!r}") / gear
@@ -378,7 +378,7 @@ class TendonsAndActuators:
     ) -> None:
         """Add an actuator whose force and torque have fixed components: at a site, at a ball, or at a free joint.
 
-        They are in the frame of the site; of the body, or of its parent, for torques of joints; of space for forces.
+        Components refer to the axes of the site; of the body or its parent for torques of joints; of space for forces.
         """
         ends: list[tuple[Part, float]] = []
         if joint is None:
@@ -463,7 +463,7 @@ class Limited:
 def activated(command: float, start: float, constant: float | None, span: tuple[float, float] | None) -> Any:
     """Return the activation x of a constant command u from t = 0: T x' = u - x, or x' = u without a time constant T.
 
-    It is a number where it does not change.
+    If x is constant, return a number.
     """
     if command == (0.0 if constant is None else start):
         return start
@@ -489,7 +489,7 @@ class _Activation:
 
 @dataclass(frozen=True, eq=False)
 class ActuatorTension:
-    """Evaluate minus the force of an actuator, whose gain and bias are linear in its length and rate."""
+    """Evaluate the negative force of an actuator whose gain and bias are linear in its length and rate."""
 
     command: Any
     gain: tuple[float, ...]
@@ -506,7 +506,7 @@ class ActuatorTension:
 
 @dataclass(frozen=True, eq=False)
 class SiteForce:
-    """Evaluate a force or torque with constant direction in the axes of a body, without length and rate."""
+    """Evaluate a force or torque with constant components in the axes of a body, of an actuator without a length."""
 
     body: Body
     components: tuple[float, ...]
@@ -519,24 +519,24 @@ class SiteForce:
 
 
 def is_single(joint: FileJoint) -> bool:
-    """Return True if a hinge or slide is a joint of its own in the model."""
+    """Return True if a hinge or slide of the file is a separate joint in the model."""
     return joint.joint is not None and joint.joint.kind in ("revolute", "prismatic")
 
 
 def activation_of(element: Element, law: Mapping[str, str]) -> str:
-    """Return the kind of activation of an actuator, "other" where it may have several."""
+    """Return the kind of activation of an actuator, or "other" if it may have several activations."""
     if element.tag not in (*SUPPORTED, "adhesion"):
         return "muscle" if element.tag == "muscle" else "other"
     return law["dyntype"]
 
 
 def _gear(given: Mapping[str, str]) -> float:
-    """Return the gear of an actuator of a joint or tendon."""
+    """Return the gear ratio of an actuator that acts on a joint or tendon."""
     return float(given.get("gear", "1").split()[0])
 
 
 def trimmed(text: str) -> list[float]:
-    """Return the coefficients of a polynomial, without zeros at its end but for the first."""
+    """Return the coefficients of a polynomial without zeros at the end; the first coefficient always remains."""
     values = [float(x) for x in text.split()] or [0.0]
     while len(values) > 1 and not values[-1]:
         values.pop()

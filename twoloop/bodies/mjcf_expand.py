@@ -13,7 +13,7 @@ import numpy as np
 from twoloop.bodies.file_parts import numbers, parsed, pose_of, root_of, text_of
 from twoloop.bodies.rotation import euler_parameters
 
-DEEPEST = 30  # files within files: more are taken for a cycle
+DEEPEST = 30  # deeper levels of files within files count as a cycle
 MODEL = "model attached"  # attribute of elements of attached models; no file has one with a space
 REFERENCES = {  # attributes by which elements refer to others
     **dict.fromkeys(("joint", "joint1", "joint2", "jointinparent"), "joint"),
@@ -24,31 +24,31 @@ REFERENCES = {  # attributes by which elements refer to others
     **dict.fromkeys(("class", "childclass"), "class"),
     "mesh": "mesh",
 }
-OF_MODEL = ("class", "mesh")  # kinds that attached parts of the same model share
+OF_MODEL = ("class", "mesh")  # kinds of elements that all attached parts of a model share
 KINDS = {"freejoint": "joint", "spatial": "tendon", "fixed": "tendon"}
 UNATTACHED = {"compiler", "option", "size", "visual", "statistic", "custom", "keyframe", "worldbody", "extension"}
 
 
 @dataclass(frozen=True)
 class Compiler:
-    """Settings of the compiler for the elements of a model, which hold also where it is attached to another."""
+    """Settings of MuJoCo's compiler for the elements of a model; they also hold where it is attached."""
 
     degrees: bool
     sequence: str
     from_geoms: str
     groups: range
-    folder: Path  # of meshes
+    folder: Path  # folder of the meshes
     strip: bool
-    automatic: bool  # limits
+    automatic: bool  # whether a range implies limits
     by_box: bool
     least_mass: float
     least_moment: float
     balance: bool
-    align: bool  # free bodies without children with their principal axes
+    align: bool  # whether frames of free bodies without children are aligned with the principal axes
 
 
 def compiler_of(root: Element, folder: Path) -> Compiler:
-    """Return the settings of the compiler, of which the last ones hold."""
+    """Return the settings of the compiler; if a file repeats a setting, the last one holds."""
     given = {key: value for each in root.findall("compiler") for key, value in each.attrib.items()}
     if given.get("coordinate", "local") != "local":
         raise ValueError("coordinates of an MJCF file must be local; global ones were dropped by MuJoCo in 2.3.4")
@@ -90,7 +90,7 @@ def expanded(path: str | os.PathLike[str], depth: int = 0) -> tuple[Element, dic
 
 
 def _attach(root: Element, element: Element, folder: Path, compilers: dict[str, Compiler], depth: int) -> None:
-    """Replace the attached models below an element by frames, and copy what acts on them."""
+    """Replace the models attached below an element by frames, and copy the elements that act on them."""
     children: list[Element] = []
     for child in element:
         if child.tag != "attach":
@@ -122,7 +122,7 @@ def _attach(root: Element, element: Element, folder: Path, compilers: dict[str, 
 
 
 def _file_of(root: Element, name: str, folder: Path) -> Path:
-    """Return the file of a model that is attached."""
+    """Return the path of the file of an attached model."""
     for each in root.findall("asset/model"):
         path = folder / each.get("file", "")
         if name == each.get("name") or ("name" not in each.attrib and name == root_of(path, "mujoco").get("model")):
@@ -131,7 +131,7 @@ def _file_of(root: Element, name: str, folder: Path) -> Path:
 
 
 def _part(source: Element, attach: Element) -> Element:
-    """Return a frame with a copy of the body or frame that is attached, or of all bodies, and with its class."""
+    """Return a frame that contains a copy of the attached body or frame, or of all bodies, and has its class."""
     for kind in ("body", "frame"):
         if kind in attach.attrib:
             found = [_found(world, kind, attach.attrib[kind], "main") for world in source.findall("worldbody")]
@@ -148,7 +148,7 @@ def _part(source: Element, attach: Element) -> Element:
 
 
 def _found(element: Element, tag: str, name: str, childclass: str) -> tuple[Element, str] | None:
-    """Return an element below another one with the class that it inherits, or None."""
+    """Find an element below another element; return it and the class that it inherits, or None."""
     for each in element:
         if each.tag == tag and each.get("name") == name:
             return each, childclass
@@ -159,7 +159,7 @@ def _found(element: Element, tag: str, name: str, childclass: str) -> tuple[Elem
 
 
 def _prefix(element: Element, prefix: str, other: bool) -> None:
-    """Prefix the names in an element; of those that belong to a model if it is another one."""
+    """Prefix the names in an element; names that belong to a model, only if this is another model (`other`)."""
     if element.tag in ("tendon", "equality", "actuator", "asset") and other:
         for each in element:
             each.set("class", each.get("class", "main"))
@@ -175,7 +175,7 @@ def _prefix(element: Element, prefix: str, other: bool) -> None:
 
 
 def _resolves(element: Element, known: set[tuple[str, str | None]]) -> bool:
-    """Return True if everything that an element refers to is in a model."""
+    """Return True if all elements to which an element refers are in a model (`known`)."""
     given = [each for part in element.iter() for each in part.attrib.items()]
     ends = [(REFERENCES[key], value) for key, value in given if key in REFERENCES and value != "world"]
     return all(kind in OF_MODEL or (kind, value) in known for kind, value in ends)
@@ -220,7 +220,7 @@ def _replicate(root: Element, element: Element, degrees: bool, sequence: str) ->
         digits, separator = len(str(int(count) - 1)), child.get("sep", "")
         suffixes = [f"{separator}{number:0{digits}d}" for number in range(int(count))]
         for number, suffix in enumerate(suffixes):
-            # the angles are multiplied, as in MuJoCo; about more than one axis, this is not the turn repeated
+            # the angles are multiplied, as in MuJoCo; with more than one axis, this differs from repeating the turn
             R = pose_of({"euler": text_of(number * turn)}, "a <replicate>", degrees, sequence).R
             frame = Element("frame", pos=text_of(place), quat=text_of(euler_parameters(R)))
             frame.extend(copy.deepcopy(list(child)))
@@ -239,13 +239,13 @@ def _replicate(root: Element, element: Element, degrees: bool, sequence: str) ->
 
 
 def _refers(element: Element, named: set[str]) -> bool:
-    """Return True if an element refers to replicated ones."""
+    """Return True if an element refers to replicated elements."""
     parts = element.iter()
     return any(value in named for part in parts for key, value in part.attrib.items() if key not in ("name", "class"))
 
 
 def _renamed(element: Element, named: set[str], suffix: str) -> Element:
-    """Return a copy of an element that refers to replicated ones, with a suffix to its name and theirs."""
+    """Return a copy of an element, with a suffix added to its name and to the replicated names in it."""
     copied = copy.deepcopy(element)
     for part in copied.iter():
         for key, value in part.attrib.items():

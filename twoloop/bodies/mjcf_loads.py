@@ -1,4 +1,4 @@
-"""Add what acts in an MJCF file to its model: springs, friction, armature, the medium; loops; the start."""
+"""Add the loads of an MJCF file to its model: springs, friction, armature, a medium; also loops and the start."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from twoloop.bodies.rotation_rates import euler_product, parameters_of, rate_of_
 from twoloop.bodies.tendons import SpringTension
 from twoloop.checks.arguments import Array, shown
 
-SMALL = 1e-9  # sine of half the angle of a ball, below which its spring is linear
-AT_REST = 1e-12  # rad/s or m/s: slower joints of a keyframe rest, as rounding errors may contradict closed loops
-AGREES = 1e-6  # tolerance of the pose that a weld prescribes
+SMALL = 1e-9  # the spring of a ball is linear if the sine of half its angle is smaller
+AT_REST = 1e-12  # rad/s or m/s: joints with a smaller rate in a keyframe rest, as rounding may contradict closed loops
+AGREES = 1e-6  # tolerance of the pose that a weld prescribes, m and entries of the rotation matrix
 
 
 class Loads(TendonsAndActuators):
-    """Add to a model what acts on its bodies, by the reader of a file."""
+    """Add to a model the loads on its bodies; `reader`: the reader of the file."""
 
     def __init__(self, reader: Any):
         super().__init__(reader)
@@ -44,7 +44,7 @@ class Loads(TendonsAndActuators):
             raise ValueError(f"commands has {min(unknown)!r}, but the file has no actuator of that name")
 
     def start(self, key: str | int | None) -> None:
-        """Set positions and rates of the joints to those of a keyframe; its ctrl are commands not given otherwise."""
+        """Set positions and rates of the joints from a keyframe, and commands from its ctrl unless given otherwise."""
         if key is None:
             return
         keys = [each for group in self.reader.root.findall("keyframe") for each in group]
@@ -81,7 +81,7 @@ class Loads(TendonsAndActuators):
         activations = [activation_of(each, self.reader.attributes(each, "main")) for each in actuators]
         names = [each.get("name", f"actuator {k}") for k, each in enumerate(actuators)]
         active = [name for name, activation in zip(names, activations, strict=True) if activation != "none"]
-        several = {each.tag for each in actuators} & {"pid", "orientation"}  # of which one may have several commands
+        several = {each.tag for each in actuators} & {"pid", "orientation"}  # kinds that may have several commands
         unknown = {*activations} - {"none", "muscle", *FILTERS}
         for what, given, which, unclear in (
             ("ctrl", self.commands, names, several),
@@ -117,7 +117,7 @@ class Loads(TendonsAndActuators):
                 self.model.actuators = tuple(self.model.forces[before:])
 
     def _medium(self) -> None:
-        """Add the forces of the medium, on each body of the file by itself."""
+        """Add the forces of the medium on each body of the file."""
         medium = self.reader.medium
         if not (medium.density or medium.viscosity):
             return
@@ -162,7 +162,7 @@ class Loads(TendonsAndActuators):
             self.ignored.append(f"limits of joint {joint.name!r}")
 
     def _rotors(self, joint: FileJoint, armature: float) -> None:
-        """Add the armature of a ball, or of a free joint, whose rates are components along fixed axes."""
+        """Add the armature of a ball or free joint; the rates of these joints are components along fixed axes."""
         part = next(each for each in self.reader.parts if joint in each.freed)
         body, parent = self._of(part), self._of(part.parent)
         assert part.start is not None
@@ -181,7 +181,7 @@ class Loads(TendonsAndActuators):
                 )
 
     def _spring(self, joint: FileJoint, single: bool) -> None:
-        """Add the spring and damper of a joint; it is unstressed at springref, and the pose of the file is ref."""
+        """Add the spring and damper of a joint; the spring is unstressed at springref, and ref is the file's pose."""
         given = joint.attributes
         stiffness, damping = (trimmed(given.get(key, "0")) for key in ("stiffness", "damping"))
         times = [float(x) for x in given.get("springdamper", "0 0").split()]
@@ -212,14 +212,14 @@ class Loads(TendonsAndActuators):
             )
 
     def _resist(self, joint: FileJoint, stiffness: float, damping: float) -> None:
-        """Add spring and damper of a ball, which has no torque in the reference pose, or the damper of a free joint."""
+        """Add spring (no torque in the reference pose) and damper of a ball, or the damper of a free joint."""
         part = next(each for each in self.reader.parts if joint in each.freed)
         body, parent = self._of(part), self._of(part.parent)
         outer = np.eye(3) if part.parent is None else part.parent.pose.R
         zero = euler_parameters(part.pose.R.T @ outer)
         start = [euler_parameters(each.rotation) for each in (parent, body)]
         start[0][1:] *= -1.0
-        if euler_product(zero, euler_product(*start))[0] < 0.0:  # of two signs the one within half a turn
+        if euler_product(zero, euler_product(*start))[0] < 0.0:  # take the sign for an angle within half a turn
             zero = -zero
         numbers_of = stiffness, damping, tuple(zero.tolist())
         turn = _Resisting(body, parent, *numbers_of, 1.0)
@@ -250,7 +250,7 @@ class Loads(TendonsAndActuators):
             frames = [self.reader.frame(given.get(key, "world")) for key in ("body1", "body2")]
         (part_1, frame_1), (part_2, frame_2) = frames
         body_1, body_2 = self._of(part_1), self._of(part_2)
-        if body_1 is body_2:  # a body of the file is fixed to the other one
+        if body_1 is body_2:  # the two bodies of the file are fixed to each other
             self.ignored += [f"equality: {what}, within one body"] if between_sites or "relpose" in given else []
             return
         name = self.reader.free(given.get("name"), f"{element.tag} of {body_1.name} and {body_2.name}")
@@ -270,7 +270,7 @@ class Loads(TendonsAndActuators):
         elif wanted[3:].any():
             pose = pose_of({"pos": text_of(wanted[:3]), "quat": text_of(wanted[3:])}, what, True, "xyz")
             asked = frame_1.then(pose)
-        # the pose of body 2 relative to body 1 that the weld prescribes, in the axes of both at the start
+        # the pose of body 2 that the weld prescribes, and its pose at the start
         meant, has = (start_pose(part_1, asked), start_pose(part_2, frame_2))
         off = max(np.abs(meant.x - has.x).max(), np.abs(meant.R - has.R).max())
         if off > AGREES:
@@ -284,7 +284,7 @@ class Loads(TendonsAndActuators):
         return body.point(*body.local_point(start_point(part, at)))
 
     def _couple(self, given: dict[str, str], kind: str) -> bool:
-        """Let a joint or tendon move as a polynomial of another one; return False if a model cannot."""
+        """Make a joint or tendon move as a polynomial of another one; return False if models do not support this."""
         names = [given[key] for key in (f"{kind}1", f"{kind}2") if key in given]
         if kind == "tendon":
             pairs = [self.tendons.get(name, (None, 0.0)) for name in names]
@@ -307,10 +307,10 @@ READ = ("tendon", "equality", "actuator")  # sections, in order
 
 
 class Polynomial:
-    """Evaluate x1 - (c0 + c1 x2 + ...), a row that couples two joint coordinates given from the start of a model.
+    """Evaluate x1 - (c0 + c1 x2 + ...), a row that couples two joint coordinates, or x1 - c0 for one coordinate.
 
-    `offsets`: displacements of both joints at the start, from the reference pose of the file. With one joint, the row
-    is x1 - c0.
+    The arguments are displacements from the start of the model; `offsets`, added to them, are the displacements of the
+    joints at the start from the reference pose of the file.
     """
 
     def __init__(self, coefficients: tuple[float, ...], offsets: tuple[float, ...]):
@@ -334,7 +334,7 @@ class _Resisting:
     parent: Body
     stiffness: float
     damping: float
-    zero: tuple[float, ...]  # relative Euler parameters without torque, inverse
+    zero: tuple[float, ...]  # inverse of the relative Euler parameters at which the torque is zero
     sign: float
 
     def __call__(self, t: Any, q: Any, v: Any) -> Any:
@@ -348,11 +348,11 @@ class _Resisting:
         return [-self.sign * x for x in torque]
 
     def potential(self, q: Any) -> Any:
-        """Return the potential energy of the spring, for one state or many; its reaction has none."""
+        """Return the potential energy of the spring, for one state or many; zero for its reaction."""
         return 0.5 * self.stiffness * self._angle(q)[0] ** 2 if self.sign > 0.0 else 0.0
 
     def _angle(self, q: Any) -> Any:
-        """Return the angle of the rotation, the sine of its half, and this sine times the axis."""
+        """Return the angle of the rotation, the sine of half this angle, and this sine times the axis."""
         relative = euler_product(parameters_of(q, self.parent.number, -1.0), parameters_of(q, self.body.number))
         w, *e = euler_product(self.zero, relative)
         s = np.sqrt(sum(x * x for x in e) + SMALL * SMALL)

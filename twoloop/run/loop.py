@@ -102,7 +102,7 @@ class Interrupts:
         """Return whether a run that Ctrl-C ended returns a result; it does not if a signal handler raised `error`."""
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # a handler of the user stays in place and may raise; so may `_on_signal`, see there
+        self.install_handlers()  # may raise: if the user has a handler, it stays in place; `_on_signal` may raise, too
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:

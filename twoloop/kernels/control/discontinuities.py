@@ -51,7 +51,7 @@ def _sample_rates(f, w, t, q, velocity, begin, end):
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * velocity[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
-        if not finite_vector(w.rates[k]):  # as the derivative of |t| at 0 is: use the next floating-point time
+        if not finite_vector(w.rates[k]):  # for example the derivative of |t| at 0: use the next floating-point time
             constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
 
 

@@ -340,5 +340,5 @@ def load_step(step: Any) -> Any:
 
 
 def step_if_loaded(step: Any) -> Any:
-    """Return `step`; for a LazyStep, return the Step in its module, or PLACEHOLDER_STEP before this is imported."""
+    """Return `step`; for a LazyStep, return the Step in its module, or PLACEHOLDER_STEP if it is not imported yet."""
     return LOADED_STEPS.get(step, PLACEHOLDER_STEP) if isinstance(step, LazyStep) else step
