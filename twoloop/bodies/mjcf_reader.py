@@ -41,7 +41,7 @@ SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"
 KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon", "actuator", "keyframe"}
 DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon"}
 TURNS = {"quat", "axisangle", "xyaxes", "zaxis", "euler"}  # alternative orientations of an element
-INERT = ("armature", "damping", "stiffness", "frictionloss", "springdamper")  # what needs the coordinate of a joint
+INERT = ("armature", "damping", "stiffness", "frictionloss", "springdamper")  # attributes that need a coordinate
 FITTED = ("sphere", "capsule", "cylinder", "box", "ellipsoid")
 UNWEIGHED = ("plane", "hfield", "sdf")
 
@@ -147,7 +147,7 @@ class _Reader:
             medium |= {name: each.attrib[name] for name in ("density", "viscosity", "wind") if name in each.attrib}
         flags = {
             name: value for flag in root.findall("option/flag") for name, value in flag.attrib.items()
-        }  # the last one counts
+        }  # if a file repeats an attribute, the last value counts
         self.disabled = {name for name, value in flags.items() if value == "disable"}
         gravity = np.zeros(3) if "gravity" in self.disabled else gravity
         self.without = {"stiffness"} if "spring" in self.disabled else set()
@@ -164,7 +164,7 @@ class _Reader:
         self.ordered: list[FileJoint] = []  # as in qpos
         self.parts: list[Part] = []
         self.gravcomp: list[tuple[Part, Lump, float]] = []
-        self.wetted: list[tuple[Part, Lump]] = []  # what the medium acts on
+        self.wetted: list[tuple[Part, Lump]] = []  # parts and masses on which the medium acts
         self.meshes: dict[str, Element] = {}
         for asset in root.findall("asset"):
             for mesh in asset.findall("mesh"):
@@ -186,7 +186,7 @@ class _Reader:
         for each in self.root.findall("worldbody"):
             self._within(each, None, Pose(np.zeros(3), np.eye(3)), "main")
         total = max(self.total_mass, default=-1.0)
-        if total > 0.0 and self.fused and self.static:  # if MuJoCo fuses them with the world, it does not count them
+        if total > 0.0 and self.fused and self.static:  # MuJoCo does not count masses that it fuses with the world
             self.ignored.append("fusestatic of the compiler, for the mass that settotalmass scales")
         scale = total / self.total if total > 0.0 and self.total > 0.0 else 1.0
         loads = Loads(self)
@@ -218,7 +218,7 @@ class _Reader:
             self._default(each, name, merged)
 
     def attributes(self, element: Element, childclass: str, kind: str | None = None) -> dict[str, str]:
-        """Return the attributes of an element with those of its default class; `kind`: of the default, if special."""
+        """Merge the attributes of an element into its default class; `kind`: kind of the default, if not its tag."""
         name = element.get("class", childclass)
         if name not in self.defaults:
             raise ValueError(f"{name_of(element)} is of the class {name!r}, which no default has")
@@ -229,7 +229,7 @@ class _Reader:
         return {key: value for key, value in given.items() if key not in self.without}
 
     def pose(self, attributes: Mapping[str, str], what: str) -> Pose:
-        """Return the pose of an element in that around it."""
+        """Return the pose of an element in the frame of the element that contains it."""
         compiler = self.compiler(attributes)
         return pose_of(attributes, what, compiler.degrees, compiler.sequence)
 
@@ -276,7 +276,7 @@ class _Reader:
             lump = self._bounded(combined(lumps or stated), self.compiler(element.attrib))
             if lump.mass and not (lumps or stated) and numbers(element.get("pos", "0 0 0"), 3, "pos").any():
                 self.ignored.append(f"where boundmass puts the mass of {name_of(element)}")  # in MuJoCo at its pos
-            if self.fused and lump.J.any() and not lump.mass:  # MuJoCo: not if it is fused with its parent
+            if self.fused and lump.J.any() and not lump.mass:  # MuJoCo drops this inertia when it fuses the body
                 self.ignored.append(f"fusestatic of the compiler, for the mass of {name_of(element)}")
             self.total += lump.mass
             self.static |= part is None and lump.mass > 0.0
@@ -306,7 +306,7 @@ class _Reader:
         return contents
 
     def _bounded(self, lump: Lump, compiler: Compiler) -> Lump:
-        """Return a mass with the bounds that the compiler sets."""
+        """Apply the compiler's lower bounds of masses and moments to a mass."""
         least, least_moment, balance = compiler.least_mass, compiler.least_moment, compiler.balance
         if not (least or least_moment or balance):
             return lump
@@ -337,7 +337,7 @@ class _Reader:
         self._within(element, part, pose, childclass)
 
     def _align(self, joint: FileJoint, body: Element) -> None:
-        """Record a free joint that MuJoCo aligns with the principal axes of its body, where that has an effect."""
+        """Record a free joint that MuJoCo aligns with the principal axes of its body, if this has an effect."""
         aligned = joint.attributes.get("align", "auto")
         aligns = aligned == "true" or (aligned == "auto" and self.compiler(body.attrib).align)
         acts = any(float(joint.attributes.get(key, "0").split()[0]) for key in INERT[:3])
@@ -345,7 +345,7 @@ class _Reader:
             self.ignored.append(f"align of joint {joint.name!r}, which is along the axes of its body")
 
     def _chain(self, name: str, parent: Part | None, pose: Pose, moved: list[FileJoint]) -> Part:
-        """Return the part of a body, behind massless ones that carry its first joints if no single joint has all."""
+        """Return the part of a body; if no joint has all freedoms, massless parts carry the first joints."""
         check_slides(name, moved)
         plain = not any(self._has_coordinate(each) for each in moved)
         kind = counterpart(moved)
@@ -362,7 +362,7 @@ class _Reader:
         return part
 
     def _has_coordinate(self, joint: FileJoint) -> bool:
-        """Return True if something acts on the coordinate of a joint, which must then be that of a joint of its own."""
+        """Return True if something acts on a joint's coordinate, so that the model needs a separate joint for it."""
         acting = any(any(float(x) for x in joint.attributes.get(key, "0").split()) for key in INERT)
         acting |= self.limits and self.limited(joint.attributes)
         return acting or joint.attributes.get("name") in self.referred
@@ -390,7 +390,7 @@ class _Reader:
         return joint
 
     def free(self, name: str | None, default: str) -> str:
-        """Return an unused name; in MJCF a body, a joint and a tendon may share one."""
+        """Return an unused name; in MJCF a body, a joint and a tendon may have the same name."""
         name = default if name is None else name
         while name in self.taken:
             name = f"{default.split()[0]} {name}"
@@ -398,7 +398,7 @@ class _Reader:
         return name
 
     def _geom(self, given: dict[str, str], what: str, weighs: bool) -> Lump | None:
-        """Return the mass of a geom in the frame of its body; None: it has none, or is unknown."""
+        """Return the mass of a geom in the frame of its body; None: the geom has no mass, or its kind is unknown."""
         if float(given.get("contype", 1)) or float(given.get("conaffinity", 1)):
             self.n_geoms += 1
         weighs = weighs and float(given.get("mass", given.get("density", 1.0))) > 0.0
@@ -462,7 +462,7 @@ class _Reader:
 
 
 def _merged(inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
-    """Merge attributes of an element into its defaults; they have one orientation, and the last sizes stay."""
+    """Merge attributes of an element into its defaults; keep one orientation, and defaults of sizes not given."""
     kept = {key: value for key, value in inherited.items() if key not in TURNS or not own.keys() & TURNS}
     sizes = own.get("size", "").split()
     sizes += inherited.get("size", "").split()[len(sizes) :]

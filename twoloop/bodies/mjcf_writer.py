@@ -16,7 +16,7 @@ from twoloop.bodies.parts import Body, Force, ModelJoint
 from twoloop.bodies.rotation import euler_parameters
 from twoloop.checks.arguments import check_path
 
-# kinds of joints in the order in which they enter the tree: those that cannot close a loop first
+# kinds of joints in the order in which they enter the tree: first the kinds that cannot close a loop
 TREE = ("prismatic", "cylindrical", "universal", "planar", "revolute", "fixed", "spherical")
 LOOP = ("spherical", "revolute", "fixed")
 
@@ -30,7 +30,7 @@ def spanning_tree(model: Any) -> tuple[dict[int, tuple[Body, ModelJoint]], list[
     linked = {each.number: {each.number} for each in (model.ground, *model.bodies)}
     edges: list[ModelJoint] = []
     loops: list[ModelJoint] = []
-    # joints to the ground first within each kind: loops are then cut between moving bodies, and branches are shorter
+    # within each kind, joints to the ground come first: loops are then cut between moving bodies, and branches shorter
     for joint in sorted(joints, key=lambda each: (TREE.index(each.kind), model.ground not in (each.a, each.b))):
         group_a, group_b = linked[joint.a.number], linked[joint.b.number]
         if group_a is group_b:

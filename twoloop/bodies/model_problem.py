@@ -32,7 +32,7 @@ Given = tuple[tuple[str, str, float], ...]  # joint, "angle" or "displacement", 
 UNCOUNTED = (
     ("revolute", "angle"),
     ("cylindrical", "angle"),
-)  # angles in space of which a state does not know the turns
+)  # joints and their angles in space, whose whole turns a state does not contain
 MOST_TURNED = 0.95 * 2.0 * np.pi  # rad
 
 
@@ -104,7 +104,7 @@ class ModelProblem(Problem):
             raise ValueError(
                 f'{name!r} has an angle and a displacement: say which, as joint_coordinate({name!r}, "angle")'
             )
-        return own[0]  # of a screw the angle
+        return own[0]  # for a screw, this is the angle
 
     def actuator_forces(self, result: Any, actuators: Sequence[Any]) -> Array:
         """Return the forces with which motors elsewhere make the motion that the drives prescribe (inverse dynamics).
@@ -274,7 +274,7 @@ class Model(Ropes):
         return self.assemble(span, name, kept, None, None, *given)
 
     def _given(self, what: str, given: Any) -> Given:
-        """Return the positions or rates of joints that are given."""
+        """Check the given positions or rates of joints; return them as tuples."""
         if given is None:
             return ()
         if not isinstance(given, Mapping):
@@ -295,12 +295,12 @@ class Model(Ropes):
         return tuple((*key, value) for key, value in values.items())
 
     def _request(self, given: Given, coordinates: Sequence[JointCoordinate]) -> Request:
-        """Return which coordinates have which values, and which are not given."""
+        """Return the Request with the given coordinates and their values, and the coordinates that are not given."""
         values = {key[:2]: key[2] for key in given}
         chosen = [each for each in coordinates if (each.joint, each.which) in values]
         held = {(each.joint, each.which) for each in chosen}
         for joint in self.joints:
-            if joint.kind == "screw":  # one of both is enough
+            if joint.kind == "screw":  # the angle or the displacement is enough
                 held |= {(joint.name, "displacement")}
                 held |= {(joint.name, "angle")} if (joint.name, "displacement") in values else set()
         others = [each for each in coordinates if (each.joint, each.which) not in held]
@@ -398,10 +398,10 @@ class Model(Ropes):
         t: float,
         q: Array,
     ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
-        """Return the system with given dry friction forces and sticking joints, and the rows of the latter.
+        """Return the system with given dry friction forces and sticking joints, and the rows of the sticking joints.
 
-        `friction` and `held` have, by the names of the dry frictions, their forces, and the displacements of b on a at
-        which joints stick. NaN: the displacement equals t, which makes a gauge of the row.
+        Keys of `friction` and `held`: names of dry frictions. Values: their forces, and the displacements of b on a at
+        which joints stick. NaN: the displacement equals t, so that the row's residual at t = 0 is the displacement.
         """
         copied = self._copy()
         for rub in self.dry:
@@ -419,7 +419,7 @@ class Model(Ropes):
         return system, {name: tables.rows[f"{name} sticks"] for name in held}
 
     def pull(self, rub: DryFriction, values: Mapping[str, float]) -> ConstrainedSystem:
-        """Return a system whose only force is unit friction in the joint: its slip as a function of the coordinates."""
+        """Return a system whose only force is unit friction in the joint: the gradient of the joint's displacement."""
         copied = self._copy()
         copied.gravity, copied.forces = np.zeros(self.dimension), [replace(rub.force, more=Numbers((1.0,)))]
         places = {name: value for name, value in values.items() if not name.startswith("gravity")}
@@ -453,7 +453,7 @@ class Model(Ropes):
         return copied
 
     def _first_row(self) -> int:
-        """Return the number of rows before those of the joints."""
+        """Return the number of rows before the first row of a joint."""
         return 0
 
     def _check_inertias(self, tables: Tables) -> None:
@@ -471,7 +471,7 @@ class Model(Ropes):
         """Raise if a drive starts half a turn away from its value, or a gear at another tooth."""
 
     def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the velocities given, (n_q,), and a mask of those that are given."""
+        """Return velocities (n_q,), and a mask of the velocities that are given."""
         given = np.full((len(self.bodies), len(self.coordinate_names)), np.nan)
         for row, body, state in zip(given, self.bodies, q.reshape(given.shape), strict=True):
             if body.velocity is not None:

@@ -12,27 +12,27 @@ NONE = -1  # no program, function or number; as a body: the ground
 
 # A row of the table of joints: kind, row of C, body i, index of its numbers, body j, index of its numbers, index of
 # further numbers, index of its first result in the program of motions. A motion has three results: value, rate and
-# acceleration. A ROW_FUNCTION has C, C_t and gamma, then the derivatives with respect to the coordinates that the
-# further numbers count and list. A RATE_FUNCTION is a row of A: its results are Q_a and the entries of the row.
+# acceleration. A ROW_FUNCTION has C, C_t and gamma, then one derivative for each coordinate in the further numbers
+# (their count, then a list). A RATE_FUNCTION is a row of A: its results are Q_a and the entries of the row.
 KIND, ROW, FIRST, FIRST_AT, SECOND, SECOND_AT, MORE, MOTION, JOINT_WIDTH = range(9)
 # A row of the table of forces: kind, body i, index, body j, index, further numbers, first result of the program, and,
 # for a spring along an axis of i, the index of its point on i.
 F_KIND, F_FIRST, F_FIRST_AT, F_SECOND, F_SECOND_AT, F_MORE, F_RESULT, F_ON_FIRST, FORCE_WIDTH = range(9)
 
 # Kinds of joint rows. A direction is three numbers in space, and the angle from the x axis of its body in the plane.
-POINT = 0  # a point of i and one of j coincide: two rows in the plane, three in space
-ALONG = 1  # displacement of a point of j from one of i along a direction of i (further numbers), minus the motion
-ACROSS = 2  # the same perpendicular to the direction, in the plane
+POINT = 0  # a point of i and a point of j coincide: two rows in the plane, three in space
+ALONG = 1  # displacement of a point of j from a point of i along a direction of i (further numbers), minus the motion
+ACROSS = 2  # in the plane: displacement of a point of j from a point of i perpendicular to a direction of i
 LENGTH = 3  # distance of two points
-ANGLE = 4  # angle of j against i, minus a number and the motion, in the plane
-PERPENDICULAR = 5  # a direction of i and one of j
-ANGLE_DRIVE = 6  # the same where the direction of i rotates by the motion from one to another
+ANGLE = 4  # in the plane: angle of j relative to i, minus a number and the motion
+PERPENDICULAR = 5  # a direction of i is perpendicular to a direction of j
+ANGLE_DRIVE = 6  # as PERPENDICULAR, with a direction that rotates on i by the motion, from one direction to another
 ROW_FUNCTION, RATE_FUNCTION = 7, 8  # any function of the coordinates, or linear in the velocities
 
-# Kinds of forces: between two points; in a hinge, on a body; about and along an axis of body i
+# Kinds of forces: first between two points, in a planar hinge, on a body; then about and along an axis of body i
 SPRING, ZERO_LENGTH_SPRING, TORSION_SPRING, FORCE, TORQUE = range(5)
 AXIAL_TORQUE, AXIAL_FORCE, AXIAL_SPRING, HINGE_FRICTION, AXIAL_FRICTION = range(5, 10)
-# inertias of rotors, which add to the mass matrix, see `rotors`
+# inertias of rotors, which contribute to the mass matrix, see rotors.py
 HINGE_ROTOR, SLIDE_ROTOR = range(10, 12)
 
 PLANAR_BODY, SPATIAL_BODY = 2, 7  # numbers of a body: mass, moment of inertia; mass, J_xx, J_yy, J_zz, J_xy, J_xz, J_yz

@@ -11,7 +11,7 @@ from twoloop.bodies.functions import Function, RowFunction
 from twoloop.bodies.parameter_layout import NONE
 from twoloop.checks.arguments import Array, check_vector
 
-ROUNDING = 4.0 * np.finfo(np.float64).eps
+ROUNDING = 4.0 * np.finfo(np.float64).eps  # largest relative value that counts as a rounding error
 COINCIDE = 1e-12  # relative distance at which two points count as coincident
 
 
@@ -96,13 +96,13 @@ class Body:
 
 
 def _without_rounding(components: Array, size: float) -> Array:
-    """Return zeros for components that are rounding errors of numbers of a size: equations are shorter without them."""
+    """Set components to zero if they are rounding errors of numbers of this size: equations become shorter."""
     return np.where(np.abs(components) > ROUNDING * size, components, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """Consecutive entries of the parameter vector; those without names are not parameters of the model."""
+    """Consecutive entries of the parameter vector; without names, they are not parameters of the model."""
 
     values: tuple[float, ...]
     names: tuple[str, ...] = ()
@@ -151,8 +151,8 @@ class ModelJoint:
     point_a: Numbers = field(repr=False)  # in body axes
     point_b: Numbers = field(repr=False)
     axes: tuple[Array, ...] = field(default=(), repr=False)  # spatial joints: the axis in the axes of a and of b
-    pitch: float = field(default=0.0, repr=False)  # of a screw: displacement per turn, m
-    path: tuple[tuple[Body, Numbers], ...] = field(default=(), repr=False)  # of a rope: its points, as drawn
+    pitch: float = field(default=0.0, repr=False)  # for a screw: displacement per turn, m
+    path: tuple[tuple[Body, Numbers], ...] = field(default=(), repr=False)  # for a rope: its points, in order
 
     @property
     def body(self) -> Body:

@@ -1,4 +1,4 @@
-"""Evaluate the callbacks of models with motions, rows or forces that are functions, whose programs stand in p."""
+"""Evaluate callbacks of models in which motions, rows or forces are functions, traced to programs stored in p."""
 
 from twoloop.bodies.callbacks import (
     fill_rows,

@@ -8,7 +8,7 @@ from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.data.common import exact, inlined
 from twoloop.kernels.evaluation.operations import N_COLUMNS, run_table
 
-N_RESULTS, N_NODES, N_ROWS, N_TERMS, PROGRAM = range(5)  # sizes in front of a program; nodes follow its results
+N_RESULTS, N_NODES, N_ROWS, N_TERMS, PROGRAM = range(5)  # sizes in front of a program; PROGRAM: where it begins
 
 
 @helper
@@ -30,7 +30,7 @@ def results_within(place, t, q, v, p):
     return nodes
 
 
-results = results_within.py_func  # for Python
+results = results_within.py_func  # the same function, for calls from Python
 
 
 @helper
@@ -56,7 +56,7 @@ def joint_places(p):
 
 @exact
 def joint_at(p, k):
-    """Return a row of the table: kind, row of C, bodies i and j with their numbers, further numbers, motion."""
+    """Return row k of the table of joints: kind, row of C, i, its numbers, j, its numbers, more numbers, motion."""
     i, at_i, j, at_j = int(p[k + 2]), int(p[k + 3]), int(p[k + 4]), int(p[k + 5])
     return int(p[k]), int(p[k + 1]), i, at_i, j, at_j, int(p[k + 6]), int(p[k + 7])
 
@@ -70,21 +70,21 @@ def force_places(p):
 
 @exact
 def force_at(p, k):
-    """Return a row of the table: kind, bodies i and j with indices of numbers, further numbers, result, point of i."""
+    """Return row k of the table of forces: kind, i and its numbers, j and its numbers, more numbers, result, point."""
     i, at_i, j, at_j = int(p[k + 1]), int(p[k + 2]), int(p[k + 3]), int(p[k + 4])
     return int(p[k]), i, at_i, j, at_j, int(p[k + 5]), int(p[k + 6]), int(p[k + 7])
 
 
 @helper
 def fill_entries(p, columns, results, first_result, entries):
-    """Add the derivatives with respect to the coordinates listed from `columns` on to entries (n_q,)."""
+    """Add the derivatives by the coordinates that p lists from index `columns` on to `entries` (n_q,)."""
     for m in range(int(p[columns])):
         entries[int(p[columns + 1 + m])] = results[first_result + m]
 
 
 @helper
 def put_entries(p, columns, results, first_result, values, begin):
-    """Store the derivatives in values from `begin` on; return the position after the last."""
+    """Store the derivatives of a row in `values` from index `begin` on; return the index after the last one."""
     for m in range(int(p[columns])):
         values[begin + m] = results[first_result + m]
     return begin + int(p[columns])
@@ -92,7 +92,7 @@ def put_entries(p, columns, results, first_result, values, begin):
 
 @helper
 def fill_nonholonomic(p, results, A):
-    """Evaluate A."""
+    """Evaluate A, the matrix of the non-holonomic constraints."""
     for k in joint_places(p):
         kind, row, _, _, _, _, columns, result = joint_at(p, k)
         if kind == RATE_FUNCTION:

@@ -283,7 +283,7 @@ class Ropes(Gears):
             )
 
         def left(q: Any) -> Any:
-            """Return the length that the parts between different bodies leave."""
+            """Return the length of the rope minus the lengths of its parts between different bodies."""
             ends = [point_of(q, body.number, place) for body, place in zip(bodies, places, strict=True)]
             spans = (sum((x - y) * (x - y) for x, y in zip(ends[i], ends[j], strict=True)) for i, j in free_parts)
             return total - fixed - sum(np.sqrt(span) for span in spans)
@@ -292,7 +292,7 @@ class Ropes(Gears):
             raise TypeError(f"winch and radius go together; given winch={shown(winch)}, radius={shown(radius)}")
 
         def row(q: Any) -> Any:
-            """Return minus this length, so that the multiplier is the tension."""
+            """Return the negative of `left`, so that the multiplier is the tension."""
             return -left(q)
 
         wound: Row = row

@@ -39,9 +39,9 @@ def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
 
 @helper
 def turned(e0, e1, e2, e3, x, y, z):
-    """Return 2 (f.a, e0 a + f x a) with f = (e1, e2, e3): s, w, of which the derivatives of R(e) a by e are made.
+    """Return s, w = 2 (f.a, e0 a + f x a) with f = (e1, e2, e3), which yield the derivatives of R(e) a by e.
 
-    That by e0 is w; that of component i by component j of f is s, if i = j, else plus or minus the third one of w.
+    The derivative by e0 is w; the derivative of component i by f_j is s if i = j, else the third component of w, +/-.
     """
     x, y, z = 2.0 * x, 2.0 * y, 2.0 * z
     return e1 * x + e2 * y + e3 * z, e0 * x + e2 * z - e3 * y, e0 * y + e3 * x - e1 * z, e0 * z + e1 * y - e2 * x
@@ -49,7 +49,7 @@ def turned(e0, e1, e2, e3, x, y, z):
 
 @helper
 def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
-    """Return the gradient of f . R(e) (x, y, z) in e, i.e. the generalised force of f at that point."""
+    """Return the gradient by e of f . R(e) (x, y, z), i.e. the generalised force of f at the point (x, y, z)."""
     s, wx, wy, wz = turned(e0, e1, e2, e3, x, y, z)
     return (
         wx * fx + wy * fy + wz * fz,
@@ -94,7 +94,7 @@ def euler_parameters(R: ArrayLike) -> Array:
     R = np.asarray(R, dtype=float)
     if R.shape != (3, 3) or not np.abs(R.T @ R - np.eye(3)).max() <= 1e-9 or np.linalg.det(R) < 0.0:
         raise ValueError(f"R must be a rotation matrix (3, 3), orthonormal and right-handed; given {R!r}")
-    # the column of 4 e e^T with the largest diagonal entry is free of cancellation
+    # take the column of 4 e e^T with the largest diagonal entry: it is free of cancellation
     d = R[0, 0] + R[1, 1] + R[2, 2]
     E = np.empty((4, 4))
     E[0, 0] = 1.0 + d

@@ -15,7 +15,7 @@ def cross(a: Any, b: Any) -> Components:
 
 
 def parameters_of(q: Any, body: int, sign: float = 1.0) -> Components:
-    """Return the Euler parameters of a body, or with sign -1 those of the inverse rotation."""
+    """Return the Euler parameters of a body, or with sign -1 the Euler parameters of the inverse rotation."""
     if body < 0:
         return [1.0, 0.0, 0.0, 0.0]
     w, *e = (q[7 * body + k] for k in range(3, 7))
@@ -23,7 +23,7 @@ def parameters_of(q: Any, body: int, sign: float = 1.0) -> Components:
 
 
 def euler_product(one: Any, other: Any) -> Components:
-    """Return the Euler parameters of a rotation that follows another."""
+    """Return the Euler parameters of the composition of two rotations; `other` is applied first."""
     (w, *e), (u, *f) = one, other
     across = cross(e, f)
     return [w * u - sum(x * y for x, y in zip(e, f, strict=True)), *(w * f[i] + u * e[i] + across[i] for i in range(3))]
@@ -57,7 +57,7 @@ def spin_of(q: Any, v: Any, body: int) -> Components:
 
 
 def rate_of_vector(q: Any, v: Any, body: int, vector: Any) -> Components:
-    """Return the rate of a vector of a body, along the axes of space."""
+    """Return the time derivative of a body-fixed vector, along the axes of space."""
     if body < 0:
         return [0.0] * len(vector)
     if len(vector) == 2:

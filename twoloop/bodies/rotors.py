@@ -1,7 +1,7 @@
 """Rotor inertias of joints: the inertia of a motor's rotor behind a gear, which adds I/2 rate^2 to the kinetic energy.
 
-The rate of a joint is w(q) . v. Its rotor adds I w w^T to the mass matrix and -I w (dw/dt . v) to the forces, because
-on the motions that the joint allows w is the gradient of the joint coordinate (Lagrange's equations of I/2 (w . v)^2).
+The rate of a joint is w(q) . v. Its rotor adds I w w^T to the mass matrix and -I w (dw/dt . v) to the forces: these are
+Lagrange's equations of I/2 (w . v)^2, because w is the gradient of the joint coordinate for motions that joints allow.
 The rotor itself has no mass, and its gyroscopic torque is neglected, as in the armature of MuJoCo.
 """
 
@@ -14,14 +14,14 @@ from twoloop.kernels.compile.caches import helper
 
 @merged
 def _arm(q, w, i, j, p, at_j):
-    """Return the point of j from the centre of i, and from the centre of j."""
+    """Return the vectors to the point of body j from the centre of body i, and from the centre of body j."""
     b = vector(q, w, j, numbers(p, w, at_j))
     return minus(plus(centre(q, w, j), b), centre(q, w, i)), b
 
 
 @merged
 def _block(q, w, body, f, torque):
-    """Return the coefficients of v in f . (velocity of the centre) + torque . (angular velocity): 7, or 3 and zeros."""
+    """Return 7 coefficients (planar: 3, zeros) of v in f . (centre's velocity) + torque . (angular velocity)."""
     if w == PLANAR:
         return f[0], f[1], torque[2], 0.0, 0.0, 0.0, 0.0
     k = 7 * body + 3
@@ -46,7 +46,7 @@ def _blocks(q, w, p, k):
 
 @helper
 def _bias(q, v, w, p, k):
-    """Return the acceleration of the joint of rotor k without the accelerations of the coordinates."""
+    """Return the part of the acceleration of rotor k's joint that does not depend on v'."""
     kind, i, at_i, j, at_j, _, _, _ = force_at(p, k)
     _, n = axis(q, w, i, p, at_i)
     spin_i, spin_j = spin(q, v, w, i), spin(q, v, w, j)

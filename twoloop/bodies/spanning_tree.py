@@ -1,6 +1,6 @@
 """Place the bodies of a model by coordinates of joints along a spanning tree.
 
-The joints of the tree are closed at any values of these coordinates; the other joints, which close loops, are not. A
+The joints of the tree are closed for all values of these coordinates; the other joints, which close loops, are not. A
 body that no joint with coordinates connects to the ground has its own pose as coordinates.
 """
 
@@ -21,7 +21,7 @@ from twoloop.bodies.rotation_rates import euler_product, rotated_by
 from twoloop.checks.arguments import Array
 
 TURN = 2.0 * np.pi
-# the joints that may stand in a tree, and how many coordinates each has: a tree of few coordinates leaves few rows open
+# the joints that may be part of a tree, and their numbers of coordinates: with few coordinates, few rows remain open
 FREEDOMS = {
     "fixed": 0,
     "revolute": 1,
@@ -38,7 +38,7 @@ DIRECTED = ("revolute", "prismatic", "cylindrical", "screw", "planar")  # joints
 class Motion(NamedTuple):
     """One coordinate of a joint: an axis of rotation and a displacement, in the axes of a, or of b."""
 
-    which: str  # "angle", "displacement"; "" where the joint has no measured coordinate
+    which: str  # "angle", "displacement"; "" if the joint has no coordinate of a name
     turn: Any  # rad per unit: a vector, or a number in the plane
     slide: Array  # m per unit
     on_b: bool = False
@@ -53,7 +53,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True)
 class Edge:
-    """A joint of the tree between a body that is placed before and one that it places."""
+    """A joint of the tree; it places one of its bodies, `child`, relative to the other body, which is placed before."""
 
     joint: ModelJoint | None  # None: a body with its own pose as coordinates
     a: int
@@ -62,7 +62,7 @@ class Edge:
     point_a: Array
     point_b: Array
     motions: tuple[Motion, ...]
-    first: int  # number of the first coordinate
+    first: int  # index of its first coordinate
 
 
 class TreeState(NamedTuple):
@@ -96,7 +96,7 @@ def _rotation(turn: Any) -> Any:
 
 
 class SpanningTree:
-    """Chart the positions of bodies by the coordinates of joints along a spanning tree.
+    """Describe the positions of bodies by the coordinates of the joints of a spanning tree.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class SpanningTree:
     held : collection of int
         Bodies that stay where they are.
     preferred : collection of str
-        Joints that stand in the tree where possible, because their coordinates are bounded.
+        Joints that are part of the tree if possible, because their coordinates are bounded.
     """
 
     def __init__(
@@ -125,9 +125,9 @@ class SpanningTree:
     ):
         self.dimension, self.width, self.n_bodies = dimension, 3 if dimension == 2 else 7, n_bodies
         self.values, self.zero = values, functools.cache(zero)
-        self.edges: list[Edge] = []  # those nearer to the ground first
-        self.keys: list[tuple[str, str]] = []  # joint and coordinate, by number
-        # whether a coordinate is a rotation, and which coordinates move which body
+        self.edges: list[Edge] = []  # sorted: edges nearer to the ground come first
+        self.keys: list[tuple[str, str]] = []  # (joint, "angle" or "displacement") of each coordinate
+        # for each coordinate, whether it is a rotation; for each body, the coordinates that move it
         turning: list[bool] = []
         moved_by: dict[int, list[int]] = {}
         parents: dict[int, Edge | None] = {}
@@ -151,7 +151,7 @@ class SpanningTree:
                     self.keys.append((edge.joint.name if edge.joint else "", motion.which))
                     turning.append(bool(np.any(motion.turn)))
             for joint in at_body.get(body, ()):
-                # few coordinates first, then short branches
+                # prefer joints with few coordinates, then short branches
                 cost = FREEDOMS[joint.kind], joint.name not in preferred, depth[body]
                 heapq.heappush(queue, (*cost, order[id(joint)], joint))
 
@@ -216,7 +216,7 @@ class SpanningTree:
         return Pose(q[k + 3 : k + 7] / np.linalg.norm(q[k + 3 : k + 7]), q[k : k + 3])
 
     def state(self, q: Array) -> TreeState:
-        """Return the state nearest to given poses, joint by joint: its angles are those of the poses."""
+        """Return the state nearest to given poses, determined joint by joint: it has the angles of the poses."""
         x, relative = np.zeros(len(self.keys)), []
         for edge in self.edges:
             pose_a, pose_b = self.pose(q, edge.a), self.pose(q, edge.b)
@@ -230,7 +230,7 @@ class SpanningTree:
         return TreeState(x, tuple(relative))
 
     def _nearest(self, edge: Edge, given: Pose) -> tuple[Any, Pose]:
-        """Return the values of the coordinates of an edge, and its pose, nearest to a pose."""
+        """Return the coordinates of an edge for which its pose is nearest to a given pose, and this nearest pose."""
         joint, motions = edge.joint, edge.motions
         if joint is None:
             return np.zeros(len(motions)), given
@@ -258,7 +258,7 @@ class SpanningTree:
         c, *e = euler_product(given.rotation, _inverse(zero))
         angle = 2.0 * float(np.arctan2(axis @ e, c)) if joint.kind != "prismatic" else 0.0
         slid = float(axis @ given.point)
-        if joint.kind == "screw":  # its angle follows from its displacement, up to whole turns where it is measured
+        if joint.kind == "screw":  # the displacement gives the angle; the pose gives it only up to whole turns
             start = float(self._screwed(joint))
             angle += TURN * np.round(((slid - start) * TURN / joint.pitch - angle) / TURN)
             slid = start + angle * joint.pitch / TURN
@@ -295,7 +295,7 @@ class SpanningTree:
         return TreeState(state.x + step, tuple(relative))
 
     def place(self, state: TreeState, q: Array) -> Array:
-        """Return the coordinates of the bodies; those that are held are taken from q."""
+        """Return the coordinates of the bodies; the coordinates of held bodies are taken from q."""
         q, w = q.copy(), self.width
         poses = {body: self.pose(q, body) for body, edge in self.parents.items() if edge is None}
         for edge, pose in zip(self.edges, state.relative, strict=True):
@@ -317,14 +317,14 @@ class SpanningTree:
         return q
 
     def tangent(self, q: Array) -> Array:
-        """Return the derivatives of the coordinates of the bodies by those of the tree, (n_q, n)."""
+        """Return the derivatives of the coordinates of the bodies by the coordinates of the tree, (n_q, n)."""
         n, d = len(self.keys), self.dimension
         derivatives = np.zeros((self.n_bodies, self.width, n))
         if n == 0:
             return derivatives.reshape(-1, 0)
         frames, ends, turns, slides, points, signs = self._lines
         bodies = q.reshape(self.n_bodies, self.width)
-        matrices = self._matrices(bodies)  # the last one is that of the ground
+        matrices = self._matrices(bodies)  # the last matrix belongs to the ground
         slide = signs * np.einsum("kij,kj->ki", matrices[frames], slides)
         turn = turns * signs[:, 0] if d == 2 else signs * np.einsum("kij,kj->ki", matrices[frames], turns)
         point = np.vstack([bodies[:, :d], np.zeros(d)])[ends] + np.einsum("kij,kj->ki", matrices[ends], points)
@@ -343,7 +343,7 @@ class SpanningTree:
 
     @functools.cached_property
     def _lines(self) -> tuple[Any, ...]:
-        """Return of each coordinate the body of its axes, b, its motion, its point on b, and its sign, as arrays."""
+        """Return arrays, by coordinate: the body of its axes, body b, its motion, its point on b, its sign."""
         lines = [(edge, motion) for edge in self.edges for motion in edge.motions]
         return (
             np.array([edge.b if motion.on_b else edge.a for edge, motion in lines]),
@@ -366,7 +366,7 @@ class SpanningTree:
         return matrices
 
     def loop(self, joint: ModelJoint) -> list[str]:
-        """Return the names of the joints of the tree that a joint makes a loop of."""
+        """Return the names of the joints of the tree that form a loop with a joint outside the tree."""
         ways: list[list[Edge]] = []
         for body in (joint.a.number, joint.b.number):
             ways.append([])

@@ -1,4 +1,4 @@
-"""Make the system of a model: compiled callbacks that read its tables, or Python ones where tracing fails."""
+"""Make the system of a model: compiled callbacks that read its tables, or Python callbacks if tracing fails."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from twoloop.problem.callbacks import LARGE
 from twoloop.problem.description import Joint
 from twoloop.problem.system import ConstrainedSystem
 
-STEPS = 50  # limit of Newton's method, which needs three or four iterations
-CONVERGED = 1e-14  # relative: change of the friction per iteration at convergence
-DEPENDENT = 1e-12  # relative: smaller singular values of the constraint rows count as zero
+STEPS = 50  # largest number of iterations; Newton's method needs three or four
+CONVERGED = 1e-14  # relative change of the friction in an iteration that counts as convergence
+DEPENDENT = 1e-12  # singular values of the constraint rows below this fraction of the largest count as zero
 
 
 class LoadedFriction:
-    """Evaluate friction -c tanh(rate / speed) |F| in joints, where the joint forces F depend on the friction in turn.
+    """Evaluate friction -c tanh(rate / speed) |F| in joints whose forces F in turn depend on the friction.
 
     M a + G^T lam = Q + W^T f and G a = gamma give lam = lam_0 + L f. With f = -c |P lam|, where c are the coefficients
     times tanh, the solution is unique if the matrix of the c_k |P_k L_l| has a spectral radius below one, because
     f -> -c |P lam(f)| is then a contraction. Otherwise a joint may jam or several solutions may exist (P. Painlevé,
     Leçons sur le frottement, 1895), and the friction is NaN.
 
-    `redundant`: constraint rows other than those of these joints may be dependent.
+    `redundant`: whether constraint rows that do not belong to these joints may be dependent.
     """
 
     def __init__(self, callbacks: Any, tables: Tables, redundant: bool):
@@ -44,11 +44,11 @@ class LoadedFriction:
         self._numbers = [place + np.arange(size) for place, size in places]
         self._rows = [self._carrying(force, tables) for force in tables.loaded]
         first = int(tables.p[tables.p.size - HEAD + FORCES]) + FORCE_WIDTH * len(tables.forces)
-        # rows of the unit motors, after those of the forces
+        # rows of the unit motors in the table of forces, after the rows of the forces
         self._units = [first + FORCE_WIDTH * k for k in range(len(self._loaded))]
 
     def _carrying(self, force: Force, tables: Tables) -> list[int]:
-        """Return the rows that carry the load of a joint: those of its point, or those across its guide."""
+        """Return the rows that carry the load of a joint: the rows of its point, or the rows across its guide."""
         joint = force.joint
         assert joint is not None
         return list(tables.rows[joint.name][: self._dimension - (joint.kind == "prismatic")])
@@ -115,7 +115,7 @@ def _friction(c: Array, loads: list[Array]) -> Array:
 ROTORS = layout.HINGE_ROTOR, layout.SLIDE_ROTOR
 KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 OF_JOINTS = ("constraint", "jacobian", "gamma")
-QUIET = np.errstate(divide="ignore", invalid="ignore")  # reported by name later
+QUIET = np.errstate(divide="ignore", invalid="ignore")  # later errors name the function with such values
 
 
 def joints_of(tables: Tables) -> list[Joint]:
@@ -170,7 +170,7 @@ def system_of(
 
 
 def _callback(kind: str, tables: Tables) -> Any:
-    """Return the callback of a kind, from the module of those that evaluate programs if it needs one."""
+    """Return the callback of a kind, from programs.py if it evaluates a program, else from callbacks.py."""
     from twoloop.bodies import callbacks, programs  # compiled on import
 
     has_program = kind not in ("mass", "mass_values") and (tables.functions if kind == "force" else tables.motions)
@@ -178,7 +178,7 @@ def _callback(kind: str, tables: Tables) -> Any:
 
 
 def _with_spring_lengths(tables: Tables, q: Array, v: Array, p: Array) -> tuple[Array, Array]:
-    """Return q and v, followed by the lengths and rates of springs if the forces of some are functions of these."""
+    """Return q and v, followed by lengths and rates of those springs whose forces are functions of them, if any."""
     n_spring_functions = sum(isinstance(each, SpringFunction) for each in tables.functions)
     if not n_spring_functions:
         return q, v
@@ -261,7 +261,7 @@ def _check_finite(function: Function | RowFunction, value: Array, t: float) -> N
 
 @QUIET
 def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
-    """Return a message that names the function whose program gives other values; "" if all agree."""
+    """Return a message that names a function whose program returns other values; "" if all programs agree."""
     from twoloop.bodies.read_tables import results as evaluate  # compiled on import
 
     head, p = tables.p[tables.p.size - layout.HEAD :], tables.p
@@ -292,7 +292,7 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
 
 
 class InPython:
-    """Evaluate the callbacks of a model whose functions are called in Python; compiled ones read the tables."""
+    """Evaluate the callbacks of a model whose functions are called in Python; compiled callbacks read the tables."""
 
     def __init__(self, callbacks: Any, tables: Tables, n_q: int):
         from twoloop.bodies.read_tables import fill_nonholonomic, fill_nonholonomic_gamma  # compiled on import

@@ -48,7 +48,7 @@ class Tables:
     loaded : list of Force
         Frictions proportional to the load of a joint. Unit motors in these joints follow the forces.
     untraced : str
-        Why the functions are not stored in p as programs; "" if they are, or there are none.
+        Why the functions are not stored in p as programs; "" if they are stored, or if there are no functions.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Tables:
         self._values: list[float] = []
         self._constants: list[float] = []
         self._known: dict[int, int] = {}
-        self._keep: list[Numbers] = []  # keeps the ids valid
+        self._keep: list[Numbers] = []  # keeps the objects alive, so that the ids in `_known` stay valid
         dimension = len(gravity)
         self._place(Numbers(tuple(gravity), tuple(f"gravity along {axis} (m/s^2)" for axis in GRAVITY[:dimension])))
         for body in bodies:
@@ -96,7 +96,7 @@ class Tables:
         return {name: float(self.p[place]) for name, place in self.places.items()}
 
     def of(self, numbers: Numbers) -> Array:
-        """Return some numbers from p."""
+        """Return the present values of `numbers` from p."""
         place = self._at(numbers)
         return self.p[place : place + len(numbers.values)]
 
@@ -106,7 +106,7 @@ class Tables:
         for force in self.forces:
             numbers = np.zeros(0) if force.more is None else self.of(force.more)
             if force.kind in (SPRING, TORSION_SPRING, AXIAL_SPRING):
-                numbers = numbers[1:2]  # the damping
+                numbers = numbers[1:2]  # only the damping counts
             elif force.kind in (HINGE_FRICTION, AXIAL_FRICTION):
                 numbers = numbers[[0, *range(2, len(numbers))]]
             if force.kind in (ZERO_LENGTH_SPRING, HINGE_ROTOR, SLIDE_ROTOR):
@@ -117,7 +117,7 @@ class Tables:
 
     @property
     def potentials(self) -> tuple[Callable[[Any], Any], ...]:
-        """Return the potential energies of forces that are functions and know theirs."""
+        """Return the potential energies of forces that are functions with a method `potential`."""
         known = (getattr(each.function, "potential", None) for each in self.functions)
         return tuple(each for each in known if each is not None)
 
@@ -184,7 +184,7 @@ class Tables:
                 self.n_rates += of_rates
                 row += 0 if of_rates else part.n_rows
             self.rows[joint.name] = tuple(numbered)
-        for name, rows in self.rows.items():  # those of A come after those of C
+        for name, rows in self.rows.items():  # rows of A come after all rows of C
             self.rows[name] = tuple(row + NONE - each if each < 0 else each for each in rows)
         n_before = len(self._values) + len(self._constants)
         forces = n_before + len(table)

@@ -16,9 +16,9 @@ from twoloop.bodies.frames import point_of
 from twoloop.bodies.parts import Body, ModelJoint, Numbers
 from twoloop.checks.arguments import Array
 
-Tension = Callable[[Any, Any, Any], Any]  # of t, length and rate; positive where it shortens the tendon
-AT_REST = 1e-8  # m/s or rad/s: below, |v| v is smooth; it changes by less than 1e-16
-CORNER = 1e-7  # width of rounded corners of limited forces, relative to their range: equations have no branches
+Tension = Callable[[Any, Any, Any], Any]  # tension(t, length, rate), positive if it shortens the tendon
+AT_REST = 1e-8  # below this rate, m/s or rad/s, |v| v is smoothed without a branch; it changes by less than 1e-16
+CORNER = 1e-7  # limited forces have corners rounded without a branch; width of a corner, relative to the range
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Tendon(JointCoordinate):
         return sum(factor * each.rate(q, v) for each, factor in self.parts)
 
     def pull(self, model: Any, tension: Tension, name: str) -> None:
-        """Let a tension act on the joints."""
+        """Add the forces of a tension on the joints to the model."""
         for (each, factor), joint in zip(self.parts, self.joints, strict=True):
             own = name if len(self.parts) == 1 else model._new_name(f"{name} in {each.joint}", None)
             leads = joint is self.joints[0] and each is self.parts[0][0]
@@ -78,10 +78,10 @@ class Tendon(JointCoordinate):
 
 @dataclass(frozen=True)
 class SitePath(JointCoordinate):
-    """Measure the length of a path through points of bodies, and its rate; each part counts by its weight."""
+    """Measure the length of a path through points of bodies, and its rate; the length of each part has a weight."""
 
     points: tuple[tuple[Body, Array], ...] = ()
-    weights: tuple[float, ...] = ()  # of the parts between neighbouring points; zero where the path is interrupted
+    weights: tuple[float, ...] = ()  # weights of the parts between neighbouring points; zero: a gap in the path
 
     @property
     def ends(self) -> tuple[Body, Body, Numbers, Numbers]:
@@ -122,7 +122,7 @@ class SitePath(JointCoordinate):
         return total
 
     def pull(self, model: Any, tension: Tension, name: str) -> None:
-        """Let a tension act on the points."""
+        """Add the forces of a tension on the points to the model."""
         leads = True
         for weight, a, at_a, b, at_b in self.parts:
             for body, at, sign in ((a, at_a, weight), (b, at_b, -weight)):
@@ -142,7 +142,7 @@ def direction(q: Any, a: Body, at_a: Array, b: Body, at_b: Array) -> list[Any]:
 
 @dataclass(frozen=True, eq=False)
 class _Share:
-    """Evaluate a multiple of a tension; the share that leads has the potential energy of the tendon."""
+    """Evaluate a multiple of a tension; of a tendon's shares, only the one with `leads` has its potential energy."""
 
     tendon: Any
     factor: float
@@ -153,7 +153,7 @@ class _Share:
         return self.factor * self.tension(t, self.tendon.position(q), self.tendon.rate(q, v))
 
     def potential(self, q: Any) -> Any:
-        """Return the potential energy of the tendon, for one state or many: that of a spring, or zero."""
+        """Return the potential energy of the tendon's spring, for one state or many; zero without a spring."""
         return self.tension.energy(self.tendon.position(q)) if self.leads and hasattr(self.tension, "energy") else 0.0
 
 
@@ -170,7 +170,7 @@ class _SpanForce(_Share):
 
 @dataclass(frozen=True, eq=False)
 class SpringTension:
-    """Evaluate the tension of a spring, which is slack between two lengths, and a damper.
+    """Evaluate the tension of a damper and a spring; the spring has no force between two lengths.
 
     The tension is k_0 s + k_1 s^2 + ... of the stretch s, and c_0 v + c_1 |v| v + c_2 v^3 + ... of the rate v.
     """
@@ -220,5 +220,5 @@ def bounded(x: Any, low: float, high: float) -> Any:
 
 
 def smooth_size(x: Any, width: float) -> Any:
-    """Return the absolute value of a number or symbol, rounded within a width."""
+    """Return the absolute value of a number or symbol, with its corner rounded over `width`."""
     return np.sqrt(x * x + width * width)

@@ -42,7 +42,7 @@ from twoloop.checks.arguments import Array, check_choice, check_finite, check_fl
 
 KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "fixed": ""}
 CROSSES = {f"universal_{'xyz'[i]}{'xyz'[j]}": (i, j) for i, j in permutations(range(3), 2)}  # axes of the joint's frame
-MORE = ("spherical", "planar", *CROSSES)  # types beside these
+MORE = ("spherical", "planar", *CROSSES)  # types of joints besides KINDS
 SIDE_TYPES = {"SPHERICAL": "spherical", "FIXED": "fixed"} | {f"UJOINT_{each[-2:].upper()}": each for each in CROSSES}
 TURNING, SLIDING = ("revolute", "continuous"), ("prismatic",)
 CLOSING = ("spherical", "revolute", "universal", "cylindrical", "prismatic", "planar", "fixed")
@@ -277,7 +277,7 @@ class _Reader:
         getattr(self.model, kind)(body_a, body_b, at=at, name=loop.name, **more)
 
     def weld(self, a: str, b: str) -> None:
-        """Let the frames of two links coincide."""
+        """Add a joint that makes the frames of two links coincide."""
         ends = [(body_of(self.model, part), start_pose(part, frame)) for part, frame in map(self._frame, (a, b))]
         (body_a, _), (body_b, _) = ends
         on_a, on_b = (Numbers(tuple(body.local_point(frame.x).tolist())) for body, frame in ends)
@@ -285,7 +285,7 @@ class _Reader:
         back = [zero_a[0], *-zero_a[1:]]
 
         def turn(q: Any, k: int) -> Any:
-            """Return a component of the relative Euler parameters, which have no second zero within a turn."""
+            """Return a vector component of the relative Euler parameters, all zero only where the frames coincide."""
             frame = euler_product(parameters_of(q, body_b.number), zero_b)
             return euler_product(back, euler_product(parameters_of(q, body_a.number, -1.0), frame))[k]
 
@@ -295,7 +295,7 @@ class _Reader:
         self.model.joints.append(ModelJoint(name, "weld", body_a, body_b, rows, on_a, on_b))
 
     def link_of(self, name: str) -> str:
-        """Return the name of a link at the end of a loop, which may be given by the joint that carries it."""
+        """Return the name of a link at the end of a loop; `name`: the link, or the joint that carries this link."""
         carried = (self._end(each, "child") for each in self.joints if each.get("name") == name)
         return name if name in self.links else next(carried, name)
 
@@ -344,7 +344,7 @@ class _Reader:
             self.ignored.append(f"mimic of joint {name!r}")
 
     def _limit(self, limit: Element, freed: FileJoint) -> bool:
-        """Add the stops of a joint; return False if they are not asked for, or a model has none there."""
+        """Add the stops of a joint; return False if stops are not requested, or a model cannot have them there."""
         if not self.limits or freed.joint is None:
             return False
         bounds = [numbers(limit.get(key, "0"), 1, f"{key} of joint {freed.name!r}")[0] for key in ("lower", "upper")]
@@ -356,7 +356,7 @@ class _Reader:
         return True
 
     def _mimic(self, mimic: Element, freed: FileJoint) -> bool:
-        """Couple a joint to the one that it follows; return False if a model cannot."""
+        """Couple a joint to the joint that it mimics; return False if a model does not support this."""
         leader = self.moved.get(mimic.get("joint", ""))
         add_coupling = getattr(self.model, "coupling", None)
         if add_coupling is None or leader is None or leader.joint is None:
@@ -377,7 +377,7 @@ class _Reader:
         return kind
 
     def _matters(self, link: str) -> bool:
-        """Return True if a link, or one beyond it, has mass or is an end of a loop."""
+        """Return True if a link, or a link that it carries, has mass or is an end of a loop."""
         mass = self.links[link].find("inertial/mass")
         heavy = mass is not None and numbers(mass.get("value", ""), 1, f"mass of link {link!r}")[0] > 0.0
         return (

@@ -21,10 +21,10 @@ from twoloop.bodies.rotation import euler_parameters, perpendiculars
 from twoloop.bodies.rotation_rates import cross, euler_product, spin_of
 from twoloop.checks.arguments import Array, check_positive, check_vector
 
-MOST_TEETH = 1000
-EXACT = 4.0 * np.finfo(np.float64).eps  # relative difference of a ratio and its fraction
-MESHES = 1e-6  # rad: larger differences after assembly are another tooth
-HALF_TURN = 3.0  # rad, with a margin
+MOST_TEETH = 1000  # largest numerator and denominator of a gear ratio
+EXACT = 4.0 * np.finfo(np.float64).eps  # largest relative difference of a ratio from a fraction of whole numbers
+MESHES = 1e-6  # rad: larger differences after assembly mean that another tooth is in mesh
+HALF_TURN = 3.0  # rad: half a turn, less a margin
 
 Complex = tuple[Any, Any]
 
@@ -44,7 +44,7 @@ class GearRow:
         return _angle(_times(_power(_rotation(q, self.other), self.m), (c, s if self.n < 0 else -s))) / self.m
 
     def off(self, q: Array) -> float:
-        """Return the angle from the tooth in mesh in the position given; zero after more than half a turn from it."""
+        """Return the angle from the tooth in mesh in the position given; zero if more than half a turn from it."""
         one, other = (_angle(_rotation(q, each)) for each in (self.one, self.other))
         meant = one * self.n / self.m
         return float(other - meant) if max(abs(one), abs(meant)) < HALF_TURN else 0.0
@@ -217,7 +217,7 @@ class SpatialCouplings(Model):
 
 
 def relative(a: Body, axis_a: Array, b: Body, axis_b: Array) -> Array:
-    """Return the rotation of b relative to a that aligns their axes and is nearest to the one given."""
+    """Return the rotation of b relative to a that aligns their axes and is nearest to the given rotation."""
     given: Array = a.rotation.T @ b.rotation
     axis_b_in_a = given @ axis_b
     turn, c = np.cross(axis_b_in_a, axis_a), float(axis_b_in_a @ axis_a)
@@ -251,7 +251,7 @@ def _power(z: Complex, n: int) -> Complex:
 
 
 def _angle(z: Complex) -> Any:
-    """Return the argument of a unit complex number, linear in the angles that it is made of."""
+    """Return the argument of a unit complex number, which is linear in the angles from which it was computed."""
     return 2.0 * np.arctan(z[1] / (1.0 + z[0]))
 
 

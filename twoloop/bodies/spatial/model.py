@@ -27,12 +27,12 @@ from twoloop.checks.arguments import Array, check_finite, check_positive, check_
 
 
 def across(a: Body, axis_a: Array, b: Body, axis_b: Array) -> JointRow:
-    """Keep a direction of a perpendicular to one of b."""
+    """Keep a direction of a perpendicular to a direction of b."""
     return JointRow(PERPENDICULAR, 1, a, b, Numbers(tuple(axis_a)), Numbers(tuple(axis_b)))
 
 
 def parallel(a: Body, axis_a: Array, b: Body, axis_b: Array) -> tuple[JointRow, ...]:
-    """Keep a direction of a parallel to one of b."""
+    """Keep a direction of a parallel to a direction of b."""
     return tuple(across(a, normal, b, axis_b) for normal in perpendiculars(axis_a))
 
 
