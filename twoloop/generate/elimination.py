@@ -98,7 +98,7 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # without refinement, random models kept 8 digits, unless pivots were this small or added rows hid small inertia
+        # refine solutions in these two cases: otherwise, solutions of random models had 8 digits without refinement
         is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _hides_little_inertia(choice, mass, G)
         choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
@@ -268,7 +268,7 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
 
 
 def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return whether rows added to M, as in `choice`, differ in scale, or M with these rows has much smaller pivots."""
+    """Return whether rows that `choice` adds to M have several scales, or M + s G^T G has relatively small pivots."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)

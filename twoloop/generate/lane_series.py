@@ -416,7 +416,7 @@ class LaneSeries:
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
         keys += [(pair, False) for pair in pairs - set(self.carried_pairs)]
-        keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # so neighbours often share a factor
+        keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours then often share a factor
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
         order = k + 1
         for begin in range(0, len(keys), MAX_SUMS_IN_LOOP):

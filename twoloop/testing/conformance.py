@@ -152,7 +152,7 @@ def _number(value: Any) -> bool:
 
 
 def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings) -> tuple[list[Finding], list[Skipped]]:
-    """Return the findings for all properties of one problem, and those that were not measured."""
+    """Return the findings for all properties of one problem, and the properties that were not measured."""
     values, motion = settings.values(problem), problem.reference
     limited = TimeLimitedSimulator(simulate, settings.time_limit)
     if problem.ends is not None:
@@ -188,9 +188,9 @@ def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings)
 def confirm_orders(
     simulate: Simulate, observation: Observation, settings: Settings, findings: list[Finding]
 ) -> list[Finding]:
-    """Return the findings, with orders that are too small measured again with steps of half the length.
+    """Return the findings after a second measurement, with steps of half the length, of orders that are too small.
 
-    Errors may vanish by chance at one step size, after which they seem to fall slowly.
+    Errors may vanish by chance at one step size; then they seem to decrease slowly with smaller steps.
     """
     failed = {finding.property for finding in findings if not finding.passed}
     low_orders = {name for name in failed if name.startswith("order of")}
@@ -246,7 +246,7 @@ def property_names(problem: KnownProblem, settings: Settings) -> list[str]:
 def _completion_finding(
     problem: KnownProblem, settings: Settings, values: list[float], runs: list[SimulatorRun]
 ) -> Finding:
-    """Check that the required runs reach the end: with fixed steps the two finest."""
+    """Check that the required runs reach the end: all runs or, with fixed steps, the two finest runs."""
     outcomes = list(zip(values, runs, strict=True))
     required = [outcome for outcome in outcomes if outcome[1].timed_out] or outcomes[0 if settings.tolerances else -2 :]
     for value, run in required:

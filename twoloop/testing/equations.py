@@ -1,7 +1,7 @@
 """Equations of motion of point masses, planar bodies and spatial bodies, in plain numpy.
 
-A body has the coordinates of its centre of mass, and an angle in the plane or four Euler parameters in space, whose
-normalisation e.e / 2 = 1/2 comes before the rows of the joints.
+The coordinates of a body are its centre of mass and, in the plane, an angle, or in space four Euler parameters. Rows
+e.e / 2 = 1/2, which normalise Euler parameters, come before the rows of the joints.
 """
 
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ class PointEquations:
 
     @property
     def parameters(self) -> dict[str, ArrayLike]:
-        """Return the constants as `KnownProblem.parameters`; of bars, their lengths and masses are in M."""
+        """Return the constants as `KnownProblem.parameters`; lengths and masses of bars are contained in M."""
         n_axes = self.weight.shape[1]
         constants: dict[str, ArrayLike] = {"masses": self._mass[::n_axes, ::n_axes], "lengths": self._lengths}
         if np.count_nonzero(constants["masses"]) == len(self.weight):
@@ -149,7 +149,7 @@ class ShakenPoints(PointEquations):
 
     @property
     def parameters(self) -> dict[str, ArrayLike]:
-        """Return the constants, and those of the excitation."""
+        """Return the constants, including the constants of the excitation."""
         return super().parameters | {"force_amplitude": self._amplitude, "force_frequency": self._frequency}
 
     def force(self, t: float, q: Array, v: Array) -> Array:
@@ -168,7 +168,7 @@ class DrivenPoint(PointEquations):
 
     @property
     def parameters(self) -> dict[str, ArrayLike]:
-        """Return the constants, and those of the drive."""
+        """Return the constants, including the constants of the drive."""
         return super().parameters | {"drive_height": self._height, "drive_rate": self._rate}
 
     def constraint(self, t: float, q: Array) -> Array:
@@ -189,7 +189,7 @@ class DrivenPoint(PointEquations):
 
 
 class EndingForce(PointEquations):
-    """Points with a drag proportional to the square root of the remaining time, NaN beyond."""
+    """Points with a drag proportional to the square root of the time that remains until `ends`; later it is NaN."""
 
     def __init__(self, ends: float, *arguments: Any):
         super().__init__(*arguments)
@@ -288,7 +288,7 @@ class PlanarEquations:
         return total
 
     def _gap_jacobian(self, q: Array, i: int, a: Point, j: int, b: Point) -> Array:
-        """Return its derivative (2, n_q)."""
+        """Return the derivative (2, n_q) of `_gap` by q."""
         J = np.zeros((2, self.n_q))
         for body, point, sign in ((i, a, 1.0), (j, b, -1.0)):
             if body != GROUND:
@@ -458,7 +458,7 @@ class SpatialEquations:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Return the constants as `KnownProblem.parameters`; the moments (n_bodies, 3) are principal ones."""
+        """Return the constants as `KnownProblem.parameters`; inertias: the principal moments (n_bodies, 3)."""
         masses, inertias = zip(*self._bodies, strict=True)
         return {"masses": masses, "inertias": [np.diag(J) for J in inertias], "gravity": self._gravity}
 

@@ -25,7 +25,7 @@ from twoloop.testing.properties import (
     remaining_error,
 )
 
-EXPLAINED = 0.1  # an explanation must reduce the error to this fraction
+EXPLAINED = 0.1  # an explanation counts if it reduces the error to this fraction
 POINTS_PER_INTERVAL = 20  # interpolation points per interval of a known motion
 
 
@@ -44,11 +44,11 @@ class Evidence:
         return self.observed.errors("q")[-1]
 
     def is_wrong(self, kind: str) -> bool:
-        """Return True if the limit of q or v, or with tolerances its error, failed."""
+        """Return True if q or v (`kind`) failed: its limit with fixed steps, or its error with tolerances."""
         return bool({f"error of {kind}", f"limit of {kind}"} & set(self.failed))
 
     def explains(self, q: Array) -> bool:
-        """Return True if replacing the coordinates of the finest run by these (n_t, n_q) removes most of the error."""
+        """Return True if coordinates q (n_t, n_q), in place of those of the finest run, have a much smaller error."""
         motion = self.observed.motion
         remaining = np.abs(q - motion.q).max(axis=1) / motion.scales[0]
         return bool(remaining.max() < EXPLAINED * self.position.max())
@@ -59,7 +59,7 @@ class Evidence:
         return self.order_of("q", 1) if len(self.observed.runs) > 1 else None
 
     def order_of(self, kind: str, refinement: int) -> float | None:
-        """Return the observed order of q or v over a refinement; 1 is the last one."""
+        """Return the observed order of q or v over a refinement; refinement 1 is the last one."""
         coarse, fine = self.observed.errors(kind)[-refinement - 1 :][:2]
         coarse_step, fine_step = self.observed.settings[-refinement - 1 :][:2]
         floor = self.observed.rounding + self.observed.floor(kind)
@@ -74,7 +74,7 @@ def _output_hint(e: Evidence) -> str:
     if np.ptp(q, axis=0).max() == 0.0:
         return "Nothing moves: every row is the same."
     for shift, word in ((1, "late"), (-1, "early")):
-        rows = np.arange(1, len(q) - 1) + shift  # an end has no row beside it
+        rows = np.arange(1, len(q) - 1) + shift  # rows without the two ends, which lack a neighbour
         shifted_error = np.abs(q[rows] - motion.q[1:-1]).max() / motion.scales[0]
         if shifted_error < EXPLAINED * e.position[rows].max():
             return (
@@ -92,7 +92,7 @@ def _output_hint(e: Evidence) -> str:
 
 
 def _time_shift_hint(e: Evidence) -> str:
-    """Return a hint for states shifted in time, or on a clock that runs fast or slow."""
+    """Return a hint for states that are shifted in time, or belong to a clock that runs too fast or too slow."""
     run, motion = e.observed.runs[-1], e.observed.motion
     if run.v is None or not (e.is_wrong("q") or "order of q" in e.failed):
         return ""
@@ -117,7 +117,7 @@ def _time_shift_hint(e: Evidence) -> str:
         states = _interpolate(motion, np.clip(times, t0, motion.t[-1]))
         comparison = zip((run.q, run.v), states, motion.scales, errors, strict=True)
         if all(np.abs(a - b)[late].max() / scale < EXPLAINED * error for a, b, scale, error in comparison):
-            # with a wrong clock the positions do not change at the rate of the velocities; with wrong forces they do
+            # with a wrong clock, velocities are not the rates of the positions; with wrong forces, they are
             defect, scaled_defect = (np.linalg.norm((rates - factor * run.v)[late]) for factor in (1.0, ratio))
             if text is not wrong_clock or scaled_defect < 0.5 * defect:
                 return text
@@ -125,11 +125,11 @@ def _time_shift_hint(e: Evidence) -> str:
 
 
 def _interpolation_hint(e: Evidence) -> str:
-    """Return a hint for states that are right at the end of a run and wrong at times within."""
+    """Return a hint for states that are right at the end of a run, and wrong at times within the run."""
     if e.settings.tolerances is None:
         return ""
     run, motion = e.observed.runs[-1], e.observed.motion
-    for k in np.argsort(-e.position)[:3]:  # the worst times, at which runs are now ended
+    for k in np.argsort(-e.position)[:3]:  # repeat the run, with its end at each of the three worst times
         try:
             short = run_simulator(e.simulate, e.observed.problem, motion.t[: k + 1], e.observed.settings[-1])
         except (TypeError, ValueError):  # the simulator accepts no other times than those of the motion
@@ -192,7 +192,7 @@ def _constraint_rate_hint(e: Evidence) -> str:
 
 
 def _clock_hint(e: Evidence) -> str:
-    """Return a hint for constraints that hold at another time than that of the state."""
+    """Return a hint for constraints that hold at a time other than the time of the state."""
     problem, run = e.observed.problem, e.observed.runs[-1]
     if "constraints" not in e.failed:
         return ""
@@ -272,7 +272,7 @@ def _velocity_hint(e: Evidence) -> str:
         if np.linalg.norm((run.v - velocities)[start:]) < 2.0 * EXPLAINED * error:
             return f"Positions are right and velocities are not. {text}"
     if e.settings.tolerances and e.observed.errors("v")[-1].max() < EXPLAINED * e.observed.errors("v")[0].max():
-        return ""  # they converge
+        return ""  # the velocities converge
     violated = "velocity constraints" in e.failed
     advice = " They do not obey C_q v + C_t = 0 either: project them." if violated else ""
     return (
@@ -490,7 +490,7 @@ def _departure_hint(e: Evidence) -> str:
     )
 
 
-# the first rule that applies is the hint: from causes that are certain to those that fit any error
+# the first rule that applies is the hint; the order is from certain causes to causes that fit any error
 MOTION_HINTS: tuple[Callable[[Evidence], str], ...] = (
     *(_output_hint, _time_shift_hint, _singular_hint, _constraint_rate_hint, _acceleration_hint, _velocity_hint),
     *(_clock_hint, _unused_hint, _interpolation_hint, _drift_hint, _floor_hint, _low_order_hint, _coarse_hint),

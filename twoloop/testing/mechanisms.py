@@ -33,7 +33,7 @@ GRAVITY = 9.81  # m/s^2
 
 @cache
 def load_motion(name: str) -> Motion | None:
-    """Return the motion of a problem, read-only; None if none is stored."""
+    """Return the motion of a problem, read-only; None if no motion is stored."""
     with np.load(FILE, allow_pickle=False) as file:
         if f"{name}/t" not in file:
             return None
@@ -175,7 +175,7 @@ ANGLE_SUMS[[1, 3, 5], [0, 4, 6]] = 1.0
 # each point is a sum of vectors (body, x, y) in body axes, starting at the ground points (0, 0), B, A, A
 SHARED = [(0, 0.007, 0.0), (1, -0.028, 0.0)]  # the joint shared by the loops
 LOOPS = [(B, [(2, 0.0, -0.035)]), (A, [(3, 0.0, -0.02), (4, 0.04, 0.0)]), (A, [(5, 0.02, 0.0), (6, 0.0, -0.04)])]
-CENTRES = [  # of mass, as sums of vectors
+CENTRES = [  # centres of mass, as sums of vectors
     [(0, 0.00092, 0.0)],
     [(0, 0.007, 0.0), (1, -0.0115, 0.0)],
     [(2, 0.01874, 0.01043)],

@@ -8,18 +8,18 @@ import numpy as np
 from twoloop.testing.problem import Array, KnownProblem, Simulate, restart_at, run_simulator, solve_saddle_point
 
 START_INDICES = range(0, 86, 5)  # indices of the known motion from which the simulator is started
-N_LATER = 10  # number of output times after which its acceleration is measured
-ACCURATE = 0.2  # places whose accelerations are known to this part go before others
+N_LATER = 10  # number of output times from the start to the measurement of the simulator's acceleration
+ACCURATE = 0.2  # places are preferred if the uncertainty of their acceleration is at most this fraction
 SIGNIFICANT = 3.0  # a difference of accelerations is significant above this multiple of the estimated error
 UNEXPLAINED = 0.15  # largest remaining fraction of the difference for an accepted explanation
-FIT_RESIDUAL = 0.05  # the same for explanations with a fitted factor
+FIT_RESIDUAL = 0.05  # largest remaining fraction for explanations with a fitted factor
 DAMPING = "there is a force (a damping?) of"
-TIE = 1e-4  # fits whose residuals differ by less count as equal
+TIE = 1e-4  # fits count as equal if their residuals differ by at most this
 Mistake = Callable[[KnownProblem, float, Array, Array], Array]
 
 
 def _replace_term(term: str, mistaken_term: Callable[..., Array]) -> Mistake:
-    """Return the acceleration with one of M, Q, J and gamma replaced."""
+    """Return a function that computes accelerations with one of M, Q, J and gamma replaced."""
 
     def mistaken(problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
         terms = {
@@ -34,7 +34,7 @@ def _replace_term(term: str, mistaken_term: Callable[..., Array]) -> Mistake:
 
 
 def _scale_multipliers(factor: float) -> Mistake:
-    """Return the acceleration with the forces of the constraints multiplied by a factor."""
+    """Return a function that computes accelerations with constraint forces multiplied by a factor."""
 
     def mistaken(problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
         lam = problem.acceleration(t, q, v)[1]
@@ -102,7 +102,7 @@ MISTAKES: dict[str, Mistake] = {
 
 @dataclass(frozen=True, eq=False)
 class ObservedAcceleration:
-    """Acceleration of a simulator at one of its states, its uncertainty, and the true one."""
+    """Acceleration `a` of a simulator at one of its states, its uncertainty `doubt`, and the `true` acceleration."""
 
     problem: KnownProblem
     t: float
@@ -129,7 +129,7 @@ def find_mistake(simulate: Simulate, problem: KnownProblem, setting: float, *, b
     observations = [sample for sample in attempts if sample is not None]
     accurate = [sample for sample in observations if sample.is_accurate]
     samples = accurate if len(accurate) > 1 else observations
-    if len(samples) < 2:  # a single one may be a coincidence
+    if len(samples) < 2:  # agreement with a single sample may be a coincidence
         return ""
     best, smallest = "", UNEXPLAINED
     for name, mistake in MISTAKES.items():
@@ -172,7 +172,7 @@ def _fit_factor(samples: list[ObservedAcceleration]) -> str:
             if remaining < FIT_RESIDUAL:
                 size = f"{factor:.2g} v" if name == DAMPING else _factor_text(1.0 + factor)
                 residuals[f"{name} {size}"] = remaining
-    # force and mass of a free coordinate are equivalent: name all that fit, the force first
+    # force and mass of a free coordinate are equivalent: name all factors that fit, the force first
     smallest = min(residuals.values(), default=0.0)
     return ", or ".join(name for name, remaining in residuals.items() if remaining <= smallest + TIE)
 

@@ -51,7 +51,7 @@ def reference_motion() -> "Callable[[str], Motion]":
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """With a report, collect the measurements, including those of other processes."""
+    """If a report is requested, collect the measurements of all processes."""
     path = config.getoption("simulator_report")
     if path is not None and not hasattr(config, "workerinput"):
         config.pluginmanager.register(_ReportWriter(Path(path)), "twoloop_simulator_report")
@@ -117,7 +117,7 @@ class PropertyFailed(Exception):
 
 
 class _Suite(pytest.Collector):
-    """One problem, which the first of its tests runs."""
+    """One problem; the first of its tests runs the simulator on it."""
 
     arguments: "tuple[Callable[..., Any], KnownProblem, Settings]"
     _results: "tuple[dict[str, Finding], dict[str, str]] | None" = None
@@ -127,7 +127,7 @@ class _Suite(pytest.Collector):
 
     @property
     def results(self) -> "tuple[dict[str, Finding], dict[str, str]]":
-        """Return the findings by property, and the reasons why others were not measured."""
+        """Return the findings by property, and the reasons why other properties were not measured."""
         if self._results is None:
             from twoloop.testing.conformance import check_problem
 

@@ -93,7 +93,7 @@ def rotate(e: Array, a: Array) -> Array:
 
 
 def rotate_jacobian(e: Array, a: Array) -> Array:
-    """Return the derivative (3, 4) of R(e) a with respect to the Euler parameters, which is linear in these."""
+    """Return the derivative (3, 4) of R(e) a by the Euler parameters; the derivative is linear in them."""
     u = e[1:]
     by_u = (u @ a) * np.eye(3) + np.outer(u, a) - np.outer(a, u) - e[0] * skew(a)
     return 2.0 * np.column_stack([e[0] * a + np.cross(u, a), by_u])
@@ -105,7 +105,7 @@ def rate_matrix(e: Array) -> Array:
 
 
 def euler_parameters(R: Array) -> Array:
-    """Return the Euler parameters (4,) of a rotation matrix, computed from the largest one, with e0 >= 0."""
+    """Return the Euler parameters (4,) of a rotation matrix, with e0 >= 0; the largest one is computed first."""
     products = np.empty((4, 4))
     products[0, 0], products[1:, 1:] = 1.0 + np.trace(R), R + R.T + (1.0 - np.trace(R)) * np.eye(3)
     products[0, 1:] = products[1:, 0] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
@@ -262,13 +262,13 @@ class KnownProblem:
         return self.row_powers.size
 
     def acceleration(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the acceleration (n_q,) and multipliers (n_c,) at a consistent state; minimum norm."""
+        """Return the acceleration (n_q,) and the multipliers (n_c,) of minimum norm at a consistent state."""
         return solve_saddle_point(self.mass(t, q), self.force(t, q, v), self.jacobian(t, q), self.gamma(t, q, v))
 
     def reaction(self, joint: KnownJoint, t: float, q: Array, lam: Array) -> tuple[Array, Array]:
         """Return force (n_axes,), N, and torque (0,), (1,) or (3,), N m, of a joint on its first body, at its point.
 
-        Components along the axes of space. With redundant rows they depend on the choice of lam; that of `reference`
+        Components are along the axes of space. With redundant rows they depend on the choice of lam; lam of `reference`
         has minimum norm.
         """
         body = self.bodies[joint.bodies[0]]
@@ -448,7 +448,7 @@ class _Stop(SystemExit):
 
 
 class TimeLimitedSimulator:
-    """A simulator whose runs raise `TimeLimitExceeded` after some seconds; it is not run again after that."""
+    """A simulator whose runs raise `TimeLimitExceeded` after some seconds; after such a run, it is not run again."""
 
     def __init__(self, simulate: Any, seconds: float | None):
         self._simulate, self._seconds, self.timeout_message = simulate, seconds, ""

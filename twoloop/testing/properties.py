@@ -138,11 +138,11 @@ MAX_ERROR = 0.3  # largest error allowed at any tolerance
 POSITION_FACTOR = 10.0  # allowed position constraint violation, in tolerances
 VELOCITY_FACTOR = 100.0  # allowed velocity constraint violation, in tolerances
 STEP_VIOLATION = 1e-8  # allowed position constraint violation with fixed steps
-ROUNDING = 1e-9  # with fixed steps, times the growth: smaller errors are not compared
+ROUNDING = 1e-9  # with fixed steps, errors below this number times the growth of perturbations are not compared
 UNRESOLVED = 1e-2  # error allowed for steps that do not resolve a stiff vibration
 LAM_DIGITS = 6.0  # digits of the known multipliers required for a comparison
 LEAST_ORDER = 0.7  # required order if none is given
-UNUSED_SHARE = 0.01  # part of the allowed error that is allowed at the last tolerance if it changes nothing
+UNUSED_SHARE = 0.01  # if the last tolerance changes nothing, only this fraction of the allowed error is allowed at it
 ORDER_SLACK = 0.6  # tolerance of the observed order
 
 
@@ -204,7 +204,7 @@ def constraint_violations(
         values = [problem.constraint(t, q)]
         if run.v is not None:
             values.append(J @ run.v[k] + problem.constraint_rate(t, q))
-        # scaled rows, so that the rank does not depend on units; near singular positions only the correctable part
+        # scaled rows, so that the rank does not depend on units; near singular positions, only the part that C_q spans
         size = np.linalg.norm(J, axis=1)
         size = np.where(size > 0.0, size, 1.0)[:, None]
         corrections = np.linalg.lstsq(J / size, np.column_stack(values) / size, rcond=1e-6)[0]
@@ -232,7 +232,7 @@ def constraint_forces(problem: KnownProblem, motion: Motion, lam: Array) -> Arra
 
 
 def multiplier_errors(observed: Observation) -> list[Array]:
-    """Return the relative errors (n_t,) of the constraint forces of each run; 0 where they are unknown."""
+    """Return the relative errors (n_t,) of the constraint forces of each run; 0 if these forces are unknown."""
     problem, motion = observed.problem, observed.motion
     reference = constraint_forces(problem, motion, motion.lam)
     scale = max(1e-12, np.abs(reference).max())
@@ -280,7 +280,7 @@ def measure_properties(observed: Observation, settings: Settings) -> Iterator[Fi
 
 
 def _worst_finding(name: str, observed: Observation, errors: list[Array], limits: list[Array]) -> Finding:
-    """Return the finding at the worst place over all runs."""
+    """Return the finding for the time and run with the largest ratio of an error to its limit."""
     ratios = [np.max(run_errors / limit) for run_errors, limit in zip(errors, limits, strict=True)]
     k = int(np.argmax(ratios))
     worst = int(np.argmax(errors[k] / limits[k]))
@@ -291,7 +291,7 @@ def _worst_finding(name: str, observed: Observation, errors: list[Array], limits
 def tolerance_findings(observed: Observation, settings: Settings, kind: str) -> Iterator[Finding]:
     """Yield the error at the tolerance where it is largest relative to its limit."""
     limits = [error_limit(observed.motion, setting) for setting in observed.settings]
-    if ignores_last_setting(observed):  # a tolerance that changes nothing must be met with room to spare
+    if ignores_last_setting(observed):  # the error must then be far below a last tolerance that changes nothing
         limits[-1] = limits[-1] * UNUSED_SHARE
     limits = [limit + observed.floor(kind) for limit in limits]
     yield _worst_finding(f"error of {kind}", observed, observed.errors(kind), limits)
@@ -332,7 +332,7 @@ def refinement_changes(observed: Observation, kind: str) -> list[Array]:
 
 
 def observed_order(observed: Observation, kind: str) -> float | None:
-    """Return the order of the errors over the last refinement; that of the changes if the limit is wrong."""
+    """Return the order of the errors over the last refinement, or if the limit is wrong, the order of the changes."""
     floor = observed.rounding + observed.floor(kind)
     errors, changes, steps = observed.errors(kind), refinement_changes(observed, kind), observed.settings
     value, limit = remaining_error(errors, changes, floor)
@@ -344,7 +344,7 @@ def observed_order(observed: Observation, kind: str) -> float | None:
 def constraint_findings(observed: Observation, settings: Settings) -> Iterator[Finding]:
     """Yield the distances of positions and velocities from the constraints.
 
-    With fixed steps those of the velocities may also vanish with the step size, as for methods that only enforce C = 0.
+    With fixed steps, distances of velocities may also vanish with the step size, as in methods that only enforce C = 0.
     """
     violations = [constraint_violations(observed.problem, run, observed.motion.scales) for run in observed.runs]
     floor = 10.0 * 10.0 ** -observed.motion.digits["q"] + 1e-12
@@ -398,7 +398,7 @@ def _convergence_finding(observed: Observation, name: str, errors: list[Array], 
 def transformed_finding(
     observed: Observation, settings: Settings, name: str, transformed: Transformed, run: SimulatorRun, setting: float
 ) -> Finding:
-    """Return the error of a run in another frame or other units, compared with that of the original."""
+    """Return the error of a run in another frame or other units, compared with the error of the original run."""
     problem, motion = observed.problem, observed.motion
     if not run.complete:
         outcome = run.error or "numbers that are not finite"

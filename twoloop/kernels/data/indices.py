@@ -63,7 +63,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_STEP_RATIO was chosen
     GAMMA_SCALE,  # largest entry of Gamma so far
     REUSE,  # the factors of C_qd are not renewed if the last correction of positions is at most this
-    ROUNDED,  # rounding error of positions, which replaces REUSE for states that may be accepted
+    ROUNDED,  # rounding error of positions; replaces REUSE when a state that may be accepted is computed
     GENERATION,  # number of partitions that have been chosen in the run
     RANK,  # rank of C_q, stored if the workspace is allocated for another rank
     RANK_V,  # rank of C_q and A together, stored if the workspace is allocated for another rank
