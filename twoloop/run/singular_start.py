@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for derivatives along the motion
 # weights of five equally spaced samples of a function in its first and second derivative, for a spacing of 1
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# largest relative error of derivatives by finite differences; smaller derivatives count as 0
+# largest relative error of derivatives by finite differences; derivatives up to this relative size count as 0
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises if a zero singular value has a larger derivative than this, relative to the derivative of C_q
 MIN_RANK_DERIVATIVE = 1e-6

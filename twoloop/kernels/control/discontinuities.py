@@ -9,7 +9,7 @@ b are sampled ahead of the step (`f`: kit, `w`: workspace), which costs less tha
 - If forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples
   follow the motion, on a parabola with the present position, velocity and acceleration. One set of samples is taken for
   one long step, or for all short steps that end within MIN_TIME_AHEAD spacings.
-- All other samples are "in time alone": at the state at which the step begins. Their spacing is also limited to a
+- All other samples are taken at a fixed state, the state where the step begins. Their spacing is also limited to a
   fraction of the step size.
 - The shortest time between two changes, and the shortest duration of a change within a short step, are recorded. If the
   spacing of samples is not much smaller, other changes as short may have been missed: a message says so.
@@ -401,7 +401,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # closely spaced samples along the motion replace samples in time alone, unless these must go on at a known change
+    # dense samples along the motion replace samples at a fixed state, unless these must go on at a known change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)

@@ -52,7 +52,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     MAY_JUMP,  # 1: C_t or b may jump
     JUMP_RATIO,  # largest ratio of a step's error to its estimate if a force jumps in the step
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
-    TIME_SPACING,  # largest spacing, s, of samples in time alone (these are taken ahead of short steps, too)
+    TIME_SPACING,  # largest spacing, s, of samples at a fixed state (these are taken ahead of short steps, too)
     # 1: samples ahead follow the motion; 0: samples use the present q and v, because a callback failed along the motion
     SAMPLE_MOTION,
     BY_TIME,  # 1: forces may change suddenly with time
@@ -86,11 +86,11 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     APPLIES_JUMP,  # 1: the next step goes from JUMP_FROM to JUMP_TO; new_state is the state after the jump
     JUMP_END,  # end of the last step that was rejected with an error above SUDDEN_ERROR, s
     PIVOT_HERE,  # fixed-order form: value of PIVOT in Work.notes at the end of the last step
-    # samples in time alone (at a fixed state) and samples along the motion: see discontinuities.py
-    SAMPLED_TO,  # time of the last sample in time alone, s
-    SAMPLED_EVERY,  # spacing of the last samples in time alone, s
+    # samples of forces, C_t and b ahead of a step, at a fixed state or along the motion: see discontinuities.py
+    SAMPLED_TO,  # time of the last sample at a fixed state, s
+    SAMPLED_EVERY,  # spacing of the last samples at a fixed state, s
     WIDEST_SAMPLING,  # widest spacing of samples so far, s
-    DISCONTINUITY,  # time of the next sudden change that samples in time alone show, s
+    DISCONTINUITY,  # time of the next sudden change that samples at a fixed state show, s
     DISCONTINUITY_OF_MOTION,  # time of the next sudden change that samples along the motion show, s
     COMPARED,  # beginning, s, of the last short step in which samples were compared with samples before and after it
     LAST_CHANGE,  # time of the last sudden change of a force, C_t or b, s

@@ -149,7 +149,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_redundant_stiffness(program, jacobian, is_independent, stiffness, c, right):
-    """For each redundant row g that stiffens M, add s g^T c_g to `right` in place; `c`: vector [r, c], contains c_g."""
+    """For each redundant row g that stiffens M, add s g^T c_g to `right` in place; `c` ([r, c]) contains c_g."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)
     product_rows, first, second, _ = stiffening_products_of(program)

@@ -110,7 +110,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # accepted steps have END_ERROR_WEIGHT * estimate_end_error up to this; the paper has no limit
+SUDDEN_ERROR = 10.0  # a step is rejected if END_ERROR_WEIGHT * estimate_end_error is larger; not in the paper
 
 
 @kernel(ATTEMPT)
