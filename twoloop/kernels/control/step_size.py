@@ -1,7 +1,7 @@
 """Step-size control: the size of the next step, the times at which steps end, and additional error measures.
 
 The next step size follows from the error of the last step. For methods with a trend (Gustafsson, ACM TOMS 20 (1994),
-496) the next size also depends on how the error has changed since the last accepted step.
+496) the next size also depends on how the error has changed since the last accepted step (`f`: kit, `w`: workspace).
 
 Errors that the embedded formula does not show are measured in two ways:
 

@@ -1,9 +1,9 @@
 """Evaluate the rows G of the constraints, their rates C_t and b, and by finite differences the right-hand side Gamma.
 
-The first rows of G are C_q, from C(t, q) = 0; the other rows are A, from A(t, q) v + b(t, q) = 0.
+The first rows of G are C_q, from C(t, q) = 0; the other rows are A, from A v + b = 0 (`f`: kit, `w`: workspace).
 
 Gamma, the right-hand side of G a = Gamma, is a derivative along the motion. Two central differences, with the steps e
-and 2 e (s), yield Gamma to order 4. Their disagreement estimates the error, by which the step e is chosen.
+and 2 e (s), yield Gamma to order 4. The step e is chosen by the estimated error: the disagreement of the differences.
 """
 
 import numpy as np

@@ -2,7 +2,7 @@
 
 Programs compute C_q and Gamma if no callback computes them (generate/derived_callbacks.py), and forces, prescribed
 motions and constraint rows that the user of a model defines by functions (bodies/programs.py). An exact derivative may
-overflow where the function itself does not, for example the derivative of tanh at large arguments.
+overflow where the function itself does not, for example the derivative of tanh. `f` is the kit, `w` the workspace.
 """
 
 import math

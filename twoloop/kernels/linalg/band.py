@@ -4,8 +4,8 @@ In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of 
 upper triangle of M, and top = 2 b for an LU, whose row exchanges fill another b diagonals (b: bandwidth).
 
 The LAPACK library comes with SciPy. Kernels are stored on disk, but addresses of LAPACK routines differ from process to
-process, and must not be part of compiled code. So a run stores `lapack_addresses` in its workspace, and passes one of
-them to `call_lapack`. (Numba calls LAPACK only for dense matrices, and allocates memory.)
+process, and must not be part of compiled code. So a run stores `lapack_addresses` in its workspace `w`, and passes one
+of them to `call_lapack`. (Numba calls LAPACK only for dense matrices, and allocates memory.) `f` is the kit.
 """
 
 import numpy as np

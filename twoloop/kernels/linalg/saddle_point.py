@@ -1,4 +1,4 @@
-"""Solve the linear equations of accelerations, M a + G^T lam = r and G a = c, in one of three forms.
+"""Solve M a + G^T lam = r, G a = c for accelerations a, in one of three forms (`f`: the kit, `w`: the workspace).
 
 - NULL_SPACE, for few degrees of freedom: a = g + T x, where G g = c, the independent entries of g are 0, and the
   columns of T = [I; D^T], D^T = -G_d^-1 G_i, are the velocities that the constraints allow. x is the solution of

@@ -2,7 +2,7 @@
 
 The history consists of modified divided differences (Krogh), scaled to the step size as in DASSL and IDA (fixed leading
 coefficient), so that the step size can change in every step. With equal steps, they are backward differences. They are
-stored for all coordinates (q, v), including dependent ones, so that a new partition needs no conversion.
+stored for all coordinates (q, v), so that a new partition needs no conversion. `f` is the kit, `w` the workspace.
 """
 
 from typing import Any

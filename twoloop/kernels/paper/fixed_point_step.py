@@ -1,4 +1,4 @@
-"""Attempt implicit Runge-Kutta steps with a fixed-point outer loop: twoloop's iteration, or that of the paper."""
+"""Attempt implicit Runge-Kutta steps by one of two fixed-point outer loops (`f`: the kit, `w`: the workspace)."""
 
 import numpy as np
 

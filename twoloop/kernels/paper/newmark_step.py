@@ -1,4 +1,4 @@
-"""Attempt Newmark steps by a fixed-point iteration on the independent accelerations. Equation numbers: the paper."""
+"""Attempt the paper's Newmark steps, by fixed-point iteration on accelerations (`f`: the kit, `w`: the workspace)."""
 
 import numpy as np
 

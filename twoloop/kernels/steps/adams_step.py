@@ -10,7 +10,7 @@ Notation: t_n are the times of accepted steps, psi_i(n) = t_n - t_{n-i}, psi_0 =
 literature; beta_i = prod_{j<i} psi_j(n+1) / psi_j(n). In the step, for s from 0 to 1, the polynomial through the last k
 accelerations is sum_i c_i(s) beta_i phi_i(n), with c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1).
 g_i = int c_i ds is the coefficient for velocities, G_i = int (1 - s) c_i ds is the coefficient for positions. All
-factors in these integrals are positive.
+factors in these integrals are positive. `f` is the kit, and `w` the workspace.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Implicit Runge-Kutta steps whose outer loop is Newton's method, for stiff problems.
 
-The unknowns are the stage accelerations a_j of the independent coordinates, as in `iterate_accelerations`:
+The unknowns are the stage accelerations a_j of the independent coordinates (`f`: kit, `w`: workspace):
 
     r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 

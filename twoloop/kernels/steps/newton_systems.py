@@ -2,7 +2,7 @@
 
 J_q and J_v are the derivatives of the accelerations by the independent positions and velocities. The corrections x of
 the independent accelerations solve (I - z^2 J_q - z J_v) x = r. The velocities that the constraints allow are
-v = T v_i, T = [I; -Cqd^-1 Cqi]. Multiplied by T^T M T, the system becomes
+v = T v_i, T = [I; -Cqd^-1 Cqi]. Multiplied by T^T M T, the system becomes (`f`: kit, `w`: workspace)
 
     T^T (M - z^2 K - z D) T x = T^T M T r.
 
