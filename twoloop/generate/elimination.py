@@ -262,7 +262,7 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # add 0.25: if parts of a mechanism differ by up to 1.25 steps, no digits are lost even without a factor
+    # 0.25 is added so that the factor is 1 for ratios down to SCALE_STEP ** -1.25, at which no digits are lost
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 

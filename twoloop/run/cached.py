@@ -557,7 +557,7 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
         run.fixed_order is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
     )
     start = t0, q0.tobytes(), v0.tobytes()
-    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # in compiled code
+    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # by compiled code alone
     idle: list[CachedIntegrator] | None = [] if can_start else None
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 

@@ -357,7 +357,7 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return whether a value is replaced: in this class, whether it is a compiled helper."""
+        """Return whether a copied function gets a replacement of this value: here, if it is a compiled helper."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:

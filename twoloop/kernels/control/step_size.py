@@ -92,7 +92,7 @@ def size_on_grid(clock, t, h, target, goal):
     margin = max(1e-6 * h, rounding)
     n_grid_steps = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + margin:
-        n_grid_steps = 0.0  # the step passes no grid time that is not counted yet
+        n_grid_steps = 0.0  # all grid times up to `target` are counted already
     end = clock[at.T_START] + (clock[at.N_FIXED] + n_grid_steps) * h
     reaches_goal = goal <= end + margin
     size = h

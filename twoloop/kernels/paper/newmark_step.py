@@ -67,7 +67,7 @@ def _estimated_error(options, tolerances, rate, h, q, v, a, a1):
 
 @kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h: iterate eq. (12) and the inner loop until the independent accelerations converge."""
+    """Attempt a step of size h: iterate eq. (12) of the paper, and the inner loop, until accelerations converge."""
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -96,7 +96,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
                 error = _estimated_error(options, tolerances, rate, h, q, v, a, a1)
-                if options[ERROR_TOL] == 0.0:  # otherwise follow the paper, which has no estimate `prediction_error`
+                if options[ERROR_TOL] == 0.0:  # if it is not zero, follow the paper, which does not add this estimate
                     for k in range(w.dependent.size):
                         m = w.dependent[k]
                         w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])

@@ -47,7 +47,7 @@ ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # indices of the arrays of a table (OperationGroups) and of a list of sums (Sums), see twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # index of an additional array of a list of sums: it tells where each sum is stored
+SUM_INDICES = N_SUMS  # index of one more array of a list of sums, which contains the index where each sum is stored
 # first positions, among the program's arrays, of the two tables and of the two lists of sums
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
