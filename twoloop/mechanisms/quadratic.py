@@ -1,10 +1,15 @@
 """Compile common callbacks of mechanisms with constant mass and force and quadratic constraints.
 
-Points and vectors fixed to bodies as coordinates ("natural" coordinates) give such constraints. The callbacks are
-compiled once for all of them; the parameters hold the terms, which `QuadraticSystem` collects::
+Points and vectors fixed to bodies as coordinates ("natural" coordinates) give such constraints. A row is a constant and
+a sum of products c a b of two scalars: a and b are affine functions of q, such as the difference of two coordinates.
+Products are not expanded: far from the origin, the squares of coordinates would cancel.
 
-    p = [n_c, number of entries of the mass, of linear terms, of quadratic terms,
-         force (n_q,), constants (n_c,), (i, j, m)..., (row, i, c)..., (row, i, j, c)...]
+The callbacks are compiled once for all mechanisms; the parameters hold the terms, which `QuadraticSystem` collects::
+
+    p = [n_c, number of entries of the mass, number of products, force (n_q,), constants (n_c,),
+         (i, j, m)..., (row, c, begin of a, end of a, begin of b, end of b)..., scalars]
+
+The begin and end of a scalar are indices in p; the scalar is its constant and pairs (i, coefficient).
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,11 +32,20 @@ ONE: Scalar = {None: 1.0}
 
 @helper
 def offsets(n_q, p):
-    """Return the offsets of the constants, the mass entries, the linear and the quadratic terms."""
-    constants = 4 + n_q
+    """Return the indices in p of the constants, the mass entries and the products, and the end of the products."""
+    constants = 3 + n_q
     entries = constants + int(p[0])
-    linear = entries + 3 * int(p[1])
-    return constants, entries, linear, linear + 3 * int(p[2])
+    products = entries + 3 * int(p[1])
+    return constants, entries, products, products + 6 * int(p[2])
+
+
+@helper
+def linear_part(p, begin, end, x):
+    """Return the scalar in p[begin:end] at x, without its constant."""
+    total = 0.0
+    for k in range(begin + 1, end, 2):
+        total += p[k + 1] * x[int(p[k])]
+    return total
 
 
 @callback("mass")
@@ -44,36 +58,38 @@ def mass(t, q, p, M):
 @callback("force")
 def force(t, q, v, p, Q):
     for i in range(q.size):
-        Q[i] = p[4 + i]
+        Q[i] = p[3 + i]
 
 
 @callback("constraint")
 def constraint(t, q, p, C):
-    constants, _, linear, quadratic = offsets(q.size, p)
+    constants, _, products, end = offsets(q.size, p)
     for row in range(C.size):
         C[row] = p[constants + row]
-    for k in range(linear, linear + 3 * int(p[2]), 3):
-        C[int(p[k])] += p[k + 2] * q[int(p[k + 1])]
-    for k in range(quadratic, quadratic + 4 * int(p[3]), 4):
-        C[int(p[k])] += p[k + 3] * q[int(p[k + 1])] * q[int(p[k + 2])]
+    for k in range(products, end, 6):
+        a, a_end, b, b_end = int(p[k + 2]), int(p[k + 3]), int(p[k + 4]), int(p[k + 5])
+        C[int(p[k])] += p[k + 1] * (linear_part(p, a, a_end, q) + p[a]) * (linear_part(p, b, b_end, q) + p[b])
 
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
-    _, _, linear, quadratic = offsets(q.size, p)
-    for k in range(linear, linear + 3 * int(p[2]), 3):
-        Cq[int(p[k]), int(p[k + 1])] += p[k + 2]
-    for k in range(quadratic, quadratic + 4 * int(p[3]), 4):
-        row, i, j, c = int(p[k]), int(p[k + 1]), int(p[k + 2]), p[k + 3]
-        Cq[row, i] += c * q[j]
-        Cq[row, j] += c * q[i]
+    _, _, products, end = offsets(q.size, p)
+    for k in range(products, end, 6):
+        row, a, a_end, b, b_end = int(p[k]), int(p[k + 2]), int(p[k + 3]), int(p[k + 4]), int(p[k + 5])
+        by_a = p[k + 1] * (linear_part(p, b, b_end, q) + p[b])
+        by_b = p[k + 1] * (linear_part(p, a, a_end, q) + p[a])
+        for m in range(a + 1, a_end, 2):
+            Cq[row, int(p[m])] += by_a * p[m + 1]
+        for m in range(b + 1, b_end, 2):
+            Cq[row, int(p[m])] += by_b * p[m + 1]
 
 
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
-    quadratic = offsets(q.size, p)[3]
-    for k in range(quadratic, quadratic + 4 * int(p[3]), 4):
-        Qd[int(p[k])] -= 2.0 * p[k + 3] * v[int(p[k + 1])] * v[int(p[k + 2])]
+    _, _, products, end = offsets(q.size, p)
+    for k in range(products, end, 6):
+        a, a_end, b, b_end = int(p[k + 2]), int(p[k + 3]), int(p[k + 4]), int(p[k + 5])
+        Qd[int(p[k])] -= 2.0 * p[k + 1] * linear_part(p, a, a_end, v) * linear_part(p, b, b_end, v)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,23 +131,13 @@ class QuadraticSystem:
         self.joints: list[Joint] = []
         self._lines: list[tuple[Sequence[Scalar], Sequence[Scalar]]] = []
         self._constants: list[float] = []
-        self._linear: list[tuple[float, ...]] = []
-        self._quadratic: list[tuple[float, ...]] = []
+        self._products: list[tuple[int, float, Scalar, Scalar]] = []
 
     def row(self, *products: tuple[float, Scalar, Scalar]) -> int:
         """Add a row: the sum of c a b over the products (c, a, b) of two scalars is zero; return its number."""
-        number, constant = len(self._constants), 0.0
-        for factor, first, second in products:
-            for i, a in first.items():
-                for j, b in second.items():
-                    c = factor * a * b
-                    if i is not None and j is not None:
-                        self._quadratic.append((number, i, j, c))
-                    elif i is None and j is None:
-                        constant += c
-                    else:
-                        self._linear.append((number, j if i is None else i, c))  # type: ignore[arg-type]
-        self._constants.append(constant)
+        number = len(self._constants)
+        self._constants.append(sum(c * a[None] * b[None] for c, a, b in products if a.keys() == b.keys() == {None}))
+        self._products += [(number, *each) for each in products if not each[1].keys() == each[2].keys() == {None}]
         return number
 
     def distance(self, first: Sequence[Scalar], second: Sequence[Scalar], length: float) -> int:
@@ -153,13 +159,22 @@ class QuadraticSystem:
     def system(self, name: str, bandwidth: int | None = None) -> ConstrainedSystem:
         """Return the system of the rows so far."""
         entries = [(i, j, self.mass[i, j]) for i, j in np.argwhere(self.mass)]
-        sizes = [len(self._constants), len(entries), len(self._linear), len(self._quadratic)]
-        tables = [np.ravel(table) for table in (entries, self._linear, self._quadratic)]
+        sizes = [len(self._constants), len(entries), len(self._products)]
+        head = np.concatenate([sizes, self.force, self._constants, np.ravel(entries)])
+        end = len(head) + 6 * len(self._products)
+        places, scalars = [], []
+        for row, c, *factors in self._products:
+            places += [row, c]
+            for scalar in factors:
+                pairs = [(i, a) for i, a in scalar.items() if i is not None and a != 0.0]
+                scalars += [scalar.get(None, 0.0), *np.ravel(pairs)]
+                places += [end, end + 1 + 2 * len(pairs)]
+                end = places[-1]
         return ConstrainedSystem(
             n_q=self.force.size,
             n_c=len(self._constants),
             **callbacks_in(globals()),
-            parameters=np.concatenate([sizes, self.force, self._constants, *tables]),
+            parameters=np.concatenate([head, places, scalars]),
             constant_mass=True,
             bandwidth=bandwidth,
             joints=self.joints,
