@@ -162,14 +162,15 @@ class QuadraticSystem:
         sizes = [len(self._constants), len(entries), len(self._products)]
         head = np.concatenate([sizes, self.force, self._constants, np.ravel(entries)])
         end = len(head) + 6 * len(self._products)
-        places, scalars = [], []
+        places: list[float] = []
+        scalars: list[float] = []
         for row, c, *factors in self._products:
             places += [row, c]
             for scalar in factors:
                 pairs = [(i, a) for i, a in scalar.items() if i is not None and a != 0.0]
                 scalars += [scalar.get(None, 0.0), *np.ravel(pairs)]
-                places += [end, end + 1 + 2 * len(pairs)]
-                end = places[-1]
+                begin, end = end, end + 1 + 2 * len(pairs)
+                places += [begin, end]
         return ConstrainedSystem(
             n_q=self.force.size,
             n_c=len(self._constants),
