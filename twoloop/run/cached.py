@@ -80,7 +80,7 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # after a run of less CPU time, s, elapsed time replaces CPU time, which takes longer to read
+SHORT_RUN = 1e-3  # CPU time (s); after a shorter run, elapsed time replaces CPU time, which takes longer to read
 HARMLESS = 0.01  # a correction of v0 is always accepted if it is at most this fraction of the tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
@@ -118,7 +118,7 @@ class CachedIntegrator:
         self.parametric = None if shared is None else ParametricRun(shared, run)
         self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
-        # largest number of attempted steps in the first chunk, and so of its states: each attempt adds at most one
+        # largest number of attempted steps in the first chunk, which adds at most one state for each attempt
         n_attempts = max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, n_attempts
         checked = system if self.parametric is None else self.parametric.system
@@ -237,8 +237,8 @@ class CachedIntegrator:
         """Check the first chunk of a run, and integrate to the end if this chunk does not reach it or is unusual.
 
         If the run is unusual, return what `integrate` has to return: fields, a request, or None (the start needs more
-        checks). Otherwise store a requested `sol` in `fields`, and return a tuple with one element: (output times,
-        states), or None if all steps are output. `is_due`: see `check_callbacks_along_run`.
+        checks). Otherwise store a requested `sol` in `fields`, and return a tuple with one element: the pair (output
+        times, states), or None if all steps are output. `is_due`: see `check_callbacks_along_run`.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -360,7 +360,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-# `set_up` need not check a start if its smallest pivot is at least this fraction of the pivot at the first start
+# `set_up` need not check a start whose smallest pivot is at least this fraction of the one at the first start
 RECHECK_PIVOT = 0.1
 
 

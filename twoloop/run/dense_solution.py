@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
-Groups = NDArray[np.int64]
+Integers = NDArray[np.int64]
 
 MAX_DIVIDED_INTERVALS = 512  # largest number of intervals with cached interior states
 MAX_ACCURATE_INTERVALS = 65536  # largest number of cached intervals that need no interior states
-# a polynomial is accurate if its residual in constraints and equations of motion, relative to the tolerances, is up to
-# MAX_ERROR; MAX_ERROR_ACROSS across singular positions, where velocities had errors of ten times the residual
+# a polynomial is accurate if its residual in constraints and equations of motion, relative to the tolerances, is at
+# most MAX_ERROR. Across singular positions, where velocity errors were ten times the residual: MAX_ERROR_ACROSS
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
 N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
 
@@ -155,35 +155,35 @@ class Interpolator:
         """Return rows [q, v] at `times`, which must be sorted and within the table."""
         if len(times) == 0 or len(table.t) == 1:
             return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
-        intervals = np.searchsorted(table.t[1:-1], times, side="right")
-        (first,) = np.concatenate([[True], intervals[1:] != intervals[:-1]]).nonzero()
-        groups = _interval_groups(table, intervals[first])
-        groups[:, indices.FIRST_TIME], groups[:-1, indices.END_TIME] = first, first[1:]
-        groups[-1, indices.END_TIME] = len(times)
+        numbers = np.searchsorted(table.t[1:-1], times, side="right")
+        (first,) = np.concatenate([[True], numbers[1:] != numbers[:-1]]).nonzero()
+        intervals = _interval_rows(table, numbers[first])
+        intervals[:, indices.FIRST_TIME], intervals[:-1, indices.END_TIME] = first, first[1:]
+        intervals[-1, indices.END_TIME] = len(times)
         out = np.empty((len(times), 2 * self.system.n_q))
         failures = 0
         undivided = []
-        for block in _blocks_of_groups(groups):
+        for block in _blocks_of_intervals(intervals):
             self._divide_inaccurate_intervals(table, block)
-            divided, divided_groups, other_groups = self._separate_divided_intervals(table, block)
-            failures += self._interpolate_groups(divided, divided_groups, times, out)
-            undivided.append(other_groups)
-        failures += self._interpolate_groups(table, np.concatenate(undivided), times, out)
+            divided, divided_intervals, other_intervals = self._split_intervals(table, block)
+            failures += self._interpolate_intervals(divided, divided_intervals, times, out)
+            undivided.append(other_intervals)
+        failures += self._interpolate_intervals(table, np.concatenate(undivided), times, out)
         self._record_failures(failures, len(times))
         return out
 
     def row_function(self, table: StateTable, t: float) -> Callable[[float], Array]:
         """Return a function that computes the row [q, v] at any time in the interval of `table` that contains t."""
-        groups = _interval_groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
-        groups[:, indices.END_TIME] = 1
-        self._divide_inaccurate_intervals(table, groups)
-        divided, divided_groups, other_groups = self._separate_divided_intervals(table, groups)
-        source, group = (divided, divided_groups) if len(divided_groups) else (table, other_groups)
+        intervals = _interval_rows(table, np.searchsorted(table.t[1:-1], [t], side="right"))
+        intervals[:, indices.END_TIME] = 1
+        self._divide_inaccurate_intervals(table, intervals)
+        divided, divided_intervals, other_intervals = self._split_intervals(table, intervals)
+        source, row = (divided, divided_intervals) if len(divided_intervals) else (table, other_intervals)
         time, out = np.empty(1), np.empty((1, 2 * self.system.n_q))
 
         def row_at(t: float) -> Array:
             time[0] = t
-            self._record_failures(self._interpolate_groups(source, group, time, out), 1)
+            self._record_failures(self._interpolate_intervals(source, row, time, out), 1)
             return out[0].copy()
 
         return row_at
@@ -194,9 +194,9 @@ class Interpolator:
         if failures > 0 and self.warns:
             _warn_of_lost_rank(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
-    def _interpolate_groups(self, table: StateTable, groups: Groups, times: Array, out: Array) -> int:
-        """Store rows [q, v] at the times of all groups in `out` (n, 2 n_q); return the number of failed projections."""
-        inputs = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
+    def _interpolate_intervals(self, table: StateTable, intervals: Integers, times: Array, out: Array) -> int:
+        """Store in `out` (n, 2 n_q) rows [q, v] at the times in these intervals; return the number of failures."""
+        inputs = (self.tolerances, table.t, table.states, np.ascontiguousarray(intervals))
         rest = (times, self.nodes, self.scratch, out)
         failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
         if failures > 0 and self.fixed_order is not None:
@@ -204,9 +204,9 @@ class Interpolator:
             failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
         return failures
 
-    def _divide_inaccurate_intervals(self, table: StateTable, groups: Groups) -> None:
+    def _divide_inaccurate_intervals(self, table: StateTable, intervals: Integers) -> None:
         """Compute and cache interior states of each interval whose polynomial is not accurate without them."""
-        start_times = table.t[groups[:, indices.FIRST_OWN]].tolist()
+        start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in start_times])
         if not self.may_divide or not is_new.any():
             return
@@ -215,42 +215,42 @@ class Interpolator:
             is_new = np.array([t not in self.accurate_intervals for t in start_times])
         if len(self.accurate_intervals) > MAX_ACCURATE_INTERVALS:
             self.accurate_intervals.clear()
-        groups = groups[is_new & (groups[:, indices.KIND] != indices.JUMP)]
+        intervals = intervals[is_new & (intervals[:, indices.KIND] != indices.JUMP)]
         for kind, plan in self.plans.items():
-            has_kind = groups[:, indices.KIND] == kind
+            has_kind = intervals[:, indices.KIND] == kind
             self.interior_states.update(
-                self._divide_intervals(table, plan, self.kits[kind], groups[has_kind, indices.FIRST_OWN])
+                self._divide_intervals(table, plan, self.kits[kind], intervals[has_kind, indices.FIRST_OWN])
             )
-        for i in groups[:, indices.FIRST_OWN].tolist():
+        for i in intervals[:, indices.FIRST_OWN].tolist():
             if (memory := self.crossing_memories.get(float(table.t[i]))) is not None:
                 self.interior_states[float(table.t[i])] = self._states_in_crossing_step(table, i, memory)
         is_divided = np.array(
-            [t in self.interior_states for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool
+            [t in self.interior_states for t in table.t[intervals[:, indices.FIRST_OWN]].tolist()], dtype=bool
         )
-        divided, own_groups, undivided = self._separate_divided_intervals(table, groups)
-        errors = np.zeros(len(groups))
-        errors[is_divided] = self._estimate_residuals(divided, own_groups)
+        divided, own_intervals, undivided = self._split_intervals(table, intervals)
+        errors = np.zeros(len(intervals))
+        errors[is_divided] = self._estimate_residuals(divided, own_intervals)
         errors[~is_divided] = self._estimate_residuals(table, undivided)
         # if the plan for its kind failed to divide an interval, the interval is too long for a polynomial
-        errors[~is_divided & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
-        is_accurate = errors <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
-        self.accurate_intervals.update(table.t[groups[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
+        errors[~is_divided & np.isin(intervals[:, indices.KIND], list(self.plans))] = np.inf
+        is_accurate = errors <= np.where(intervals[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
+        self.accurate_intervals.update(table.t[intervals[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
         for k in (~is_accurate).nonzero()[0]:
-            self._repair_interval(table, groups[k], float(errors[k]))
+            self._repair_interval(table, intervals[k], float(errors[k]))
 
-    def _estimate_residuals(self, table: StateTable, groups: Groups) -> Array:
-        """Return estimated residuals (one per group) of the polynomials of intervals, relative to the tolerances."""
-        out, groups = np.zeros(len(groups)), np.ascontiguousarray(groups)
-        arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.scratch, self.rows, out
+    def _estimate_residuals(self, table: StateTable, intervals: Integers) -> Array:
+        """Return the estimated residual of the polynomial of each of `intervals`, relative to the tolerances."""
+        out, intervals = np.zeros(len(intervals)), np.ascontiguousarray(intervals)
+        arrays = self.tolerances, table.t, table.states, intervals, self.nodes, self.scratch, self.rows, out
         entry_point(self.kernels.estimate_errors)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
-    def _repair_interval(self, table: StateTable, group: Groups, smallest: float) -> None:
+    def _repair_interval(self, table: StateTable, interval: Integers, smallest: float) -> None:
         """Try other nodes for the polynomial of an interval; cache them if they reduce its residual below `smallest`.
 
         Nodes to try: states in a step across a singular position, states of N_REPAIR_STEPS steps, and the two ends.
         """
-        i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
+        i, kind = int(interval[indices.FIRST_OWN]), int(interval[indices.KIND])
         begin = float(table.t[i])
         candidates = (
             lambda: self._cross_interval(table, i),
@@ -261,9 +261,9 @@ class Interpolator:
             if smallest <= MAX_ERROR_ACROSS or (interior := candidate()) is None:
                 continue
             new_table = StateTable(np.ascontiguousarray(interior[0]), np.ascontiguousarray(interior[1]), table.kinds)
-            new_group, last = group[None, :].copy(), len(new_table.t) - 1
-            new_group[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = 0, last, 0, last
-            error = float(self._estimate_residuals(new_table, new_group)[0])
+            new_interval, last = interval[None, :].copy(), len(new_table.t) - 1
+            new_interval[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = 0, last, 0, last
+            error = float(self._estimate_residuals(new_table, new_interval)[0])
             if error < smallest or not np.isfinite(smallest):
                 smallest = error
                 self.interior_states[begin] = new_table.t, new_table.states
@@ -299,7 +299,7 @@ class Interpolator:
         return times, states
 
     def _plan_for_repair(self, kind: int) -> tuple[Plan, Any]:
-        """Return plan and kit of N_REPAIR_STEPS steps, to divide an interval of this kind with a poor polynomial."""
+        """Return the plan and the kit that divide an interval of this kind into N_REPAIR_STEPS steps."""
         is_stiff = kind == indices.VELOCITIES
         if is_stiff not in self.repair_plans:
             from twoloop.methods.dop853 import DOP853
@@ -318,22 +318,22 @@ class Interpolator:
             self.repair_plans[is_stiff] = plan, make_kit(self.system, self.arguments[1], q0, plan, self.fixed_order)
         return self.repair_plans[is_stiff]
 
-    def _separate_divided_intervals(self, table: StateTable, groups: Groups) -> tuple[StateTable, Groups, Groups]:
-        """Return a StateTable of the cached interior states, the groups that have such states, and the other groups."""
-        start_times = table.t[groups[:, indices.FIRST_OWN]].tolist()
+    def _split_intervals(self, table: StateTable, intervals: Integers) -> tuple[StateTable, Integers, Integers]:
+        """Return a StateTable of the cached interior states, the intervals that have such states, and the others."""
+        start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_divided = np.array([t in self.interior_states for t in start_times], dtype=bool)
         pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
-        own_groups = groups[is_divided]
+        divided = intervals[is_divided]
         if not pairs:
-            return StateTable(table.t[:0], table.states[:0], table.kinds), own_groups, groups
+            return StateTable(table.t[:0], table.states[:0], table.kinds), divided, intervals
         t, states = zip(*pairs, strict=True)
         sizes = np.array(list(map(len, t)), dtype=np.int64)
-        own_groups[:, indices.LAST_OWN] = own_groups[:, indices.HIGH] = np.cumsum(sizes) - 1
-        own_groups[:, indices.FIRST_OWN] = own_groups[:, indices.LOW] = own_groups[:, indices.LAST_OWN] - sizes + 1
-        return StateTable(np.concatenate(t), np.concatenate(states), table.kinds), own_groups, groups[~is_divided]
+        divided[:, indices.LAST_OWN] = divided[:, indices.HIGH] = np.cumsum(sizes) - 1
+        divided[:, indices.FIRST_OWN] = divided[:, indices.LOW] = divided[:, indices.LAST_OWN] - sizes + 1
+        return StateTable(np.concatenate(t), np.concatenate(states), table.kinds), divided, intervals[~is_divided]
 
     def _divide_intervals(
-        self, table: StateTable, plan: Plan, kit: Any, intervals: Groups
+        self, table: StateTable, plan: Plan, kit: Any, numbers: Integers
     ) -> dict[float, tuple[Array, Array]]:
         """Divide intervals into `plan.parts` steps, or fewer if steps fail; return {first time: (times, states)}."""
         n = self.system.n_q
@@ -342,18 +342,18 @@ class Interpolator:
         step_arrays = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
         interior_states = {}
         for parts in range(plan.parts, 1, -1):
-            if len(intervals) == 0:
+            if len(numbers) == 0:
                 break
             n_states = parts + 1
-            out_t, out = np.empty(n_states * len(intervals)), np.empty((n_states * len(intervals), 3 * n))
+            out_t, out = np.empty(n_states * len(numbers)), np.empty((n_states * len(numbers), 3 * n))
             entry_point(self.kernels.fill_intervals)(
-                kit, self.work, *step_arrays, table.t, table.states, intervals, out_t, out
+                kit, self.work, *step_arrays, table.t, table.states, numbers, out_t, out
             )
             times, states = out_t.reshape(-1, n_states), out.reshape(-1, n_states, 3 * n)
             succeeded = np.isfinite(times[:, 0])
             start_times = times[:, 0].tolist()
             interior_states.update({start_times[k]: (times[k], states[k]) for k in succeeded.nonzero()[0].tolist()})
-            intervals = intervals[~succeeded]
+            numbers = numbers[~succeeded]
         return interior_states
 
     def interior_blocks(self, table: StateTable) -> Iterator[tuple[Array, Array]]:
@@ -361,8 +361,8 @@ class Interpolator:
 
         A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q) of m intervals; missing states are NaN.
         """
-        groups = _interval_groups(table, np.arange(len(table.t) - 1))
-        for block in _blocks_of_groups(groups):
+        intervals = _interval_rows(table, np.arange(len(table.t) - 1))
+        for block in _blocks_of_intervals(intervals):
             self._divide_inaccurate_intervals(table, block)
             start_times = table.t[block[:, indices.FIRST_OWN]].tolist()
             pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
@@ -399,31 +399,31 @@ class Interpolator:
                 _warn_of_lost_rank(text)
 
 
-def _blocks_of_groups(groups: Groups) -> list[Groups]:
-    """Return the groups in blocks of at most MAX_DIVIDED_INTERVALS, so that the cache can hold a block's states."""
-    return [groups[begin : begin + MAX_DIVIDED_INTERVALS] for begin in range(0, len(groups), MAX_DIVIDED_INTERVALS)]
+def _blocks_of_intervals(rows: Integers) -> list[Integers]:
+    """Return the rows of `_interval_rows` in blocks so small that the cache can hold the interior states of a block."""
+    return [rows[begin : begin + MAX_DIVIDED_INTERVALS] for begin in range(0, len(rows), MAX_DIVIDED_INTERVALS)]
 
 
-def _interval_groups(table: StateTable, intervals: Groups) -> Groups:
-    """Return a group (row of indices for kernels) for each of `intervals`, without output times."""
-    groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
-    groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
-    groups[:, indices.KIND] = table.kinds[intervals]
-    groups[:, indices.HIGH] = len(table.t) - 1
+def _interval_rows(table: StateTable, numbers: Integers) -> Integers:
+    """Return a row of indices (for kernels) for each interval number; the rows do not contain output times yet."""
+    rows = np.zeros((len(numbers), indices.N_COLUMNS), dtype=np.int64)
+    rows[:, indices.FIRST_OWN], rows[:, indices.LAST_OWN] = numbers, numbers + 1
+    rows[:, indices.KIND] = table.kinds[numbers]
+    rows[:, indices.HIGH] = len(table.t) - 1
     # polynomials across a singular position do not use states before the crossing, which may have rounding errors
     is_crossing = np.append(False, table.kinds == indices.ACROSS)
     (crossing_starts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
     if crossing_starts.size:
-        is_across = is_crossing[intervals + 1]
-        last_start = np.searchsorted(crossing_starts, intervals[is_across], side="right") - 1
-        groups[is_across, indices.LOW] = crossing_starts[last_start]
+        is_across = is_crossing[numbers + 1]
+        last_start = np.searchsorted(crossing_starts, numbers[is_across], side="right") - 1
+        rows[is_across, indices.LOW] = crossing_starts[last_start]
     (jumps,) = (table.kinds == indices.JUMP).nonzero()
     if not jumps.size:
-        return groups
-    next_jump = np.searchsorted(jumps, intervals)
-    groups[:, indices.LOW] = np.maximum(groups[:, indices.LOW], np.append(0, jumps + 1)[next_jump])
-    groups[:, indices.HIGH] = np.append(jumps, len(table.t) - 1)[next_jump]
-    return groups
+        return rows
+    next_jump = np.searchsorted(jumps, numbers)
+    rows[:, indices.LOW] = np.maximum(rows[:, indices.LOW], np.append(0, jumps + 1)[next_jump])
+    rows[:, indices.HIGH] = np.append(jumps, len(table.t) - 1)[next_jump]
+    return rows
 
 
 def _warn_of_lost_rank(consequence: str, stacklevel: int = 4) -> None:
@@ -441,7 +441,7 @@ class OutputInterpolation:
         """Interpolate rows [q, v] at output `times`, and store them for `complete_rows`.
 
         `t`, `rows`: times and rows [q, v, a, lam] of accepted steps. `kinds`: kinds of the intervals between steps.
-        `pattern`: 1 at the entries of the constraint rows at the start, 0 elsewhere.
+        `pattern`: 1 at the nonzero entries of the constraint rows at the start, 0 elsewhere.
         """
         run = self.run
         table = StateTable(t, rows[:, : 3 * run.system.n_q].copy(), kinds)
@@ -480,22 +480,22 @@ class DenseState:
     t : float or ndarray (n,)
         Times, s.
     q, v : ndarray (n_q,) or (n_q, n)
-        Coordinates and velocities, on the constraints to rounding. Exception: close to a singular position, where
-        rounding would dominate the velocities, they are not projected, and a warning says so.
+        Coordinates and velocities, satisfying the constraints to rounding error. Exception: close to a singular
+        position, where rounding would dominate the velocities, they are not projected, and a warning says so.
     a : ndarray (n_q,) or (n_q, n)
         Accelerations at these times, evaluated when they are first read.
     lam : ndarray (n_c + n_a,) or (n_c + n_a, n)
         Multipliers at these times, evaluated when they are first read.
     """
 
-    def __init__(self, interpolator: Interpolator, t: Array, order: Groups, rows: Array):
+    def __init__(self, interpolator: Interpolator, t: Array, order: Integers, rows: Array):
         self._interpolator, self._order, self._rows = interpolator, order, rows
         n = interpolator.system.n_q
         self.t: Any = t if t.ndim else float(t)
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return rows, sorted by time, as columns in the order of `t`; for a single time, as a vector."""
+        """Return `rows`, sorted by time, as columns in the order of `t`; for a single time, return a vector."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]
@@ -526,16 +526,16 @@ class DenseSolution:
     Between accepted steps q and v are Hermite polynomials; the inner loop then restores the dependent coordinates, so
     that the constraints hold to rounding. At an accepted step the state is the stored one. The polynomials go through
     q, v and a of four neighbouring states (order 12). Where Newton's method solved the outer loop, they go through q
-    and v (order 8), because a has the noise of vibrations that are stepped over. For `Lobatto16`, `BDF` and `Newmark`,
-    v has a polynomial of its own, through v and a (order 8).
+    and v (order 8), because a contains the noise of vibrations that are stepped over. For `Lobatto16`, `BDF` and
+    `Newmark`, v has a polynomial of its own, through v and a (order 8).
 
-    The steps of `RungeKutta` of order 6 and more (by Newton's method of order 7 and more), of `Taylor` and `Lobatto16`,
-    in `auto` too, are too long for such polynomials. Each is divided into 2 to 6 equal steps of the method when a time
-    within it is first evaluated; this costs about as much as the run. If the last of its states changes a polynomial by
-    more than the tolerances, the polynomial is compared with the constraints and the equations at two times in the
-    interval. Beside a singular position, or a force that jumps, a polynomial may violate them. Then the interval gets
-    the interior states of a step across the position, or of four steps of `DOP853` (or a Radau method, where Newton's
-    method was used), or none, whichever fits best. The evaluations for all this are not counted.
+    Some steps are too long for such polynomials: steps of `RungeKutta` of order 6 and more (with Newton's method, of
+    order 7 and more), of `Taylor` and of `Lobatto16`, also within `auto`. Each such step is divided into 2 to 6 equal
+    steps of the method when a time within it is first evaluated; this costs about as much as the run. If the last node
+    of a polynomial changes it by more than the tolerances, the polynomial is compared with the constraints and the
+    equations at two times in the interval. Beside a singular position or a jump of a force, a polynomial may violate
+    them. Then the interval gets the interior states of a step across the position, or of four steps of `DOP853` (of a
+    Radau method where Newton's method was used), or none, whichever fits best. These evaluations are not counted.
 
     The solution takes 8 (2 + 3 n_q) bytes of memory per step.
 

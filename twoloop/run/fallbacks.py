@@ -19,9 +19,9 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import TimedState, least_singular_value
 from twoloop.run.workspace import kit_for_plan, make_kit
 
-# ratio of two times: duration of the shortest change of forces or drives, over longest time between evaluations. Below
-# REPEAT_BELOW, the run may have missed shorter changes, and is repeated. Below WARN_BELOW, the run may even have missed
-# other changes of this duration, and warns if it is not repeated
+# limits of the duration of the shortest change of forces or drives, divided by the longest time between evaluations.
+# Below REPEAT_BELOW, the run may have missed shorter changes, and is repeated. Below WARN_BELOW, the run may even have
+# missed other changes of this duration, and warns if it is not repeated
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
 EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations that a repetition makes within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
@@ -35,7 +35,7 @@ def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
 
 
 def gap_for_repetition(run: Run) -> float:
-    """Return the largest time between evaluations, s, for a repetition of a run that may have missed short changes."""
+    """Return the largest time (s) between evaluations for a repetition of a run that may have missed short changes."""
     a, clock = run.a, run.clock
     return float(max(clock[a.SHORTEST_CHANGE] / EVALUATIONS_PER_CHANGE, clock[a.WIDEST_SAMPLING] / MAX_REFINEMENT))
 
@@ -114,13 +114,13 @@ class Origin(NamedTuple):
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# largest age of a base, s: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times the size of a
+# largest age of a base: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times the size of a
 # step that ends as far beyond the singular position as the current state is before it (see _find_base_state)
 MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
 # if the distance of an earlier state is below this fraction of the base's, another singular position is between them
 MIN_DISTANCE_RATIO = 0.5
 MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
-FAR_BEYOND = 0.3  # beyond a singular position, the run's own method continues only from this distance on
+FAR_BEYOND = 0.3  # beyond a singular position, the run's own method continues at this distance or farther away
 
 
 def requires_crossing(run: Run, code: int) -> bool:
@@ -135,7 +135,7 @@ def requires_crossing(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Replace a run's plan, whose steps fail or are unsuitable, by its substitute; retry the size of a failed step."""
+    """Replace a run's plan, whose steps fail or are unsuitable, by its substitute; try a failed size again."""
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` never changes, and needs no copy
@@ -222,11 +222,11 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 
 
 def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
-    """Return the base (first state) of a polynomial across a singular position, and the mirrored step size, s.
+    """Return the base (first state) of a polynomial across a singular position, and the mirrored step size (s).
 
-    The base is the latest state in `past` far from the position (near it, at a singular value s, rounding changes
-    velocities by eps/s^2); else the farthest state; None if the current state is farther. A step of the mirrored size
-    ends as far beyond the position as the base is before it, if the distance changes linearly; 0: the distance grows.
+    The base is the latest state in `past` that is far from the position, because rounding changes velocities near it;
+    if none is far, the farthest state; None if the current state is farther. If the distance changes linearly, a step
+    of the mirrored size ends as far beyond the position as the base is before it; 0: the distance grows.
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
     singular_value = least_singular_value(run.system, t, run.state[:n], run.rank)
@@ -247,7 +247,7 @@ def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | Non
 
 
 def sizes_across(longest: float, allowed: float) -> list[float]:
-    """Return the step sizes, s, to try across a singular position: `longest` times STEP_RATIOS, at most `allowed`."""
+    """Return the step sizes (s) to try across a singular position: `longest` times STEP_RATIOS, at most `allowed`."""
     first_size = min(longest, allowed)
     return [first_size, *(longest * part for part in STEP_RATIOS if longest * part < first_size)]
 

@@ -82,7 +82,7 @@ MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next one
 class Interrupts:
     """Handler of Ctrl-C that replaces Python's own handler (never a user's) until `restore_handlers` is called.
 
-    Before `install_handlers`, Ctrl-C raises KeyboardInterrupt, because there is no result yet that would be lost.
+    Before `install_handlers`, Ctrl-C raises KeyboardInterrupt, because no result would be lost yet.
     """
 
     n_signals, _is_installed = 0, False  # n_signals: number of times that Ctrl-C was pressed
@@ -140,7 +140,7 @@ def interrupted_fields(system: ConstrainedSystem, t0: float, events: list[Any] |
 BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
 BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
 CHUNK_TO_EVENT = 16  # attempted steps per chunk if an event may end the run: steps beyond the event are wasted
-# chunks do not grow further once a chunk takes more than this CPU time, s, so that Ctrl-C is noticed soon
+# chunks do not grow further once a chunk takes more than this CPU time (s), so that Ctrl-C is noticed soon
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
@@ -189,7 +189,7 @@ class IntegrationLoop:
         has_terminal_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if has_terminal_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # attempted steps from one check of progress to the next; total number of attempted steps at the next check
+        # number of attempted steps between two checks of progress; total number of attempted steps at the next check
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
@@ -469,7 +469,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """Return the states at all times at which steps had to end if a singular position was near; else []."""
+        """If the run passed near a singular position, return the states at the prescribed ends of steps; else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (
@@ -496,7 +496,7 @@ class IntegrationLoop:
         return Recorder(self.request, interpolator, n, run.t0, self.start, max_spacing)
 
     def _interval_kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:
-        """Return the kind of interval, for the dense solution, of each accepted step."""
+        """Return, for each accepted step, the kind of its interval in the dense solution."""
         run = self.run
         if not self.request.between_steps:
             return NO_KINDS

@@ -1,9 +1,9 @@
 """Monitor a run, and describe its end: status, message and advice.
 
 `StallDetector` detects a run that makes no progress. `StiffnessMonitor` samples states; after the run,
-`describe_stiffness` decides whether stability, not accuracy, limited the steps: at the sampled states, it estimates the
-rates of the fastest vibration and decay, by power iteration with dF/dq and dF/dv (F: accelerations), and compares each
-rate, times the step size, with the stability limit of the method.
+`describe_stiffness` decides whether stability, not accuracy, limited the steps. At the sampled states, it estimates the
+rates of the fastest vibration and decay, by power iteration with dF/dq and dF/dv (F: accelerations). It compares each
+rate times the step size with the stability limit of the method.
 """
 
 import sys
@@ -77,12 +77,12 @@ class StallDetector:
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
 N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
-INITIAL_FACTOR = 0.1  # this times `initial_direction` is added to the last eigenvectors: no component may stay 0
+INITIAL_FACTOR = 0.1  # this multiple of `initial_direction` is added to the last eigenvectors: no component may stay 0
 # the dominant eigenvalue is negative if the cosine of the angle from a direction to its image is below -MIN_ALIGNMENT
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
 # a problem counts as stiff if the median of h * rate / limit over the samples is at least this. `h`: step size; `rate`:
-# of the fastest vibration or decay; `limit`: largest stable h * rate. In smooth motion the median is 0.4
+# rate of the fastest vibration or decay; `limit`: largest stable h * rate. In smooth motion the median is 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -195,7 +195,7 @@ def _dominant_eigenvalue(
 
 # messages call C_q (or M) singular if the ratio of its smallest to its largest singular value is at most this
 MAX_SINGULAR_RATIO = 1e-3
-# a result is not to be trusted if rounding errors of velocities (or accelerations) exceed this multiple of tolerances
+# a result is not trusted if rounding errors of velocities (or accelerations) exceed this multiple of the tolerances
 MAX_LASTING_ERROR = 100.0
 MAX_RATIO_AT_END = 1e-6  # up to this ratio of singular values, constraints do not determine the velocities at the end
 # advice if no step leads across a singular position; loose tolerances help, because rounding errors are large near it

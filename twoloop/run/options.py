@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # stands for the arguments and options of the last call before the first call
+NO_OPTIONS: Any = (None,) * 12, None  # before the first call: in place of the arguments and options of the last call
 
 
 def options_of(

@@ -209,7 +209,7 @@ class ConsistentState(tuple[Array, Array]):
     dependent : tuple of int (rank,)
         Dependent coordinates: the best conditioned columns of C_q, in ascending order, without coordinates in `keep`.
     determinant_sign : int
-        Sign of the determinant of these columns of C_q; 0 if C_q has not full rank. Two positions with the same values
+        Sign of the determinant of these columns of C_q; 0 if C_q lacks full rank. Two positions with the same values
         of the other coordinates and opposite signs are on different assemblies, with a dead centre between them.
     margin : float
         Smallest over largest singular value of these columns, after scaling of rows and columns: 0 at a dead centre.
@@ -376,7 +376,7 @@ def _projected_position(
 def _describe_other_assembly(
     system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Project other guesses, as far from `q1` as `guess`; return words about another assembly, None: all on the same.
+    """Project other guesses, as far from `q1` as `guess`; return what happens to one that leaves the assembly, or None.
 
     On the same assembly, a guess is projected near the point that C_q predicts to first order, and the determinant
     keeps its sign. Two assemblies may differ in the dependent coordinates alone.
@@ -479,7 +479,7 @@ def _identify_assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int
 
 
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
-    """Return the right singular vector (n_q,) of the smallest nonzero singular value; its largest entry is 1."""
+    """Return the right singular vector (n_q,) of the smallest nonzero singular value, scaled to max|x| = 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
     nonzero = values > RANK_CUTOFF * values.max()
     direction = np.zeros(scaled.shape[1])
@@ -488,7 +488,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Return a sentence if C_q, unscaled and scaled, nearly loses rank, else ""."""
+    """Return a sentence if C_q nearly loses rank, both unscaled and scaled, else ""."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]
@@ -505,7 +505,7 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
 def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
-    """Return the message if the rank of the `free` columns is too small for a projection; `why`: what failed."""
+    """Return the message for a projection that fails as the rank of the `free` columns is too small; `why`: how."""
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
     name = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:

@@ -27,7 +27,7 @@ from twoloop.run.dense_solution import DenseSolution, Interpolator, StateTable
 if TYPE_CHECKING:
     from twoloop.run.run import Run
 
-MAGIC, HEADER_SIZE = b"\x93NUMPY\x01\x00", 128  # first bytes of a file in NumPy's format, and size of its header, bytes
+MAGIC, HEADER_SIZE = b"\x93NUMPY\x01\x00", 128  # first bytes of NumPy's file format, and size of its header in bytes
 STEP_ARRAYS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # fields with one row per step
 
 
@@ -79,7 +79,7 @@ class FileStore:
             self._write_header(file, name, dtype, (min(n, n_before), *width))
 
     def array(self, name: str) -> NDArray[Any]:
-        """Return all rows of an array as a memory map; changes of the array do not change the file."""
+        """Return all rows of an array as a memory map; changes to the array do not change the file."""
         return memory_map(self._path(name))
 
     def _path(self, name: str) -> Path:
@@ -100,7 +100,7 @@ class FileStore:
 
 
 def memory_map(path: Path) -> NDArray[Any]:
-    """Return the array in a NumPy file as a copy-on-write memory map: changes of the array do not change the file."""
+    """Return the array in a NumPy file as a copy-on-write memory map: changes to the array do not change the file."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
@@ -162,9 +162,9 @@ class Recorder:
     ):
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps = 0  # number of steps searched for events so far; the last one may contain a terminal event
-        self.last_step_size = 0.0  # time, s, from the beginning of the run's last step to the terminal event
+        self.last_step_size = 0.0  # time (s) from the beginning of the run's last step to the terminal event
         self.interrupted = False  # whether Ctrl-C interrupted the search for events, or the interpolation
-        # states at the ends of intervals that are still to be searched, and earlier nodes of the polynomials in these
+        # states at the ends of intervals still to be searched, and earlier nodes of the polynomials in these intervals
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
         self._next_interval = 0  # index, in `_t` and `_kinds`, of the first interval that is still to be searched
@@ -457,7 +457,7 @@ class Record:
 
     @property
     def energy(self) -> Array:
-        """Energy at the times `t`, J, (n_t,).
+        """Energy (J) at the times `t`, an array (n_t,).
 
         Raises
         ------
@@ -533,7 +533,7 @@ INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return fields of a record with one row per step; `counts`: see INITIAL_COUNTS; updated in place."""
+    """Return fields of a record with one row per step; update `counts` (see INITIAL_COUNTS) in place."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -541,7 +541,7 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
 
 
 def statistics(counters: Integers, cpu: float) -> Statistics:
-    """Return the Statistics of a run, given the array of counters of its workspace, and its CPU time, s."""
+    """Return the Statistics of a run, given the array of counters of its workspace, and its CPU time (s)."""
     return Statistics(**dict(zip(COUNT_NAMES, GET_COUNTS(counters.tolist()), strict=True)), cpu_time=cpu)
 
 

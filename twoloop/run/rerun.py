@@ -182,7 +182,7 @@ MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
 
 
 class RerunPiece(NamedTuple):
-    """Result of a rerun of a piece: rows [q, v] at the requested times, largest step size, s, and number of steps."""
+    """Result of a rerun of a piece: rows [q, v] at the requested times, largest step size (s), and number of steps."""
 
     states: Array
     longest: float

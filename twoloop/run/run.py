@@ -97,7 +97,7 @@ class Run:
         rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # without them, C_t is zero
         self.control[loop_state.MAY_JUMP] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
-        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # most attempted steps per chunk
+        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # largest number of attempts in a chunk
         self.clock = np.zeros(loop_state.N_CLOCK)
         self._reset_clock(t0)
         self.write_step_control(plan)
@@ -113,12 +113,12 @@ class Run:
         self.may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # size, s, of a step that begins and ends equally far from the position
+        self.mirrored_size = 0.0  # size (s) of a step that begins and ends equally far from the position
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
-        self.sizes_to_try: list[float] = []  # step sizes, s, that are still to be tried
-        self.larger_sizes: list[float] = []  # larger sizes, s, to try if too few nodes are beyond the position
-        self.crossing_size = 0.0  # size of the last attempted step across a singular position, s
-        self.piece_ends: list[float] = []  # ends, s, of the next pieces of the polynomial across a position
+        self.sizes_to_try: list[float] = []  # step sizes (s) that are still to be tried
+        self.larger_sizes: list[float] = []  # larger sizes (s) to try if too few nodes are beyond the position
+        self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
+        self.piece_ends: list[float] = []  # ends (s) of the next pieces of the polynomial across a position
         self.origins: list[Any] = []  # an `Origin` for each polynomial across the position that is still to be tried
         self.t1 = np.inf  # end of the run, s
         self.starts_singular = False  # whether the start is a singular position, and the rank rises beside it
@@ -154,7 +154,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to the state q, v at t, discard its past steps, compute accelerations; return code (0: done)."""
+        """Set the run to the state q, v at t, discard past steps, compute accelerations; return a code (0: done)."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -163,7 +163,7 @@ class Run:
         return code
 
     def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, first_size: float) -> None:
-        """Move a run's start from a state beside a singular position to this position; `first_size`: first step, s."""
+        """Move a run's start from a state beside a singular position to this position; `first_size`: first step (s)."""
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
@@ -187,7 +187,7 @@ class Run:
     def advance(
         self, outputs: Array, buffers: Buffers, filled: NDArray[np.int64], active: tuple[Plan, Array, Kit] | None = None
     ) -> int:
-        """Take compiled steps to the last of `outputs`, or until Python must act; return a code: why the steps ended.
+        """Take compiled steps to the last of `outputs`, or until Python must act; return a code: the reason.
 
         Steps end at all times in `outputs`. `filled` becomes the numbers of states and of steps in the buffers.
         `active`: plan, controls and kit for this call, if they differ from the attributes of the run.
@@ -199,7 +199,7 @@ class Run:
         return code
 
     def _copy_without_workspace(self) -> "Run":
-        """Return a copy of this run, which must be at its start, that has no workspace yet."""
+        """Return a copy of this run, still without a workspace; the run must be at its start."""
         new_run = object.__new__(Run)
         vars(new_run).update(
             vars(self),
@@ -387,7 +387,7 @@ class Run:
         return describe_equations(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
 
     def set_step_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
-        """Set the first step size and the limits of step sizes, s; `first_step` None: take an estimate."""
+        """Set the first step size and the limits of step sizes (s); if `first_step` is None, estimate it."""
         self.max_step = max_step
         self.limit_steps()
         proposed_size = self.choose_first_step(self.t0, t1, self.state, max_step)
@@ -405,7 +405,7 @@ class Run:
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the first step size, s, at a state; if `longest` (max_step) > 0, also limit the later step sizes."""
+        """Return the size (s) of the first step from a state; if `longest` (max_step) > 0, limit later sizes, too."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size

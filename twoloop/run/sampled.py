@@ -63,7 +63,7 @@ class SampledState(NamedTuple):
 class SampledRun:
     """Integration from sample to sample, with parameters of the forces that may change at samples.
 
-    `set_parameters` changes the parameters of `system`, which therefore nothing else may use. Raise TypeError or
+    `set_parameters` changes the parameters of `system`, so nothing else may use this object. Raise TypeError or
     ValueError if the start is refused, or the method is a Taylor series, whose code is valid for fixed parameters only.
     """
 
@@ -156,7 +156,7 @@ class SampledRun:
             self._write_parameter(index, float(values[index]))
 
     def step(self, dt: float) -> SampledState:
-        """Integrate for a time dt, s, from the last sample; store the final state as a new sample, and return it."""
+        """Integrate for a time dt (s) from the last sample; store the final state as a new sample, and return it."""
         if self._step_failed:
             self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()

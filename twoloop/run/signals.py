@@ -12,7 +12,7 @@ from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.events import Event
 from twoloop.problem.system import ConstrainedSystem
 
-# code objects of those functions of twoloop that call functions of the user
+# code objects of the functions of twoloop that call functions of the user
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
 COMPILERS = ("numba", "llvmlite")  # packages that break if an exception is raised between two of their instructions
 # signals whose handlers are replaced; not all of them exist on Windows

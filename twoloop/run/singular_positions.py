@@ -167,7 +167,7 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return M and the rows, scaled to unit masses and unit norms, divisors of the rows, and units of the coordinates.
+    """Return M scaled to unit masses, the rows scaled to unit norms, their divisors, and the units of the coordinates.
 
     The divisor of a row is its norm, or at least MIN_ROW_NORM times the norm expected from its derivative.
     """
@@ -198,13 +198,13 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
 # rounding errors are estimated along singular vectors with singular values up to this fraction of the largest one
 WEAK_RATIO = 1e-2
-# ratio of the smallest pivot to the largest: below SMALL_PIVOT, rounding errors are always estimated; it is typically
-# PIVOT_FACTOR times the ratio of singular values
+# rounding errors are always estimated if the ratio of the smallest pivot to the largest is below SMALL_PIVOT. The ratio
+# is typically PIVOT_FACTOR times the ratio of singular values
 SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return the ratio of the smallest pivot to the largest below which rounding may change velocities beyond rtol."""
+    """Return a limit of smallest pivot / largest pivot: below it, rounding may change velocities by more than rtol."""
     return min(
         WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
     )

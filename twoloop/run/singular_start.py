@@ -26,10 +26,10 @@ CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
 # largest relative error of derivatives by finite differences; derivatives up to this relative size count as 0
 MAX_DIFFERENCE_ERROR = 1e-8
-# the rank of C_q rises if a zero singular value has a larger derivative than this, relative to the derivative of C_q
+# the rank of C_q rises if the derivative of a zero singular value exceeds this, relative to the derivative of C_q
 MIN_RANK_DERIVATIVE = 1e-6
-# the derivative of a zero singular value is certain if it is at least this multiple of its uncertainty: the derivative
-# of the rows along velocities as large as the tolerances
+# the derivative of a zero singular value counts as certain if it exceeds this multiple of its uncertainty, which is the
+# norm of the derivative of the rows along a velocity as large as the tolerances
 MIN_CLARITY = 10.0
 # relative change of the rows: from the start to a state beside the start, and in the first step that is tried
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
@@ -124,5 +124,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time, s, in which rows change by `change`, given their first (1/s) and second (1/s^2) derivative."""
+    """Return the time (s) in which rows change by `change`, given their first (1/s) and second (1/s^2) derivative."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 # to find which forces depend on a coordinate or velocity x, x is displaced by this fraction of max(1, |x|)
 DISPLACEMENT = 1e-3
-# Newton's matrix gets sparse factors if they have at most this share of the entries, and operations, of dense factors
+# Newton's matrix gets sparse factors if its entries, and their operations, are at most this share of the dense ones
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -55,7 +55,7 @@ def newton_form(
     bodies: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Return the program that factorizes Newton's matrix, see sparse_lu.py, and the number of groups of its columns.
+    """Return the program that factorizes Newton's matrix (see sparse_lu.py), and the number of groups of its columns.
 
     One finite difference of forces yields all columns of a group. `mass`, `jacobian`: indices of nonzero entries.
     `bodies`: coordinates of each body. `stiff`: indices of `_stiff_rows`. Return None if sparse factors do not pay.
@@ -109,12 +109,12 @@ def _derivative_entries(
     return entries
 
 
-# a direction has no mass if the eigenvalue of a body's block of M is at most this fraction of its largest eigenvalue
+# a body has no mass along an eigenvector of its block of M if the eigenvalue is at most this fraction of the largest
 MASSLESS_RATIO = 1e-10
 # a row can give mass to the massless directions of a body if its part along them is at least this fraction of the row
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # Newton's matrix gets sparse factors from this number of coordinates on, relative to LARGE
-MAX_SHARE = 0.05  # sparse factors pay if they have at most this share of the entries, and operations, of dense factors
+MIN_SIZE_NEWTON = 1.6  # Newton's matrix may get sparse factors if n_q is at least this multiple of LARGE
+MAX_SHARE = 0.05  # sparse factors pay if entries of the matrix, and operations, are at most this share of dense ones
 
 
 class FixedOrderForm(NamedTuple):
@@ -272,7 +272,7 @@ def _nonzero_entries(pattern: Array) -> Entries:
 
 
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return a matrix with 1 at entries of M that are not zero at q0 or, if M is variable, at positions near q0."""
+    """Return a matrix with 1 at the entries of M that are nonzero at q0 (or, if M varies, at a nearby position)."""
     pattern = np.zeros((system.n_q, system.n_q))
     magnitudes = np.maximum(np.abs(q0), np.abs(q0).max())
     directions = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
