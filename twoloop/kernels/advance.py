@@ -1,7 +1,7 @@
 """Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
 `advance` serves all methods: the functions of a method are in the kit `f`, its data in `options` and `memory`. `w` is
-the workspace, `Work`; `t`: time, s; `size`: step size, s; `state`, `new_state`: [q, v, a, lam] before and after a step.
+the workspace, `Work`; `t`: time (s); `size`: step size (s); `state`, `new_state`: [q, v, a, lam] before and after it.
 """
 
 import numpy as np
@@ -60,7 +60,7 @@ from twoloop.kernels.linalg.dense import copy
 
 SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to the size of a rejected step
-# the trial of a method can fail for short steps only after this number of accepted steps: the first size is a guess
+# short steps end the trial of a method only after this number of accepted steps: the first size is a guess
 FIRST_JUDGED_STEP = 2
 
 
@@ -144,7 +144,7 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
     """Prepare the repetition of a failed step and return CONTINUE, or return an end code.
 
     A step is repeated with a smaller size, a new partition, or both; a step of fixed size, with a new partition and
-    only once. `t_repeated`: time, s, at which the last repeated step of fixed size began.
+    only once. `t_repeated`: time (s) at which the last repeated step of fixed size began.
     """
     n = w.Q.size
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
@@ -226,7 +226,7 @@ def advance(
     """
     fixed_size = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
-    t_repeated = np.inf  # time (s) at which the last step of fixed size began that was repeated with a new partition
+    t_repeated = np.inf  # beginning (s) of the last step of fixed size that was repeated with a new partition
     filled[0] = 0
     filled[1] = 0
     n_attempts = 0.0
@@ -266,7 +266,7 @@ def advance(
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        n_grid_steps = 1.0  # number of steps, of the grid of fixed steps, that this step completes
+        n_grid_steps = 1.0  # number of steps on the grid of fixed steps that this step completes
         if fixed_size:
             size, n_grid_steps, reaches_goal = size_on_grid(clock, t, h, target, goal)
         else:
@@ -357,7 +357,7 @@ def advance(
             out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
-        # a step that was shortened, such as to end at an output time, must not limit the size of the next step
+        # a step that was shortened, for example to end at an output time, must not limit the size of the next step
         clock[at.H_NEXT] = max(proposed_size, h) if shortened else proposed_size
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:

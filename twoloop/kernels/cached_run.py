@@ -1,13 +1,13 @@
 """Start a run and take its first steps in one compiled call, which stores all results in one array.
 
 `start_and_advance` checks the start, keeps the independent rows and dependent coordinates of the previous run, takes
-steps, and fills one array (`f` is the kit, `w` the workspace, `b` the other arrays, RUN_ARRAYS):
+steps, and fills one array (`f` is the kit, `w` the workspace; `b` has the other arrays, see RUN_ARRAYS):
 
     ... | report: N_REPORT numbers, counters | times | steps | states ...
                                                              ^ a fixed index
-`advance` writes states from the fixed index on. The other parts, whose length depends on the number of steps, are then
-copied so that they end where the states begin. So the used part is contiguous: Python copies it as one slice, and
-splits the copy when a field of the result is read.
+`advance` writes states, beginning at the fixed index. The other parts, whose length depends on the number of steps,
+are then copied so that they end where the states begin. So the used part is contiguous: Python copies it as one slice,
+and splits the copy when a field of the result is read.
 """
 
 import math
@@ -183,7 +183,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 # - RANK, WEAK: thresholds for `choose`; SCALE: factor s in M + s G^T G; MASS_FLAG: DEFINITE, INDEFINITE or 0 (constant)
 # - HAS_ALL_ENTRIES: 1 if `kinds` shows all entries of `rows`; CONTRADICTS: relative tolerance of redundant rows
 # - LEAST_PIVOT: smallest pivot of an accepted start; NEAR: pivot below which Python checks the run
-# - FIRST: first step size, s, that the user has chosen, or 0; LEAST: argument `smallest` of _first_step_size
+# - FIRST: first step size (s) that the user has chosen, or 0; LEAST: argument `smallest` of _first_step_size
 # - LONGEST, EVALUATES_WITHIN: arguments of _set_step_limits
 # - MAX_CHANGE_RATIO: largest change of velocities in the last step, relative to the change that accelerations explain
 # - MIN_SAMPLES: shortest time between two sudden changes, in spacings of samples
@@ -335,8 +335,8 @@ def _equals_last_start(last_start, t, t1, q, v):
 # indices in the report. N_STATES: number of states, including the first. N_STEPS: number of steps. NOTHING_TO_CHECK: 1
 # if Python need not check the run. JUMPED: 1 if velocities changed suddenly in the last step. IN_CHECKED_REGION: 1 if
 # all states are in the region in which callbacks were compared with their traces. DEFECT_KNOWN: 1 if the defect was
-# evaluated in every step. DEFECT: largest defect. LONGEST_GAP: longest time between two evaluations, s. END_CODE: code
-# that `advance` returned. IS_NEW: 1 if the start differs from the previous start. From N_REPORT on: the counters
+# evaluated in every step. DEFECT: largest defect. LONGEST_GAP: longest time (s) between two evaluations. END_CODE: code
+# that `advance` returned. IS_NEW: 1 if the start differs from the previous start. N_REPORT: first counter
 N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
 N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps

@@ -46,9 +46,9 @@ def _node_range(low, high, i, last):
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
     """Store nodes in z and coefficients in c of the Hermite polynomial through rows lo to hi; return their number.
 
-    The polynomial, in Newton's form, has the variable (time - t[i]) / h. It interpolates n columns of `states`, from
-    index `column` on, minus their values in row i. The next two groups of n columns are the first and the second
-    derivatives; the polynomial interpolates `order` of these three groups.
+    The polynomial, in Newton's form, has the variable (time - t[i]) / h. It interpolates n columns of `states`,
+    beginning with index `column`, minus their values in row i. The next two times n columns are the first and the
+    second derivatives; the polynomial interpolates values and order - 1 derivatives.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order
@@ -107,8 +107,7 @@ def _kind_by_duration(kind, tolerances, h, states, i):
 def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
     """Store the polynomials of an interval, given by a row of the table of intervals, in (z_q, c_q) and (z_v, c_v).
 
-    Return kind and duration of the interval, first and last node, number of derivatives at a node, and the number of
-    coefficients of each polynomial.
+    Return kind and duration of the interval, first and last node, values per node, and both numbers of coefficients.
     """
     i, last, kind = group[kinds.FIRST_OWN], group[kinds.LAST_OWN], group[kinds.KIND]
     h = t[last] - t[i]

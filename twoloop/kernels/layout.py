@@ -242,7 +242,7 @@ def _create_layout(
     of_integers, n_integers = _array_ranges(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + mass_side * mass_side, (mass_side, mass_side)
-    # number of integers at the end of `index` that only the choice of an order of elimination uses
+    # number of integers at the end of `index` that are scratch for choosing an elimination order, and need not be kept
     n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if fixed_order is None else 0
     n_lasting = of_numbers["matrices"][0], of_integers["index"][1] - n_ordering
     if n_a == 0:

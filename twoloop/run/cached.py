@@ -92,8 +92,8 @@ STEPS = OutputRequest()  # output at the ends of all steps
 class RepeatRequest:
     """Request to repeat a run that may have missed short changes of forces."""
 
-    max_gap: float  # largest time between two evaluations in the repetition, s
-    cpu_time: float  # CPU time of the run to be repeated, s
+    max_gap: float  # largest time between two evaluations in the repetition (s)
+    cpu_time: float  # CPU time of the run to be repeated (s)
 
 
 class CachedIntegrator:
@@ -131,7 +131,7 @@ class CachedIntegrator:
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
         self.attributes_at_start = {key: getattr(run, key) for key in ("plan", "memory", "chunk", "kit")}
-        self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
+        self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run (s)
         self.interpolation = OutputInterpolation(run)
         self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # last entry: whether generated code is called
         self.independent_rows = self.arrays.start_rows.tobytes()  # indices of the independent rows, as bytes
@@ -451,7 +451,7 @@ class CacheEntry(NamedTuple):
 
     run: Run
     start: tuple[float, bytes, bytes]  # t0, and the bytes of q0 and v0
-    t1: float  # end of the run, s
+    t1: float  # end of the run (s)
     code: GeneratedCode | None
     definite: bool  # whether M was definite at the start
     for_other_starts: bool  # whether copies of the run can begin at other starts

@@ -108,7 +108,7 @@ STRICT, WIDER, LOOSER = range(3)
 class Origin(NamedTuple):
     """Where a polynomial across a singular position begins, and its limits, for attempts with several step sizes."""
 
-    earliest: float  # no node of the polynomial is before this time, s
+    earliest: float  # no node of the polynomial is before this time (s)
     base: TimedState | None  # earlier state at which the polynomial begins; None: it begins at the current state
     limits: int = STRICT  # STRICT, WIDER or LOOSER
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run

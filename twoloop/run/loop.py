@@ -252,7 +252,7 @@ class IntegrationLoop:
         return self._build_record(check_derivatives)
 
     def _handle_code(self, steps: Array, across: bool, chunk_time: float) -> None:
-        """Act on `self.code`; set this code to PAUSED if the run goes on. `chunk_time`: CPU time of the chunk, s."""
+        """Act on `self.code`; set this code to PAUSED if the run goes on. `chunk_time`: CPU time of the chunk (s)."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness_monitor.samples:
                 self.stiffness_monitor.add_steps(steps[:, self.run.a.H])

@@ -56,7 +56,7 @@ class StallDetector:
         self.longest_step = self.mean_step = 0.0
 
     def add_steps(self, h: Array) -> None:
-        """Add the sizes of accepted steps, s."""
+        """Add the sizes of accepted steps (s)."""
         self.longest_step = max(self.longest_step, float(h.max(initial=0.0)))
         self.window_n += len(h)
 
@@ -93,7 +93,7 @@ class StiffnessSample(NamedTuple):
     q: Array
     v: Array
     a: Array
-    h: float  # step size before the state, s
+    h: float  # step size before the state (s)
     vibration: float  # largest stable h times the angular frequency of a vibration
     decay: float  # largest stable h times the rate of a decay
 
@@ -103,11 +103,11 @@ class StiffnessMonitor:
 
     def __init__(self, plan: Plan):
         self.plan, self.sampling_interval, self.n_calls, self.n_steps = plan, 1, 0, 0
-        self.last_sizes = np.zeros(0)  # sizes of the last N_LAST_STEPS steps, s
+        self.last_sizes = np.zeros(0)  # sizes of the last N_LAST_STEPS steps (s)
         self.samples: list[StiffnessSample] = []
 
     def add_steps(self, steps: Array) -> None:
-        """Add the sizes of accepted steps, s."""
+        """Add the sizes of accepted steps (s)."""
         self.n_steps += steps.size
         last = steps[-N_LAST_STEPS:]
         self.last_sizes = last if last.size == N_LAST_STEPS else np.concatenate([self.last_sizes, last])[-N_LAST_STEPS:]

@@ -120,7 +120,7 @@ class Run:
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
         self.piece_ends: list[float] = []  # ends (s) of the next pieces of the polynomial across a position
         self.origins: list[Any] = []  # an `Origin` for each polynomial across the position that is still to be tried
-        self.t1 = np.inf  # end of the run, s
+        self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position, and the rank rises beside it
         self.branch_known = False  # whether the branch of the motion that leaves such a start is known
         self.jumps: list[float] = []  # times at which C_t or b, and therefore the velocities, jumped

@@ -108,7 +108,7 @@ class SampledRun:
             np.empty((MAX_ATTEMPTS, self.run.a.N_STEP_COLUMNS)),
         )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time, s; longest allowed time between evaluations, s
+        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); longest allowed time between evaluations (s)
         self._store_sample(t0)
 
     def _create_run(self, t: float, q: Array, v: Array) -> Run:
@@ -128,7 +128,7 @@ class SampledRun:
 
     @property
     def t(self) -> float:
-        """Time of the last sample, s."""
+        """Time of the last sample (s)."""
         return self.times[-1]
 
     def set_parameters(self, inputs: Any) -> None:

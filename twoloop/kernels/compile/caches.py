@@ -52,8 +52,7 @@ class UntrustedFile(OSError):
 def read_trusted(path: Path) -> bytes:
     """Return the content of a file in a folder that `trusted_folder` has returned.
 
-    Raises OSError if there is no such file. Raises UntrustedFile if another user could have written the file; a warning
-    is printed on stderr.
+    Raises OSError if there is no such file. Raises UntrustedFile, and warns, if another user could have written it.
     """
     with path.open("rb") as file:
         if reason := _reason_of_mode(os.fstat(file.fileno())):
@@ -166,7 +165,7 @@ def _warn_first(text: str) -> None:
 
 
 MAX_ON_DISK = 500  # largest number of files on disk for each kind of functions generated for mechanisms
-CHECKSUM_SIZE = hashlib.sha256().digest_size  # length of the checksum at the beginning of a file, bytes
+CHECKSUM_SIZE = hashlib.sha256().digest_size  # length (bytes) of the checksum at the beginning of a file
 
 
 class CodeFiles:
@@ -226,7 +225,7 @@ class CodeFiles:
 
 
 def _time_written(path: Path) -> float:
-    """Return the time when a file was written, s, or 0 if another process has removed the file."""
+    """Return the time (s) when a file was written, or 0 if another process has removed the file."""
     try:
         return path.stat().st_mtime
     except OSError:

@@ -59,7 +59,7 @@ def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
-    """Return whether a function may use an index that is no constant or loop counter; True if its source is unknown."""
+    """Return whether a function may use indices other than constants and loop counters; True if there is no source."""
     if is_twoloop(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
@@ -459,7 +459,7 @@ def _name_and_location(function: Callable[..., Any]) -> str:
 
 # pattern of an excerpt from a source file in numba's messages; the excerpt ends with a line that contains only ^
 _SOURCE_EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
-# pattern of the beginnings of those lines in numba's messages that give no reason
+# pattern of the beginnings of lines in numba's messages that give no reason
 _UNINFORMATIVE_LINE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"

@@ -63,7 +63,7 @@ class Digest:
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
-        self.names: set[str] = set()  # names of those attributes of modules that the current function may use
+        self.names: set[str] = set()  # names of the attributes of modules that the current function may use
         self.positions: dict[tuple[int, str], int] = {}  # position of each value added so far, by its id and name
         self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it calls
 
@@ -203,7 +203,7 @@ class FrozenValue(NamedTuple):
 
 
 class _LoadedName(NamedTuple):
-    """Global variable (or closure variable: `free`) that a code object loads, and the attributes it loads from it."""
+    """Global (if `free`, closure) variable that a code object loads, and the attributes loaded from the variable."""
 
     free: bool
     name: str
@@ -283,7 +283,7 @@ def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenVa
 
 
 def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
-    """Yield the defaults, globals and closure variables of a function, and those attributes of modules that it uses."""
+    """Yield the defaults, globals and closure variables of a function, and the attributes of modules that it uses."""
     code, namespace = function.__code__, function.__globals__
     last_arguments = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last_arguments, (function.__defaults__ or ())[::-1], strict=False):

@@ -107,9 +107,9 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     """Return SMOOTH, RAMP or JUMP for the least smooth row of C_t and b from t to `end`, and two times (s).
 
-    The times are beginning and end of the jump or ramp, or t and `end` if the row is smooth. If a ramp fills the step,
-    they enclose its first half: accelerations may be zero at both ends of the ramp, and a method that evaluates only
-    there would miss the ramp. (q, v) is the state at t; positions are extrapolated along `velocity` (n_q).
+    The times are the beginning and the end of the jump or ramp, or t and `end` if the row is smooth. If a ramp fills
+    the step, they enclose its first half: accelerations may be zero at both ends of the ramp, and a method that
+    evaluates only there would miss the ramp. (q, v) is the state at t; positions are extrapolated along `velocity`.
     """
     begin = t
     h = end - t
@@ -161,8 +161,8 @@ N_SAMPLES = 20  # number of intervals between the samples of one set
 MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
 SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of samples
 LEAST_RANGE = 0.1  # samples are examined if their range exceeds this fraction of rtol times the largest value so far
-# samples are examined only if their range also exceeds this number, in any unit: squares of smaller values underflow,
-# and subnormal numbers are too coarsely spaced to look smooth
+# samples are examined only if their range also exceeds this number, whatever their unit: squares of smaller values
+# underflow, and subnormal numbers are too coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
 # smallest number of samples in a step: the stages alone may all miss a force that acts for a quarter of the step
 MIN_SAMPLES_IN_STEP = 8.0
@@ -170,8 +170,8 @@ RESAMPLE_BELOW = 0.25  # samples ahead are taken again if their spacing has to f
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
 EQUAL_CHANGES = 1e-5  # two changes count as one up to this distance, relative to the widest spacing of samples
-# changes are recorded only from this time after the start on, relative to GAP: rounding errors make forces that begin
-# at zero, such as 1 - cos(t), look sudden
+# changes are recorded only later than this time after the start, in units of tolerances[GAP]: before that, rounding
+# errors make forces that begin at zero, such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a sudden change exceeds this multiple of the changes next to it; a smooth slope does not
 SHORT_STEP = 0.5  # a discontinuity is suspected if a step is below this fraction of the longest of the last steps
@@ -187,7 +187,7 @@ N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b in `values`: at `time`, in the state after `elapsed` s from (q, v) at constant a."""
+    """Store in `values` forces, C_t and b at `time`, in the state that (q, v) reaches in `elapsed` s at constant a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -303,8 +303,8 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
     """Return the time of the first sample with a sudden change of a component (or infinity), and of the last sample.
 
-    (q, v, a) is the state at t. Samples are taken from `begin` on, at most until `last`: along the motion if
-    `follows_motion` is 1, or at the state (q, v) if it is 0.
+    (q, v, a) is the state at t. The first sample is at `begin`, the last one at `last` or earlier. Samples follow the
+    motion if `follows_motion` is 1, or are taken at the state (q, v) if it is 0.
     """
     changes, n, t_first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -434,7 +434,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return the step size: `size` (s), or less, to end the step from t at a sudden change of a force or drive.
+    """Return the size (s) of the step from t: `size`, or less if it must end at a sudden change of a force or drive.
 
     Forces, C_t and b are sampled ahead of t, at most until `last`. `new_state` is scratch.
     """

@@ -34,9 +34,9 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
 
 # indices in `control`, after the rule
 (
-    MAX_STEP,  # largest step, s
-    FIXED_STEP,  # fixed step size, s; 0: step-size control
-    LIMIT_START,  # value of H_LIMIT if none of the last LIMIT_MEMORY steps failed, s
+    MAX_STEP,  # largest step (s)
+    FIXED_STEP,  # fixed step size (s); 0: step-size control
+    LIMIT_START,  # value (s) of H_LIMIT if none of the last LIMIT_MEMORY steps failed
     LIMIT_FACTOR,  # value of H_LIMIT after a failed step, relative to the size of this step
     LIMIT_MEMORY,  # number of accepted steps during which a failed step limits the step size
     MAX_STEPS,  # largest number of accepted steps
@@ -46,13 +46,13 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     # 1: stop with NEAR_SINGULAR near a singular position; 0: do not stop; SUSPENDED: do not stop near the present
     # singular position; the value is 1 again after the run has left this position
     MAY_CROSS,
-    SHORTEST,  # smallest allowed step size, s; steps of up to EQUAL_SPACINGS spacings of t are not allowed, either
+    SHORTEST,  # smallest allowed step size (s); steps of up to EQUAL_SPACINGS spacings of t are not allowed, either
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
     TRIAL_STEPS,  # stop with SWITCH_METHOD if one of the first TRIAL_STEPS steps proposes a next size of at most GAP
     MAY_JUMP,  # 1: C_t or b may jump
     JUMP_RATIO,  # largest ratio of a step's error to its estimate if a force jumps in the step
-    SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
-    TIME_SPACING,  # largest spacing, s, of samples at a fixed state (these are taken ahead of short steps, too)
+    SPACING,  # spacing (s) of samples of the forces ahead of a step, see discontinuities.py; 0: no samples
+    TIME_SPACING,  # largest spacing (s) of samples at a fixed state (these are taken ahead of short steps, too)
     # 1: samples ahead follow the motion; 0: samples use the present q and v, because a callback failed along the motion
     SAMPLE_MOTION,
     BY_TIME,  # 1: forces may change suddenly with time
@@ -64,38 +64,38 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
 
-# columns of `out_steps`, which has one row for each accepted step. H: step size, s; the other columns count, since the
+# columns of `out_steps`, which has one row for each accepted step. H: step size (s); the other columns count, since the
 # start of the run: rejections by the error test, failures, partitions, and Jacobians (JACOBIANS: 0 in an explicit step)
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
 # indices in `clock`, after the history
 (
-    T,  # present time, s
-    H_NEXT,  # size of the next step, s
-    H_LIMIT,  # present upper limit of the step size, s; a failed step lowers it for LIMIT_MEMORY accepted steps
+    T,  # present time (s)
+    H_NEXT,  # size of the next step (s)
+    H_LIMIT,  # present upper limit of the step size (s); a failed step lowers it for LIMIT_MEMORY accepted steps
     LIMIT_AGE,  # number of accepted steps since the last failed step
     NEXT_OUTPUT,  # index of the next output time
-    T_START,  # start time of the run, s; the grid of steps of fixed size begins there
+    T_START,  # start time of the run (s); the grid of steps of fixed size begins there
     N_FIXED,  # number of completed steps of this grid
     FAILURE_CODE,  # code of the last failed attempt, which explains short steps; DONE: no attempt failed recently
-    H_FAILED,  # size of the last failed step, for messages, s
-    H_LONG,  # longest of the last steps, s; older steps count less, see H_LONG_DECAY in step_size.py
+    H_FAILED,  # size (s) of the last failed step, for messages
+    H_LONG,  # longest of the last steps (s); older steps count less, see H_LONG_DECAY in step_size.py
     LARGEST_PIVOT,  # largest value so far of PIVOT in Work.notes, the smallest pivot of C_q
-    JUMP_FROM,  # time at which the next interval with a jump of C_t or b begins, s; infinite: no jump is known
-    JUMP_TO,  # time at which this interval ends, s
+    JUMP_FROM,  # time (s) at which the next interval with a jump of C_t or b begins; infinite: no jump is known
+    JUMP_TO,  # time (s) at which this interval ends
     APPLIES_JUMP,  # 1: the next step goes from JUMP_FROM to JUMP_TO; new_state is the state after the jump
-    JUMP_END,  # end of the last step that was rejected with an error above SUDDEN_ERROR, s
+    JUMP_END,  # end (s) of the last step that was rejected with an error above SUDDEN_ERROR
     PIVOT_HERE,  # fixed-order form: value of PIVOT in Work.notes at the end of the last step
     # samples of forces, C_t and b ahead of a step, at a fixed state or along the motion: see discontinuities.py
-    SAMPLED_TO,  # time of the last sample at a fixed state, s
-    SAMPLED_EVERY,  # spacing of the last samples at a fixed state, s
-    WIDEST_SAMPLING,  # widest spacing of samples so far, s
-    DISCONTINUITY,  # time of the next sudden change that samples at a fixed state show, s
-    DISCONTINUITY_OF_MOTION,  # time of the next sudden change that samples along the motion show, s
-    COMPARED,  # beginning, s, of the last short step in which samples were compared with samples before and after it
-    LAST_CHANGE,  # time of the last sudden change of a force, C_t or b, s
-    SHORTEST_CHANGE,  # shortest time between two sudden changes, s
-    MOTION_SAMPLED_TO,  # time of the last sample along the motion, s
+    SAMPLED_TO,  # time of the last sample at a fixed state (s)
+    SAMPLED_EVERY,  # spacing of the last samples at a fixed state (s)
+    WIDEST_SAMPLING,  # widest spacing of samples so far (s)
+    DISCONTINUITY,  # time (s) of the next sudden change that samples at a fixed state show
+    DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change that samples along the motion show
+    COMPARED,  # beginning (s) of the last short step in which samples were compared with samples before and after it
+    LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b
+    SHORTEST_CHANGE,  # shortest time between two sudden changes (s)
+    MOTION_SAMPLED_TO,  # time of the last sample along the motion (s)
     SAMPLES_MOTION,  # 1 while callbacks are sampled along the motion, at states that the motion may not reach
     # smallest result of min_pivot_ratio (partition.py) at output times and at grid times of fixed steps
     PIVOT_AT_OUTPUT,

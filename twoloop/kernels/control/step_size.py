@@ -152,7 +152,7 @@ FIXED_FRACTION = 0.01
 
 @merged
 def store_prediction(w, q1):
-    """Store the dependent positions of q1 (n_q), as the formula of the method predicts them, in w.predicted."""
+    """Store in w.predicted the dependent positions in q1 (n_q), which the formula of the method has predicted."""
     for k in range(w.dependent.size):
         w.predicted[k] = q1[w.dependent[k]]
 

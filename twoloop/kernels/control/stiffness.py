@@ -103,15 +103,15 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     NEXT_ESTIMATE,  # rho is estimated again after this number of evaluations since the start of the run
     ESTIMATES_TO_WAIT,  # number of estimates before the next trial may begin
     WAIT,  # value of ESTIMATES_TO_WAIT after the last trial
-    T_BEGIN,  # beginning of the measurement of the cost per second, s
+    T_BEGIN,  # beginning (s) of the measurement of the cost per second
     COST_BEGIN,  # cost of the run at the time T_BEGIN, in evaluations
     COST_PER_SECOND,  # cost of a second of motion, in evaluations, by the method used before the trial
     RATE,  # last estimate of rho, 1/s
     FIRST_MEMORY,  # number of entries of the memory of the first method
-    H_MEAN,  # mean step size, s
+    H_MEAN,  # mean step size (s)
     HISTORY,  # index at which the history of step-size control in this phase begins: 2 numbers, see loop_state.py
     _HISTORY_ERROR,
-    H_TRIED,  # size of the last attempted step, s
+    H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
     N_ABOVE_LIMIT,  # number of estimates with h rho above LIMIT since the last one below LIMIT
@@ -131,8 +131,7 @@ def switching_options(
     """Return the array `options` of a pair of methods.
 
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
-    `rules` has one row for each method: its step-size rule and its value of REUSE. `first` and `second` are the options
-    of the two methods.
+    `rules` has a row for each method: step-size rule and value of REUSE. `first`, `second`: options of the methods.
     """
     first = np.asarray(first)  # numbers, or expressions in the parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
@@ -276,7 +275,7 @@ def _evaluations_between_estimates(options, memory):
 
 @compiled
 def _begin_phase(w, options, memory, phase, t):
-    """Update `memory` for a `phase` that begins at t: clear the history of errors, and measure costs from t on."""
+    """Update `memory` for a `phase` that begins at t: clear the history of errors, and begin to measure costs."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0

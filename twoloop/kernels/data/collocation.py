@@ -12,9 +12,9 @@ MAX_ROUNDING = 1e-13  # differences of at most this size, relative to the values
 CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
 
 (
-    T,  # time at the beginning of the step, s
-    H,  # step size, s
-    H_BEFORE,  # size of the step whose polynomial predicts the accelerations in this step, s
+    T,  # time at the beginning of the step (s)
+    H,  # step size (s)
+    H_BEFORE,  # size (s) of the step whose polynomial predicts the accelerations in this step
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: accelerations are predicted by a polynomial; 0: they are predicted to be constant
     CURRENT,  # 0 or 1: which of the two stored polynomials belongs to the last accepted step
@@ -37,9 +37,9 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR,  # largest ratio of the next step size to this one that the convergence allows
     FACTOR_OF_ERROR,  # largest ratio of the next step size to this one that the error allows
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
-    ALLOWED_H,  # largest size that the error would have allowed for the last step, s
+    ALLOWED_H,  # largest size (s) that the error would have allowed for the last step
     SIZE,  # largest sum of a velocity and its change in the step, relative to the tolerances
-    STRICTER,  # ratio of the largest of all WEIGHTS to the largest of those WEIGHTS that belong to iterated coordinates
+    STRICTER,  # largest of all WEIGHTS, divided by the largest WEIGHT of an iterated coordinate
 ) = range(28)
 # offsets of the arrays that follow the scalars
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE

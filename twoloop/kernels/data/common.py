@@ -48,8 +48,8 @@ class Work(NamedTuple):
     G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
     entries: Any  # view of `G` as a vector
     augmented: Any  # view of the memory of `G` and, after it, of `M`
-    S: Any  # (r_v, r_v) G M^-1 G^T, with the independent rows of G, and its factors
-    W: Any  # (r_v, n_q) G M^-1, with the independent rows of G
+    S: Any  # (r_v, r_v) G M^-1 G^T for the independent rows of G; its factors replace it
+    W: Any  # (r_v, n_q) G M^-1 for the independent rows of G
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
     D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T; last row: dependent velocities for v_i = 0; columns in elimination order
@@ -133,8 +133,7 @@ class Attempt(NamedTuple):
     error : error in units of the tolerances: the step is accepted if it is at most 1. If a step is longer than the
         method allows, the step is not computed, and `error` is the ratio of its size to the allowed size.
     factor : ratio of the next step size to the size of this step; 0: the controller computes the ratio from the error.
-        If both factor and error exceed 1, the step size was a guess: the step was not completed, and has to be repeated
-        with a larger size.
+        If both factor and error exceed 1, the step size was a guess: the step has to be repeated with a larger size.
     """
 
     code: int
@@ -180,8 +179,8 @@ for _name in ("commit", "commit_first", "commit_second"):
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
-# functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Those with a boolean result
-# return False, and write no results, if a condition of the generated code is not satisfied
+# functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Functions with a boolean
+# result return False, and write no results, if a condition of the generated code is not satisfied
 OWN_FUNCTIONS = {
     # functions of a state, with arguments (t, q, v, numbers) and then arrays for the results. own_accelerate
     # stores a; own_correct_positions stores the correction and the corrected q; own_project stores a, the correction of
@@ -218,7 +217,7 @@ def _source_text(module: str) -> str:
 
 
 def _imported_modules(text: str) -> set[str]:
-    """Return the names of those modules of the kernels that a source text imports, such as "steps.stages"."""
+    """Return the names of the modules of the kernels that a source text imports, such as "steps.stages"."""
     names = set()
     for folder, several, single in re.findall(
         r"^from twoloop\.kernels([\w.]*) import (?:\(([^)]*)\)|(.+))$", text, re.MULTILINE

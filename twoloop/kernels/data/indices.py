@@ -57,7 +57,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     ORIENTATION,  # sign of det C_qd at the last accepted state with this partition; 0: not known yet
     ORIENTATION_NEW,  # sign of det C_qd at the end of the attempted step; 0: not known yet
     FAULT_KIND,  # index in Functions of the callback that returned a value that is not finite; -1: none known
-    FAULT_TIME,  # time of the call of a callback that returned a value that is not finite, s
+    FAULT_TIME,  # time (s) at which a callback returned a value that is not finite
     GAMMA_REQUIRED,  # required relative accuracy of Gamma by differences, see evaluation/constraints.py
     GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to largest_difference_step
     GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_STEP_RATIO was chosen
@@ -79,9 +79,9 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     DEFECT,  # largest defect of the attempted step, relative to the allowed defect; -1: not evaluated
     LARGEST_DEFECT,  # largest value of DEFECT in the accepted steps
     UNCHECKED,  # number of accepted steps without an evaluation of the defect
-    WIDEST_GAP,  # longest time between two evaluations within accepted steps, s
-    LAST_JUMP,  # time of the last known jump of C_t or b, s
-    NEXT_JUMP,  # time of the next known jump of C_t or b, s
+    WIDEST_GAP,  # longest time (s) between two evaluations within accepted steps
+    LAST_JUMP,  # time (s) of the last known jump of C_t or b
+    NEXT_JUMP,  # time (s) of the next known jump of C_t or b
     MAX_COEFFICIENT,  # redundant rows are combinations of independent rows: largest coefficient, at the last partition
     SMALLEST,  # fixed-order form: smallest squared sine of the angle from a row to previous rows, see sparse_ldl.py
     TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
@@ -104,8 +104,8 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
     RTOL,
     ESTIMATE,  # 0 for steps of fixed size, else 1
     LEAST,  # smallest tolerance of a coordinate or a velocity
-    GAP,  # longest time between two evaluations of the equations, s
-    DEFECT_GAP,  # longest time between two evaluations in steps that evaluate their defect between nodes, s
+    GAP,  # longest time between two evaluations of the equations (s)
+    DEFECT_GAP,  # longest time (s) between two evaluations in steps that evaluate their defect between nodes
     ATOL,  # first index of the absolute tolerances: one for each coordinate and its velocity
 ) = range(6)
 MAX_GAP_RATIO = 0.01  # value of GAP, relative to the duration of the run

@@ -220,8 +220,8 @@ def _is_consistent(C, rate, rows, q, v, records, tolerance):
     """Return whether (q, v) satisfies the constraints up to rounding; `rows`: C_q with A, `rate`: C_t with b.
 
     The size of a coordinate counts as at least its size in `records` (see `evaluate_start`), and at least the rounding
-    error of the largest coordinate. Otherwise a constraint whose coordinates are all rounding errors of zero, as they
-    are normal to the plane of a planar motion, would not be small relative to its terms.
+    error of the largest coordinate. Otherwise a constraint would not be small relative to its terms if its
+    coordinates are all rounding errors of zero, such as coordinates normal to the plane of a planar motion.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _index_of_near_position(q, rows, C.size, records)
@@ -344,7 +344,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at_positions(f, t, positions, n_c, rows):
-    """Store C_q (n_c rows) and A in `rows`, zero on entry, for each of the `positions`, one after another."""
+    """Store in `rows` (zero on entry) C_q (n_c rows) and A at each of the `positions`, one after another."""
     n_rows = len(rows) // len(positions)
     for k in range(len(positions)):
         begin = k * n_rows

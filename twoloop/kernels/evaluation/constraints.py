@@ -33,7 +33,7 @@ def _clear_recorded_entries(w):
 
 @merged
 def clear_rows(f, w):
-    """Set w.G to zero; in the augmented form, only its recorded entries: the task VERIFY_PATTERN detects new ones."""
+    """Set w.G to zero; in the augmented form, clear recorded entries only (the task VERIFY_PATTERN detects others)."""
     if f.form == AUGMENTED:
         _clear_recorded_entries(w)
     else:
@@ -42,7 +42,7 @@ def clear_rows(f, w):
 
 @merged
 def row_residual(w, v, rows):
-    """Store the residuals G v + (C_t, b) of the rows with the indices `rows` in w.z, with G and rates in w."""
+    """Store in w.z the residuals G v + (C_t, b) of the rows with the indices `rows`, from G and the rates in w."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -64,7 +64,7 @@ def constraint_rates(f, w, t, q, rate):
 
 @merged
 def kinematics(f, w, t, q, v):
-    """Store C, C_q with A, C_t with b, and Gamma of the rows of C_q in w, by the callback that computes all of them."""
+    """Store in w C, C_q with A, C_t with b, and Gamma of the rows of C_q, by the callback that computes all of them."""
     n_c, n_rows = w.C.size, w.Rate.size
     clear_rows(f, w)
     w.C[:] = 0.0
@@ -88,17 +88,17 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-# largest step of a finite difference, s, which also limits the change of q during this step, relative to max|q|; and
+# largest step (s) of a finite difference, and largest change of q during a step, relative to max|q|. MIN_STEP_RATIO:
 # smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the previous step
-ROUNDING_DISAGREEMENT = 1e-9  # by rounding, Gamma with the steps e and 2 e may differ up to this fraction
+ROUNDING_DISAGREEMENT = 1e-9  # due to rounding, Gamma with the steps e and 2 e may differ by this fraction
 # if Gamma with the steps e and 2 e differs by less than this fraction, e is doubled, to reduce rounding errors
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # step of one-sided differences (order 2), relative to central differences (order 4)
-# if terms of G v cancel, rounding error of Gamma, relative to the largest term divided by the largest step
+# rounding error of Gamma if terms of G v cancel, relative to the largest term divided by the largest step
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this part of the required accuracy
 
@@ -111,7 +111,7 @@ def representable_step(t, h):
 
 @merged
 def largest_difference_step(q, v):
-    """Return the largest difference step e, s: MAX_DIFFERENCE_STEP, or less if the coordinates move fast.
+    """Return the largest difference step e (s): MAX_DIFFERENCE_STEP, or less if the coordinates move fast.
 
     In the time e, coordinates move by at most MAX_DIFFERENCE_STEP times max|q|, unless MIN_STEP_RATIO limits e.
     """
@@ -123,7 +123,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return on which side of t to take differences: 1 (after) or -1 if C_t or b jumps on the other side; 0: both."""
+    """Return the side of t on which to take differences: 1 (after t) or -1 if C_t or b jumps on the other; 0: both."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0

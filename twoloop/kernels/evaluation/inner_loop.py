@@ -90,7 +90,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_equations_at(f, w, t, q):
-    """Factor the linear system for accelerations at (t, q), after the rows and `find_null_space`; return a code."""
+    """Factor the linear system for accelerations at (t, q), using the rows and w.D (NULL_SPACE) in w; return a code."""
     if f.constant_mass == 0:
         w.factored = 0.0
         mass_matrix(f, w, t, q)
@@ -102,7 +102,7 @@ def factor_equations_at(f, w, t, q):
 
 @merged
 def compute_accelerations(f, w, t, q, v, a):
-    """Store the accelerations at (q, v) in `a`, after the rows, their factors and w.D (NULL_SPACE); return a code."""
+    """Compute the accelerations `a` at (q, v) from the rows, their factors and w.D (NULL_SPACE); return a code."""
     w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:
@@ -306,8 +306,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Compute the dependent entries of q and v from the independent ones, and the accelerations `a`; return a code.
 
-    Velocities and accelerations are computed with the Jacobian that was factored last, at a position that differs from
-    the final q by at most w.reuse.
+    Velocities and accelerations use the Jacobian that was factored last, at most w.reuse away from the final q.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
@@ -344,7 +343,7 @@ def restore_constraints(f, w, t, q, v, tolerance):
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Store `a` and lam, accelerations and multipliers at a state from `restore_constraints`; return a code."""
+    """Store the accelerations `a` and multipliers lam at a state from `restore_constraints`; return a code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 

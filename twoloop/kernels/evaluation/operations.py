@@ -58,7 +58,7 @@ def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, en
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Compute all `nodes` from the inputs t, q and v, which are stored as the nodes from index `inputs` on.
+    """Compute all `nodes` from t, q and v, which become the input nodes, beginning with index `inputs`.
 
     The table contains integers, or whole floats if it is among the parameters of a model. `rows` and `columns` are the
     first indices of the operations and of the terms' nodes in `table`; `coefficients` and `constants` are the first

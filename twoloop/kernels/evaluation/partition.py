@@ -65,7 +65,7 @@ def _max_abs_from_column(row, first):
 
 @compiled
 def full_pivoting(A, order, row_order, row_maxima, first, last, max_rank):
-    """Do Gaussian elimination of A in place with full pivoting, from pivot `first` on; return the numerical rank.
+    """Do Gaussian elimination of A in place with full pivoting, beginning with pivot `first`; return the rank.
 
     Pivots are chosen in the rows before row `last`, at most `max_rank` in all, including the pivots before `first`.
     `order` and `row_order` are permuted in the same way as columns and rows of A; `row_maxima` is scratch.
@@ -109,8 +109,7 @@ def min_pivot_ratio(f, w, t, q):
     """Return the ratio of the smallest to the largest pivot of C_q and A at (t, q), without changing the partition.
 
     Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the
-    fixed-order form, or with more than MAX_ROWS_ELIMINATED rows, return w.pivot instead: the smallest pivot when the
-    last partition was chosen.
+    fixed-order form, or with more than MAX_ROWS_ELIMINATED rows, return w.pivot, the smallest pivot at the last choice.
     """
     if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.pivot
@@ -151,7 +150,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # end of the rows to eliminate: from row `rank` on, rows of A replace the redundant rows of C_q
+    last = rank  # end of the rows to eliminate: the rows of A replace the redundant rows of C_q, from index `rank`
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -184,7 +183,10 @@ def _copy_in_ascending_order(source, target):
 
 @compiled
 def _adopt_pivot_order(w):
-    """Store the partition given by w.row_order and w.order; write its programs; return False if C_qd is singular."""
+    """Store the partition given by w.row_order and w.order, and write its elimination programs (see markowitz_lu.py).
+
+    Return False if the dependent columns of w.G are singular.
+    """
     rank, rank_v = w.rows.size, w.rows_v.size
     # indices are stored in ascending order, so that equal sets of coordinates are equal partitions
     _copy_in_ascending_order(w.row_order[:rank], w.rows)
@@ -207,7 +209,7 @@ def _adopt_pivot_order(w):
 
 @compiled
 def write_programs(w):
-    """Write the programs that factor the dependent columns of w.G; return False if these columns are singular."""
+    """Write programs (markowitz_lu.py) to factor the dependent columns of w.G; return False if these are singular."""
     _record_columns_of_entries(w)
     w.factored = 0.0
     is_regular = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
@@ -232,7 +234,7 @@ def _record_columns_of_entries(w):
 
 @compiled
 def record_entries(w):
-    """Set w.pattern to 1 where w.G is not zero; return whether w.pattern changes, which makes programs invalid."""
+    """Set w.pattern to 1 where w.G is not zero; return whether this changes w.pattern, which makes programs invalid."""
     if not update_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -243,8 +245,8 @@ def record_entries(w):
 def choose_partition(f, w, t, q):
     """Choose and store the dependent and independent coordinates and the independent rows at (t, q); return a code.
 
-    The code is SINGULAR if the rank is lower than for the previous partition. For the first partition, the code is
-    RANK_DIFFERS, with the ranks stored in w, if the workspace is allocated for other ranks.
+    The code is SINGULAR if the rank is lower than for the previous partition. For the first partition, if the workspace
+    is allocated for other ranks, the ranks are stored in w, and the code is RANK_DIFFERS.
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
@@ -428,8 +430,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve eq. (15) by Newton's method for the dependent positions in q; return a code.
 
     The iteration ends after a correction of at most `tolerance`. On return, w has the rows and factors at q or, if the
-    last correction was at most `reuse_limit`, at q before this correction. The callback `kinematics`, if given, also
-    stores w.Rate and w.Gamma.
+    last correction was at most `reuse_limit`, at q before this correction. The callback `kinematics` also stores Gamma.
     """
     last_correction = np.inf
     has_converged = w.C.size == 0
@@ -471,7 +472,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
 
 @merged
 def find_null_space(f, w, t, q):
-    """Store the null space of G, and the velocities that drives prescribe, in w.D (see Work), with the factors in w."""
+    """Compute the null space of G, and the velocities that drives prescribe, by the factors in w; store them in w.D."""
     if f.kinematics_given == 0 or w.has_gamma == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
@@ -481,7 +482,7 @@ def find_null_space(f, w, t, q):
 
 @merged
 def restore_velocities(f, w, t, q, v, reuse_limit):
-    """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, with rows and factors in w.
+    """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, by the factors in w.
 
     If no velocity changes by more than `reuse_limit`, HAS_GAMMA stays set: w.Gamma, as computed by the callback
     `kinematics`, is still valid.
@@ -514,7 +515,10 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
 
 @compiled
 def check_all_rows(f, w, t, q, v):
-    """Return DONE if the accepted state (q, v), with its rows in w.G, satisfies all rows, else ROWS_CONTRADICT."""
+    """Return DONE if the accepted state (q, v) satisfies all rows, including redundant ones, else ROWS_CONTRADICT.
+
+    w.G must already contain [C_q; A] at this state. Positions and velocities are checked.
+    """
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))

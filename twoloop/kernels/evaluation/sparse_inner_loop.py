@@ -255,7 +255,7 @@ def choose_rows(f, w, t, q):
 
 REGULARIZATION = 1e-11  # diagonal entries of W (module docstring), relative to the sums of squares of the columns of G
 CONVERGED_RESIDUAL = 1e-14  # the refinement ends if the residual of G^T lam = b is at most this fraction of max|b|
-MAX_RESIDUAL = 1e-9  # largest residual of G^T lam = b, relative to max|b|, that is accepted if it no longer decreases
+MAX_RESIDUAL = 1e-9  # residuals of G^T lam = b that no longer decrease are accepted up to this fraction of max|b|
 MAX_SOLUTIONS = 30  # largest number of linear solutions in the refinement of multipliers of least norm
 
 
@@ -346,7 +346,7 @@ def _add_jacobian_times(f, w, x, out):
 
 @compiled
 def _fill_gamma(f, w, t, q, v):
-    """Store Gamma, of G a = Gamma, in w.Gamma; return DONE, or NEEDS_DENSE if only differences could compute Gamma."""
+    """Store Gamma (of G a = Gamma) in w.Gamma; return DONE, or NEEDS_DENSE if only differences could compute Gamma."""
     w.Gamma[:] = 0.0
     if f.gamma_given == 1:
         f.gamma(t, q, v, f.p, w.Gamma)
@@ -366,7 +366,7 @@ def _failure_of_accelerations(w, t, q):
 
 @compiled
 def _compute_accelerations(f, w, t, q, v, a):
-    """Store the accelerations at (q, v) in `a`, and the multipliers in w.z, with the factors in w; return a code."""
+    """Compute accelerations and multipliers at (q, v) by the factors in w; store them in `a`, w.z; return a code."""
     w.n_evaluations += 1
     code = _fill_gamma(f, w, t, q, v)
     if code != DONE:
@@ -415,7 +415,7 @@ def _is_on_constraints(f, w, q):
 
 @compiled
 def _project_state(f, w, t, q, v, theta):
-    """Project (q, v) in place; return a code. On return, the factors in w are those at q before the last correction."""
+    """Project (q, v) in place; return a code. On return, the factors in w belong to q before the last correction."""
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.rounded)
     for _ in range(MAX_ITERATIONS):
@@ -466,7 +466,7 @@ def _has_expected_mass_pattern(w):
 
 @compiled
 def _check_redundant_rows(f, w, t, q, v):
-    """Return DONE if the accepted state (q, v) satisfies all rows, else ROWS_CONTRADICT; uses the entries of G in w."""
+    """Return DONE if the accepted state (q, v) satisfies all rows (w has their entries at q), else ROWS_CONTRADICT."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
@@ -486,7 +486,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _solve_system(f, w, r, c, a, lam):
-    """Store in `a` and lam the solution of M a + G^T lam = r and G a = c, with the factors in w; return DONE."""
+    """Solve M a + G^T lam = r and G a = c by the factors in w; store `a` and lam; return DONE."""
     n = r.size
     copy(r, w.unknowns[:n])
     copy(c, w.unknowns[n:])
@@ -515,7 +515,7 @@ def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
 
 @kernel(INNER)
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task` at (t, q, v), see inner_loop.py; return a code. For SOLVE, q and v are the right-hand side."""
+    """Do `task`, a number from tasks.py, by sparse factors; return a code. For SOLVE, q and v are r and c."""
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
         code = STOPPED if w.time_is_up == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.nearly_singular == PROJECT_STAGES:

@@ -1,7 +1,7 @@
 """Integration loop of runs in lanes: each lane has its own step size, and starts a new run when its run has ended.
 
 If a condition of the generated code does not hold, or many successive steps are rejected, a run is removed from its
-lane, and repeated alone later. The method's function `code.step` takes the steps. For `work` see layout.py.
+lane, and repeated outside the lanes later. The method's function `code.step` takes the steps. For `work` see layout.py.
 """
 
 import numpy as np

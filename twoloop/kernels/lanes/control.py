@@ -22,7 +22,7 @@ from twoloop.kernels.lanes.layout import (
 
 # indices in `options`, whose first N_RULE entries are the step-size rule. JUMP_RATIO: largest ratio of error to
 # estimate if a force jumps; FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest
-# tolerance of a coordinate. From N_HEAD on, `options` contains the method's options for a single run
+# tolerance of a coordinate. N_HEAD: index of the first of the method's options for a single run
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
 SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
@@ -102,7 +102,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set T_NEW, the time of the state NEW, to T + X, or to exactly t1 at the end of the run."""
+    """Set T_NEW, the time of NEW, to T + X (X: time since the beginning of the step), or to exactly t1 at the end."""
     for k in range(LANES):
         t, x = work[at.T * LANES + k], work[at.X * LANES + k]
         work[at.T_NEW * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x
@@ -110,7 +110,7 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW onto the constraints; if NEW changes by more than ERROR, in tolerances, store the change in ERROR.
+    """Project NEW onto the constraints; if this changes NEW by more than ERROR tolerances, store the change in ERROR.
 
     Velocities change by more than the tolerances if a drive jumps or bends between stages. `predicted_v` is scratch.
     """
@@ -140,8 +140,7 @@ def _accept_or_shorten(options, work, k):
         work[at.H_NEXT * LANES + k], work[at.H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[at.LIMIT_AGE * LANES + k] = 0.0
         return False
-    # near a jump of a force, the error estimate may be small by chance: until JUMP_END, multiply the estimate by
-    # JUMP_RATIO
+    # near a jump of a force, the error estimate may be small by chance: multiply it by JUMP_RATIO until JUMP_END
     error_factor = options[JUMP_RATIO] if t < work[at.JUMP_END * LANES + k] else 1.0
     is_accepted = error * error_factor <= 1.0
     if error > SUDDEN_ERROR and not is_accepted:

@@ -25,16 +25,16 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
 
 # offsets in `work` of the fields, each a vector; after the fields, `work` contains the arrays of `array_offsets`
 (
-    T,  # time of STATE, s
-    T_NEW,  # time of NEW, s
-    UNIT,  # unit of time of a series, s
-    H,  # size of the step, s
-    X,  # time from the beginning of the step to the state to be computed, s
+    T,  # time of STATE (s)
+    T_NEW,  # time of NEW (s)
+    UNIT,  # unit of time of a series (s)
+    H,  # size of the step (s)
+    X,  # time (s) from the beginning of the step to the state to be computed
     ACTIVE,  # 1 in lanes where the next task has to run; a task that fails in a lane sets 0 there
     DEFECT,  # defect at the end of the step, relative to the allowed defect
     PREDICTION_ERROR,  # difference of predicted and projected positions, over its limit, see step_size.py
     LENGTH,  # step size that a series allows, in units of UNIT
-    LONGEST,  # largest allowed step size, s
+    LONGEST,  # largest allowed step size (s)
     REQUESTED,  # 1 in lanes that begin a run, or need a state within the step
     WORST_DEFECT,  # largest defect within the step, relative to the allowed defect
     N_REJECTED,  # number of successive rejected steps
@@ -46,11 +46,11 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     ACCEPTED,  # 1 in lanes whose step was accepted
     IS_NEW,  # 1 in lanes whose run has not taken a step yet
     ERROR,  # error estimate of the step, in units of the tolerances
-    H_FULL,  # size of the step before it was shortened to reach the end of the run, s
-    H_NEXT,  # size of the next step, s
-    H_LIMIT,  # upper limit of step sizes after a failed step, s; infinity: no limit
+    H_FULL,  # size (s) of the step before it was shortened to reach the end of the run
+    H_NEXT,  # size of the next step (s)
+    H_LIMIT,  # upper limit of step sizes after a failed step (s); infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
-    JUMP_END,  # end of the last step that was rejected with an error above SUDDEN_ERROR, s
+    JUMP_END,  # end (s) of the last step that was rejected with an error above SUDDEN_ERROR
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
     EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
     PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
@@ -80,7 +80,7 @@ START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
 # indices in `settings`, whole numbers that describe the mechanism and the method
 N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)
-T0, T1, GAP, RTOL, ATOL = range(5)  # indices in `control`; from ATOL on, one absolute tolerance for each coordinate
+T0, T1, GAP, RTOL, ATOL = range(5)  # indices in `control`; ATOL: first of the n absolute tolerances
 
 SHORTEST = 1e-13  # smallest step size, relative to the larger of |t| at its beginning and |t1|
 
@@ -129,20 +129,20 @@ def fill_field(work, field, value):
 
 @merged
 def remove_run(work, status, k, reason):
-    """Remove the run from lane k, to be repeated alone; store the `reason`, such as NO_VALUES, in `status`."""
+    """Remove the run from lane k, to be repeated outside lanes; store the `reason`, such as NO_VALUES, in `status`."""
     work[RUNNING * LANES + k] = 0.0
     status[int(work[RUN * LANES + k])] = reason
 
 
 @inlined
 def vector_range(work, begin, count):
-    """Return a flat view of `count` adjacent vectors of `work`, from the offset `begin` on."""
+    """Return a flat view of `count` adjacent vectors of `work`, beginning at the offset `begin`."""
     return work[begin * LANES : (begin + count) * LANES]
 
 
 @inlined
 def matrix_view(work, begin, rows, count):
-    """Return a view (rows, count * LANES) of adjacent vectors of `work`, from the offset `begin` on."""
+    """Return a view (rows, count * LANES) of adjacent vectors of `work`, beginning at the offset `begin`."""
     return work[begin * LANES : (begin + rows * count) * LANES].reshape((rows, count * LANES))
 
 
@@ -207,7 +207,7 @@ def _multiply_number(work, target, imaginary_target, x, imaginary):
 def _subtract_product(work, target, x, y, imaginary, imaginary_y):
     """Subtract the product x * y from the number `target` in each lane; if `imaginary` > 0, all three are complex.
 
-    The imaginary part is `imaginary` vectors after the real part of x, and `imaginary_y` after that of y and `target`.
+    Imaginary parts are `imaginary` vectors after the real part in x, and `imaginary_y` after it in y and `target`.
     """
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:
@@ -232,7 +232,7 @@ def _pivot_magnitude(work, entry, imaginary, k):
 
 @compiled
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
-    """Exchange rows so that entry (c, c), the pivot, is the largest one from row c on in column c; store its inverse.
+    """Exchange rows so that the pivot (c, c) is the largest entry of column c in row c or below; store its inverse.
 
     Clear ACTIVE in lanes where the pivot is zero.
     """
@@ -273,7 +273,7 @@ def factor_matrices(work, matrix, pivots, n, imaginary):
 
 @compiled
 def solve_systems(work, matrix, pivots, n, imaginary, x):
-    """Replace a right-hand side x (n) in each lane by the solution, with the factors of `factor_matrices`.
+    """Replace a right-hand side x (n) in each lane by the solution, using the factors from `factor_matrices`.
 
     If `imaginary` > 0, the system is complex, and n imaginary parts follow the real parts of x.
     """

@@ -52,9 +52,9 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     SCALE_V,  # largest absolute velocity at the stages, at least 1
     LARGEST_Q,  # largest correction of positions, divided by the square of the step size
     LARGEST_V,  # largest correction of velocities, divided by the step size
-    H_PREVIOUS,  # size of the step whose accelerations are in PREVIOUS, s; 0: there is no such step
+    H_PREVIOUS,  # size (s) of the step whose accelerations are in PREVIOUS; 0: there is no such step
     CONSTANT,  # 1: the predicted accelerations of all stages equal the accelerations at the beginning; else 0
-    DURATION,  # duration of an error of the velocities, s, see velocity_errors.py; 0: not known
+    DURATION,  # duration of an error of the velocities (s), see velocity_errors.py; 0: not known
     N_SINGLE_VECTORS,
 ) = range(11)
 # indices of the blocks of n vectors: accelerations at STATE; q, v and a at the beginning of the step; scratch for sums;
@@ -80,7 +80,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 # indices of the blocks (s, n): accelerations of the stages, and of the stages of the previous step; residuals; and
 # corrections. The weights (s, s) follow the blocks
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
-# indices of the matrices (n, n); from SYSTEMS on, a real and an imaginary part for each system. The pivots follow them
+# indices of the matrices (n, n). SYSTEMS: first of the systems, each with a real and an imaginary part; pivots follow
 DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
@@ -293,7 +293,7 @@ def _correct_stages(settings, method_options, s, work):
 
 @merged
 def _raise_to_largest_value(work, target, begin, n):
-    """Raise the vector `target` to the largest absolute value in n vectors from `begin` on; NaN if a value is NaN."""
+    """Raise the vector `target` to the largest |value| in the n vectors beginning at `begin`; NaN if a value is NaN."""
     for i in range(n * LANES):
         magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if magnitude > work[index] or magnitude != magnitude:

@@ -46,7 +46,7 @@ def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
 def subtract_products(work, target, x, x_stride, y, y_stride, count):
     """Subtract the products of the vectors x + i * x_stride and y + i * y_stride, i < `count`, from vector `target`.
 
-    A vector has one number for each lane; `target`, x and y are numbers of vectors in `work`.
+    A vector has one number for each lane; `target`, x and y are offsets in `work`.
     """
     for k in range(0, LANES, 4):
         x_0, y_0 = x * LANES + k, y * LANES + k
@@ -54,8 +54,11 @@ def subtract_products(work, target, x, x_stride, y, y_stride, count):
 
 
 @merged
-def subtract_row(work, target, entries, pattern, i, y):
-    """Subtract the product of row i of G and y from `target`; `entries`: offset of the entries of G, row by row."""
+def subtract_row_product(work, target, entries, pattern, i, y):
+    """Subtract from `target` the dot product of row i of a sparse matrix and the vector y.
+
+    `entries`: offset of the entries of the matrix, row by row; `pattern`: see module docstring.
+    """
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
 
@@ -82,7 +85,7 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
         for j in range(i + 1):
             entry = gram + i * n_rows + j
             fill_field(work, entry, -shift if i == j else 0.0)
-            subtract_row(work, entry, factors, pattern, j, row)
+            subtract_row_product(work, entry, factors, pattern, j, row)
             subtract_products(work, entry, Z + i, n_rows, Z + j, n_rows, n_redundant)
             for k in range(LANES):
                 work[entry * LANES + k] *= -1.0
@@ -199,7 +202,7 @@ def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
 
 @compiled
 def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
-    """Store the d of smallest norm with G d = -x in `change` (n), NaN in lanes with dependent rows; overwrite x."""
+    """Store in `change` (n) the d of smallest norm with G d = -x (NaN in lanes with dependent rows); overwrite x."""
     for i in range(n_rows):
         _multiply_vector(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
     solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
@@ -207,14 +210,14 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# no other assembly is as near as the guess if the projection of a displaced position differs from its linear prediction
-# by C_q by at most this fraction of the displacement
+# another assembly counts as near if the projection of a displaced position differs from its linear prediction by C_q by
+# more than this fraction of the displacement
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # rows of norm 1 count as independent if all eigenvalues of G G^T are at least this
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; `settings` of runs has N_EVALUATIONS there
-# other guesses are displaced from the projected positions by a sum of two vectors; these are the factors on the change
-# from the first guess to the projected positions, and on the weakest direction
+# other guesses are displaced from the projected positions by the change from the first guess to the projected positions
+# times the first factor, plus the weakest direction times the second factor
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
@@ -258,7 +261,7 @@ _memory_offsets = merged(offsets_in_memory)
 
 @merged
 def _largest_value(work, offset, count, k):
-    """Return the largest absolute value of `count` numbers from `offset` on in lane k, or NaN if one is NaN."""
+    """Return the largest |value| in lane k of the `count` vectors that begin at `offset`, or NaN if a value is NaN."""
     largest = 0.0
     for j in range(count):
         magnitude = abs(work[(offset + j) * LANES + k])
@@ -328,7 +331,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
     for _ in range(2):  # the second pass removes the rounding errors of a large change
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
-            subtract_row(work, x + i, G, pattern, i, new + n)
+            subtract_row_product(work, x + i, G, pattern, i, new + n)
             for k in range(LANES):
                 work[(x + i) * LANES + k] = work[(memory + n_rows + i) * LANES + k] - work[(x + i) * LANES + k]
         solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change)
@@ -374,7 +377,7 @@ def _check_nearby_guesses(code, settings, control, pattern, moves, work):
         _gauss_newton(code, settings, control, pattern, moves, work)
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
-            subtract_row(work, x + i, factors, pattern, i, displacement)
+            subtract_row_product(work, x + i, factors, pattern, i, displacement)
         # `change` becomes the component of the displacement that is normal to the constraints
         solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):

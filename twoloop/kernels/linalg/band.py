@@ -66,9 +66,9 @@ def call_lapack(typing_context, address, arguments):
     return types.int64(address, arguments), emit_call
 
 
-# number of coordinates from which on Newton steps are assumed to be faster with banded than with dense algebra. For
-# chains of bandwidth 1 to 11, and for beams, 36 to 75 were measured. Single evaluations, as in a fixed-point iteration,
-# are faster only above about 150 coordinates; with 56 coordinates they take a third longer
+# smallest number of coordinates for which Newton steps are assumed to be faster with banded than with dense algebra.
+# The measured break-even is 36 to 75, for chains of bandwidth 1 to 11 and for beams. Single evaluations, as in a
+# fixed-point iteration, are faster only above about 150 coordinates; with 56 coordinates they take a third longer
 MIN_BANDED_SIZE = 56
 
 
@@ -92,7 +92,7 @@ def _mass_band(w, b):
 
 @inlined
 def _mass_diagonals(w, b):
-    """Return the view of w.L, behind the Cholesky factor, of the diagonals of M: entry (i, i + k) of M is at [k, i]."""
+    """Return a view of the diagonals of M, stored in w.L after the Cholesky factor: M[i, i + k] is at [k, i]."""
     n = w.Q.size
     return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
 
@@ -115,7 +115,7 @@ def factor_banded_mass(f, w):
 
 @merged
 def solve_banded_mass(f, w, x):
-    """Replace x (n_q) by M^-1 x, with the Cholesky factor that `factor_banded_mass` stored."""
+    """Replace x (n_q) by M^-1 x, using the Cholesky factor that `factor_banded_mass` stored."""
     n = w.Q.size
     b = f.bandwidth
     call_lapack(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))

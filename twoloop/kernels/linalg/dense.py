@@ -109,7 +109,7 @@ def lu_sign(A, pivots):
 
 @merged
 def lu_solve(A, pivots, x):
-    """Replace the right-hand side x by the solution, with the factors A and `pivots` from `lu_factor`."""
+    """Replace the right-hand side x by the solution, using the factors A and `pivots` from `lu_factor`."""
     n = A.shape[0]
     for k in range(n):
         pivot_row = pivots[k]
@@ -129,9 +129,9 @@ def lu_solve(A, pivots, x):
 
 @merged
 def ldl_factor(A):
-    """Replace the upper triangle of a symmetric A by its factors U^T D^-1 U: 1/d_k on the diagonal, U above it.
+    """Factor a symmetric A = U^T D^-1 U in its upper triangle; D = diag(U) contains the pivots d_k.
 
-    Returns False if A is not positive definite, or has values that are not finite.
+    Store 1/d_k on the diagonal, and the rest of U above it. Return False if A is not positive definite or not finite.
     """
     n = A.shape[0]
     for k in range(n):
@@ -169,7 +169,7 @@ def invert_definite(A):
 
 @merged
 def ldl_solve(A, x):
-    """Replace the right-hand side x by the solution, with the factors A from `ldl_factor`."""
+    """Replace the right-hand side x by the solution, using the factors A from `ldl_factor`."""
     n = A.shape[0]
     for k in range(n):
         if x[k] != 0.0:
@@ -185,7 +185,7 @@ def ldl_solve(A, x):
 
 @merged
 def ldl_solve_rows(A, B):
-    """Replace the right-hand sides, the columns of B, by the solutions, with the factors A from `ldl_factor`."""
+    """Replace the right-hand sides, the columns of B, by the solutions, using the factors A from `ldl_factor`."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):

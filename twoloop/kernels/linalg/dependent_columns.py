@@ -184,8 +184,7 @@ def choose_dependent_columns(G, kinds, rows, n_kept, numbers, integers, out):
     """Choose dependent columns of G for the rows rows[:n_kept]; return the number of pivot blocks, or 0 on failure.
 
     `kinds` has the kind of each entry of G, row by row. `out` receives two rows (as indices in `rows`) and two columns
-    of each block; a single pivot has its row and its column twice. `numbers` and `integers` are scratch, see
-    `scratch_sizes`.
+    of each block; a single pivot has its row and its column twice. `numbers`, `integers`: scratch (`scratch_sizes`).
     """
     n = G.shape[1]
     if n_kept > n:

@@ -7,8 +7,7 @@ elimination become large, another order is chosen. If the program is nearly as l
 factors replace the sparse ones.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
-lists that it changes. So the work grows as the number of rows times the number of entries, and not as the third power
-of the number of rows.
+lists that it changes. So the work grows as the number of rows times the number of entries, not as the rows cubed.
 
 The factors of a matrix are two arrays: `index`, the program, and `values`. Right-hand sides and solutions are in the
 order of elimination: entry k of a right-hand side belongs to row rows_of(index)[k] of the Jacobian, and entry k of a
@@ -31,10 +30,12 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
 
 # indices in `index`. SIZE: number of rows r. DENSE: 1 if the factors are dense. SIGN: sign of the permutations (1, -1).
 # N_SLOTS: number of entries of the factors. FIRST_LOWER: first entry of L. WIDTH: number of columns of the Jacobian.
-# After these numbers, `index` contains arrays: rows (r), columns (r), row exchanges of dense factors (r), first entries
-# (r) and ends (r) of the rows of U, first entries of the rows of L (r + 1); row, column and source of each entry, where
-# the source is the index of a number in the matrix; the targets of the subtractions; and the lists for choosing an
-# order. The entries are sorted: first the diagonal, then U from its last row up, then L from its first row down
+# After these numbers, `index` contains arrays: rows (r) and columns (r) of the matrix in the order of elimination; row
+# exchanges of dense factors (r); for each row of U, the index of its first entry (r) and the index after its last entry
+# (r); for each row of L, the index of its first entry, followed by the end of L (r + 1); for each entry, its row, its
+# column and its source, the flat index in G of its initial value (of a zero for fill-in); for each subtraction, the
+# index of the entry that it changes; and the lists for choosing an order. The entries are sorted: first the diagonal,
+# then U from its last row up, then L from its first row down
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
 # indices of arrays with one number per row or column. ROW_SIZE: number of entries in the list of a row. COLUMN_SIZE:
 # number of entries in the list of a column, without eliminated rows. ACTIVE_ROW_SIZE: number of entries of a row in
@@ -104,7 +105,7 @@ def index_of_entries(r):
 
 @inlined
 def views_of_lists(index, values):
-    """Return three views, to choose an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
+    """Return three views for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
 
     w is the largest number of entries in a row or column.
     """
@@ -215,8 +216,7 @@ def choose_order(index, matrix, zero_source, zero_ratio):
     """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a code.
 
     Fill-in entries get the source `zero_source`, the index of a zero. A pivot counts as zero up to `zero_ratio` times
-    the largest pivot so far. The code is ORDER_CHOSEN, SINGULAR_MATRIX or TOO_MANY_ENTRIES; `index` is complete only
-    if it is ORDER_CHOSEN.
+    the largest pivot so far. The code is ORDER_CHOSEN (`index` is complete), SINGULAR_MATRIX or TOO_MANY_ENTRIES.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]

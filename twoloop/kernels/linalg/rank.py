@@ -132,7 +132,7 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
 def singular_values_exceed(rows, ratio, gram):
     """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one, s.
 
-    This is so if rows rows^T - (ratio s)^2 I is definite; the Frobenius norm, a bound, replaces s. `gram`: scratch.
+    This holds if rows rows^T - (ratio s)^2 I is definite; the Frobenius norm (at least s) replaces s. `gram`: scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
@@ -148,9 +148,8 @@ BOUND_ROUNDING = 1e-12  # largest rounding error of a pivot, relative to the bou
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
 # if the ratio of the smallest to the largest eigenvalue of M exceeds SIMILAR_EIGENVALUES, no row is added to M, and the
-# pivots of S = G M^-1 G^T decide which rows are independent. If a pivot exceeds INDEPENDENT, the part of the row that
-# is orthogonal to the previous rows is at least 3e-9 of the row; for a dependent row, this part must be at most
-# DEPENDENT
+# pivots of S = G M^-1 G^T decide which rows are independent. If a pivot exceeds INDEPENDENT, the part of its row that
+# is orthogonal to previous rows is at least 3e-9 of the row; for a dependent row, this part must be at most DEPENDENT
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # a redundant row is a combination of independent rows; an independent row is exchanged with it if its coefficient (rows
 # scaled to norm 1) exceeds this limit. Where a coefficient passes through zero, the independent rows become dependent,
@@ -253,8 +252,7 @@ def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
     """Add scale g g^T to M in place, for rows g of G, until all eigenvalues of M are large enough.
 
     An eigenvalue is too small if it is less than `weak_ratio` times the largest one. Rows are tried in the sequence
-    `order`, in which -1 replaces the index of an added row. Store the indices of the added rows in `added`; return
-    their number, or STAYS_SINGULAR.
+    `order`, where -1 replaces an added index. Store added indices in `added`; return their number, or STAYS_SINGULAR.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
@@ -306,7 +304,7 @@ def _exchange_rows(C, is_kept, kept):
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
             break
-        # solve the equation of the entering row for the leaving row; insert the result into the other redundant rows
+        # solve the equation of the entering row for the leaving row; substitute the result in the other redundant rows
         inverse = 1.0 / C[entering, leaving]
         is_kept[leaving], is_kept[entering] = 0, 1
         for k in range(n):
@@ -323,7 +321,7 @@ def _exchange_rows(C, is_kept, kept):
 
 @compiled
 def _fill_scaled_products(mass, G, factors, solved, S, sizes):
-    """Store the upper triangle of S = G M^-1 G^T, scaled to a diagonal of 1, in S; return whether M is definite.
+    """Store in S the upper triangle of G M^-1 G^T, scaled to a diagonal of 1; return whether M is definite.
 
     `sizes` receives the factors that scale the rows, or 0 for a row of zeros. `factors` and `solved` are scratch.
     """

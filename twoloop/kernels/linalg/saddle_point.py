@@ -109,7 +109,7 @@ def factor_reduced_mass(f, w):
 
 @merged
 def solve_by_reduced_mass(f, w, r, c, a):
-    """Store in `a` the accelerations with M a + G^T lam = r and G a = c, by the factors of T^T M T."""
+    """Store in `a` the accelerations with M a + G^T lam = r and G a = c, using the factors of T^T M T."""
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
     n_dof, z, x, D, M = independent.size, w.z, w.x, w.D, w.M
     for k in range(rows.size):
@@ -224,7 +224,7 @@ def factor_schur_complement(f, w):
 
 @merged
 def solve_by_schur_complement(f, w, r, c, a):
-    """Store the accelerations in `a` and the multipliers of the independent rows in w.z, by the factors of S."""
+    """Store the accelerations in `a` and the multipliers of the independent rows in w.z, using the factors of S."""
     rows, M_inverse_G = w.rows_v, w.W
     _apply_inverse_mass(f, w, r, a)
     for i in range(rows.size):
@@ -238,8 +238,8 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-MIN_ROWS = 8  # the augmented form is fastest from this number of rows, and of degrees of freedom, on (measured: 7)
-# from this number of coordinates on, the augmented form is always fastest, unless M is diagonal (measured: about 30)
+MIN_ROWS = 8  # smallest number of rows, and of degrees of freedom, where the augmented form is fastest (measured: 7)
+# smallest number of coordinates where the augmented form is always fastest, unless M is diagonal (measured: about 30)
 MIN_COORDINATES = 32
 
 
@@ -313,7 +313,7 @@ def factor_augmented(f, w):
 
 @compiled
 def solve_augmented(w, r, c, a):
-    """Store the accelerations in `a` and the multipliers of the independent rows in w.z, by the sparse factors."""
+    """Store the accelerations in `a` and the multipliers of the independent rows in w.z, using the sparse factors."""
     n, size, scale = r.size, w.index_a[at.SIZE], w.mass_scale
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
@@ -375,7 +375,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Store in lam the multipliers of the independent rows for the last solution `a`; leave the other entries."""
+    """Store in lam the multipliers of the independent rows for the last solution `a`; leave other entries unchanged."""
     if f.form == NULL_SPACE:
         multipliers_by_elimination(f, w, r, a, lam)
     else:

@@ -126,7 +126,7 @@ def factor(program, is_independent, values, sizes, min_sine_square):
 
 @compiled
 def solve(program, values, stiffness, x, y):
-    """Replace the right-hand side x = [r, c] by the solution [a, lam], with the factors `values`; y is scratch."""
+    """Replace the right-hand side x = [r, c] by the solution [a, lam], using the factors `values`; y is scratch."""
     n, order, n_q = program[N_PIVOTS], pivot_order_of(program), program[N_COORDINATES]
     # with M + s g g^T in place of M, r should become r + s g c. If r stays the same, so do accelerations, because
     # g a = c, but the multiplier of g is smaller by s c; the last loop adds s c
@@ -148,15 +148,15 @@ def solve(program, values, stiffness, x, y):
 
 
 @compiled
-def add_redundant_stiffness(program, jacobian, is_independent, stiffness, c, right):
-    """For each redundant row g that stiffens M, add s g^T c_g to `right` in place; `c` ([r, c]) contains c_g."""
+def add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, rhs, right):
+    """For each redundant row g that stiffens M, add s g^T c_g to `right`; s: its stiffness; c_g: its entry in `rhs`."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)
     product_rows, first, second, _ = stiffening_products_of(program)
     for u in range(product_rows.size):
         row, entry = product_rows[u], first[u]
         if entry == second[u] and is_independent[row] == 0.0:
-            right[columns[entry]] += stiffness[row] * jacobian[entry] * c[n_q + row]
+            right[columns[entry]] += stiffness[row] * jacobian[entry] * rhs[n_q + row]
 
 
 @compiled
@@ -185,7 +185,7 @@ def solve_refined(program, mass, jacobian, is_independent, values, stiffness, x,
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):
         right[k] = x[k]
-    add_redundant_stiffness(program, jacobian, is_independent, stiffness, right, x)
+    add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, right, x)
     for i in range(is_independent.size):
         if is_independent[i] == 0.0:
             x[n_q + i] = right[n_q + i] = 0.0

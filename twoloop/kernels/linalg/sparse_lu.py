@@ -169,7 +169,7 @@ def factor(program, is_independent, values, sizes):
 
 @compiled
 def solve(program, values, x, y):
-    """Replace the right-hand side x = [r, c] by the solution, with the factors `values`; y is scratch."""
+    """Replace the right-hand side x = [r, c] by the solution, using the factors `values`; y is scratch."""
     n, n_off, order = program[N_PIVOTS], program[N_OFF_DIAGONAL], pivot_order_of(program)
     begin, row_of = factor_columns_of(program)
     for k in range(n):

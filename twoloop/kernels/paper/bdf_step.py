@@ -69,8 +69,7 @@ def _coefficient_row(memory, row):
 def _history_views(memory, n):
     """Return views of `memory`: differences, trial differences, prediction, rate, and scratch.
 
-    Both arrays of differences have the shape (N_DIFFERENCES, 2 n). The prediction of (q, v) and its rate, the time
-    derivative, have 2 n entries.
+    Arrays of differences have the shape (N_DIFFERENCES, 2 n). The prediction of (q, v) and its rate have 2 n entries.
     """
     begin = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
@@ -205,7 +204,7 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error, in tolerances, and the next step-size ratio; d: y1 minus its prediction."""
+    """Store NEXT_ORDER; return the error (in tolerances) and the next step-size ratio; d: y1 minus its prediction."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
@@ -244,7 +243,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _update_differences(memory, trial, y1, d):
-    """Replace the scaled differences in `trial` by those at the end of the step, where y1 = prediction + d."""
+    """Replace scaled differences in `trial` by the differences at the end of the step, where y1 = prediction + d."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:

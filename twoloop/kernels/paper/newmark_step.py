@@ -13,8 +13,7 @@ MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has f
 GROWTH_AFTER_REST = 2.0
 TINY = 1e-300  # added to the tolerance, which would be zero for a mechanism at rest at the origin
 
-# indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. After these scalars, `memory` has the
-# new accelerations (n_q)
+# indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. The new accelerations (n_q) follow
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
 # indices in `options` of newmark_step
@@ -31,7 +30,7 @@ def _largest_abs(x, lower_bound):
 
 @compiled
 def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
-    """Return the rate of the motion, 1/s: the reciprocal of the time in which the largest |coordinate| can double.
+    """Return the rate (1/s) of the motion: the reciprocal of the time in which the largest |coordinate| can double.
 
     The time follows from the largest |coordinate|, |velocity| and |acceleration| so far, because all coordinates may be
     near zero at a single time, depending on the origin. If the largest |coordinate| arises mainly in this step, as it

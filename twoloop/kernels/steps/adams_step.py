@@ -236,7 +236,7 @@ def _estimate_error(g, G, h, order, largest_v, largest_q):
 def _choose_order(memory, h, k, table, d, n):
     """Store NEXT_ORDER; return the error, in units of the tolerances, and the ratio of the next step size to h.
 
-    The rules are those of Shampine and Gordon's STEP. The order decreases if the error at lower orders is not larger.
+    The rules are taken from STEP (Shampine and Gordon). The order decreases if the error at lower orders is not larger.
     It increases if k + 1 steps had the order k and the error at order k + 1 is smaller; while STARTING is 1, always.
     """
     g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)

@@ -82,7 +82,7 @@ def _fill_newton_matrix(w, memory, n, m, z, H):
 
 @compiled
 def factor_newton_matrix(w, memory, z):
-    """Factor T^T (M - z^2 K - z D) T, with z = gamma h and the tangents K and D computed last; return a code."""
+    """Factor T^T (M - z^2 K - z D) T, z = gamma h, for the tangents K and D that were computed last; return a code."""
     n, m = w.Q.size, w.independent.size
     storage = matrix_storage(w, n, at.FILTER)
     H = as_matrix(storage, m)
@@ -128,7 +128,7 @@ def compute_and_factor_matrix(f, w, memory, t, q, v, z):
 
 @compiled
 def _solve_newton_system(w, memory, x):
-    """Replace the right-hand side x (n_dof) by the solution, with the factors computed by `factor_newton_matrix`."""
+    """Replace the right-hand side x (n_dof) by the solution, using the factors from `factor_newton_matrix`."""
     m = x.size
     H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
     if memory[at.IS_SYMMETRIC] == 1.0:
@@ -221,7 +221,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
-    """Update derivatives at (t, Q, V), where accelerations are F, and factors, unless still valid; return a code."""
+    """Renew derivatives (at Q, V, where accelerations are F) and factors unless they are still valid; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -379,8 +379,7 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
     """Return the largest component of the error estimate of `_store_weighted_sums`, in units of the tolerances.
 
     The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If outdated derivatives
-    make the filter wrong, the derivatives are computed anew. On return, the vectors E_Q and E_V of `memory` contain the
-    estimate, filtered twice.
+    make the filter wrong, they are computed anew. On return, E_Q and E_V in `memory` have the estimate, filtered twice.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]

@@ -47,7 +47,7 @@ from twoloop.kernels.linalg.band import (
 )
 from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.linalg.markowitz_lu import columns_of
-from twoloop.kernels.linalg.sparse_ldl import add_redundant_stiffness
+from twoloop.kernels.linalg.sparse_ldl import add_terms_of_redundant_rows
 from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
 from twoloop.kernels.linalg.sparse_lu import load_matrix, tangent_entries_of
 from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
@@ -204,7 +204,7 @@ def reduce_to_independents(w, A, AT, B):
 
 @compiled
 def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
-    """Store J_q and J_v, computed from K and D at (t, q, v), the last evaluated state, in w.matrices; return a code."""
+    """Store in w.matrices J_q and J_v at (t, q, v), the last evaluated state, computed from K and D; return a code."""
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
@@ -234,7 +234,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store J_q, or J_v if `by_v`, in J, at (t, q, v) with accelerations a; return a code. The rest is scratch."""
+    """Store J_q (J_v if `by_v`) at (t, q, v), where accelerations are a, in J; return a code. The rest is scratch."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     for column in range(w.independent.size):
         j = w.independent[column]
@@ -253,7 +253,7 @@ def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_ne
 
 @compiled
 def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v at (t, q, v), the last evaluated state, with accelerations a, in w.matrices; return a code."""
+    """Store in w.matrices J_q and J_v at (t, q, v), the last evaluated state; a: accelerations there; return a code."""
     if f.force_by_q_given == 1 and w.Rate.size == w.C.size:
         return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
@@ -284,7 +284,7 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense_matrix(w, memory, s, index, z, matrix):
-    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, with pivots `index` in `memory`; return a code."""
+    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, and in `memory` the pivots `index`; return a code."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
     damped = memory[at.HAS_DAMPING] == 1.0
@@ -325,8 +325,7 @@ def _band_view(numbers, n, b):
 def _border_views(w, n, r, b):
     """Return views of three arrays stored after K: independent rows of C_q (r, n), D (n - r + 1, r), and indices (r).
 
-    C_q and D, a copy of w.D, belong to the state where K was computed. The indices, one for each column of D, are
-    dependent coordinates.
+    C_q and D, a copy of w.D, belong to the state where K was computed. The indices are the dependent coordinates.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -352,7 +351,7 @@ def _update_banded_residual(f, w, t, q, v):
 
 @compiled
 def _fill_band(f, w, t, q, v, by_v, base, moved, b, band):
-    """Store K, or D if `by_v`, computed by differences, in `band` (n_q, 2 b + 1); return DONE or NOT_FINITE.
+    """Store K (D if `by_v`), computed by differences, in `band` (n_q, 2 b + 1); return DONE or NOT_FINITE.
 
     Columns j, j + 2 b + 1, ... are computed at once. `base` (n_q) is the residual at (q, v); `moved` (n_q) is scratch.
     """
@@ -386,7 +385,7 @@ def _copy_band(A, b, band):
 
 @compiled
 def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
-    """Store the tangents K and D at (t, q, v), the last evaluated state, as bands in w.matrices; return a code."""
+    """Store in w.matrices the bands of the tangents K and D at (t, q, v), the last evaluated state; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, at.FILTER).reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
     code = fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
@@ -437,7 +436,7 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
-    """Store the factors of M - z^2 K - z D with the border C_q in `numbers`, and pivots in `memory`; return a code.
+    """Store in `numbers` the factors of M - z^2 K - z D bordered by C_q, and pivots in `memory`; return a code.
 
     `index`: index of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
     """
@@ -480,7 +479,7 @@ def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
 
 @compiled
 def _solve_banded_system(f, w, b, numbers, pivots, substitute, X, x):
-    """Replace x[:n_dof] by (I - z^2 J_q - z J_v)^-1 x[:n_dof], with the factors of the bordered matrix.
+    """Replace x[:n_dof] by (I - z^2 J_q - z J_v)^-1 x[:n_dof], using the factors of the bordered matrix.
 
     The other entries of x (n_q), and X (n_q), are scratch.
     """
@@ -596,7 +595,7 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 @compiled
 def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
-    """Store the entries of K, or of D if `by_v`, computed by differences, in `entries`; return DONE or NOT_FINITE.
+    """Store in `entries` the entries of K (of D if `by_v`), computed by differences; return DONE or NOT_FINITE.
 
     All columns of a group are computed at once. `base`: residual at (q, v); `residual` and `moved` (n_q): scratch.
     """
@@ -640,7 +639,7 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
 
 @compiled
 def _fill_sparse_tangents(f, w, memory, t, q, v):
-    """Store the entries of K and D at (t, q, v), the last evaluated state, in w.matrices; return a code.
+    """Store in w.matrices the entries of K and D at (t, q, v), the last evaluated state; return a code.
 
     The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
     """
@@ -703,7 +702,7 @@ def _fill_sparse_right_side(f, w, r, right):
     rows, columns, _ = jacobian_entries_of(f.newton_program)
     for k in range(rows.size):
         right[w.Q.size + rows[k]] += jacobian[k] * r[columns[k]]
-    add_redundant_stiffness(f.newton_program, jacobian, is_independent, stiffness, right, right)
+    add_terms_of_redundant_rows(f.newton_program, jacobian, is_independent, stiffness, right, right)
 
 
 @compiled
@@ -726,7 +725,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v (dense storage) or K and D (else) at the last evaluated state in w.matrices; return a code."""
+    """Store in w.matrices J_q and J_v (dense storage) or K and D (else) at the last evaluated state; return a code."""
     if f.form == FIXED_ORDER:
         return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.bandwidth >= 0:
@@ -774,7 +773,7 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
-    """Replace x[:n_dof] by the solution, with the factors of `_factor_system` in `numbers`; X (n_q) is scratch."""
+    """Replace x[:n_dof] by the solution, using the factors in `numbers` from `_factor_system`; X (n_q) is scratch."""
     m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, index)
     if f.bandwidth >= 0:
         _solve_banded_system(f, w, f.bandwidth, numbers, pivots, substitute, X, x)
@@ -784,7 +783,7 @@ def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
 
 @compiled
 def _solve_sparse_system(f, w, numbers, right, y, x):
-    """Replace x (n_q), real or complex, by the solution with the factors `numbers`; `right` and `y` are scratch."""
+    """Replace x (n_q), real or complex, by the solution, using the factors `numbers`; `right` and `y` are scratch."""
     _fill_sparse_right_side(f, w, x, right)
     solve_lu(f.newton_program, numbers, right, y)
     copy(right[: x.size], x)
@@ -792,7 +791,10 @@ def _solve_sparse_system(f, w, numbers, right, y, x):
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
-    """Replace x[:n_dof], a complex right-hand side, by the solution for eigenvalue k of A, which may be real."""
+    """Replace x[:n_dof], a complex right-hand side, by the solution of the system for eigenvalue k of A.
+
+    If this eigenvalue is real, only the real part of x is used, and the solution is real.
+    """
     n = w.Q.size
     if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # the first eigenvalue is real: it is gamma0
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)

@@ -36,7 +36,8 @@ def options_array(
 ) -> NDArray[np.float64]:
     """Return the array `options` of an implicit Runge-Kutta method with the tableau A, b, c.
 
-    `outer_test`: 1 if test (32) of the paper also covers dependent coordinates; else see EXTRAPOLATION and POWER.
+    `outer_test`: 1 if test (32) of the paper also covers dependent coordinates, else 0. `extrapolation` and `power` are
+    explained above, at EXTRAPOLATION and POWER.
     """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
@@ -134,13 +135,13 @@ N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
 # indices of the scalars in `memory`
 (
     HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt (in diagonal_step.py: there was one)
-    H_TRIAL,  # step size of the last attempt, s
+    H_TRIAL,  # step size of the last attempt (s)
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
-    H_PREVIOUS,  # size of the last accepted step, s
+    H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: the stored derivatives may be used
     IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at the step's end
     PARTITION_NUMBER,  # number (GENERATION in data/indices.py) of the partition that the stored derivatives belong to
-    H_FACTORED,  # step size in the factored systems, s; 0: none are factored
+    H_FACTORED,  # step size in the factored systems (s); 0: none are factored
     CONTRACTION,  # ratio of the last two corrections of Newton's method
     HAS_DAMPING,  # 1: forces depend on v; 0: J_v and D are zero
     IS_SYMMETRIC,  # kind of factors in diagonal_step.py. 1: L D L^T of a symmetric matrix; 0: L U
@@ -157,8 +158,8 @@ A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # indices of the parts of w.matrices, n_q^2 entries each, in dense and banded storage; for J_q, K, T etc. see
 # newton_systems.py. DERIVATIVE_Q: in dense storage J_q, or T^T K T if diagonal_step.py factors its own matrices; in
 # banded storage the band of K, followed by the independent rows of C_q and by w.D. DERIVATIVE_V: J_v, or T^T D T, or
-# the band of D. FILTER: factors of the real matrix that filters errors. From SYSTEMS on: for each eigenvalue of A, two
-# parts with the factors of its complex matrix (in diagonal_step.py: T^T M T)
+# the band of D. FILTER: factors of the real matrix that filters errors. SYSTEMS: first of two parts for each eigenvalue
+# of A, with the factors of its complex matrix (in diagonal_step.py: T^T M T)
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
@@ -210,8 +211,8 @@ def n_matrices(n_systems: int) -> int:
 
 
 # `options` of a diagonally implicit method begin with the options of Newton's method for one stage, A = [[gamma]], in
-# which N_REAL has the index NEWTON_OFFSET. From DIAGONAL_OFFSET on, they contain the number of stages, A, c, b - b^,
-# the jump weights, and 1 if steps with an error estimate end at the result of the embedded formula, otherwise 0
+# which N_REAL has the index NEWTON_OFFSET. At DIAGONAL_OFFSET follow the number of stages, A, c, b - b^, the jump
+# weights, and 1 if steps with an error estimate end at the result of the embedded formula, otherwise 0
 NEWTON_OFFSET = N_SCALARS + 2 + 5
 DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 
@@ -250,7 +251,7 @@ def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
 
 @merged
 def newton_options_index(s):
-    """Return the index in `options` at which the entries by `newton_options` begin (that of N_REAL), for s stages."""
+    """Return the index in `options` of N_REAL, the first of the entries by `newton_options`, for s stages."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
@@ -309,7 +310,7 @@ def pivots_of(memory, s, n, k):
 
 @inlined
 def complex_vector(memory, s, n, n_systems, index):
-    """Return a view of complex scratch vector `index` (n), 0 or 1, of `memory`."""
+    """Return a view (n) of complex scratch vector `index` (0 or 1) of `memory`."""
     return _storage_after_vectors(memory, s, n, 1 + n_systems + 2 * index).view(np.complex128)
 
 

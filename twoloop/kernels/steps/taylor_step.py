@@ -58,18 +58,18 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
 (
     HAS_SERIES,  # 1: the current series has been computed
     CURRENT,  # index, 0 or 1, of the current series: the series about the beginning of the step
-    UNIT,  # unit of time of the current series, s
-    NEXT_UNIT,  # unit of time of the series about the end of the last attempt, s
+    UNIT,  # unit of time of the current series (s)
+    NEXT_UNIT,  # unit of time (s) of the series about the end of the last attempt
     ALLOWED_SIZE,  # step size that the current series allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
-    PASSED,  # with KEEP = 1: time since the state about which the series is computed, s
+    PASSED,  # with KEEP = 1: time (s) since the state about which the series is computed
     TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
     # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
     SUSPECTED,  # 1: the run has not passed the time SUSPECT yet
-    SUSPECT,  # time within a rejected step at which the defect was too large, s
+    SUSPECT,  # time (s) within a rejected step at which the defect was too large
     N_MEMORY_SCALARS,
 ) = range(14)
 
@@ -275,7 +275,7 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Store coefficients: of t and q up to order 1, of v and early operations of order 0; set r and c to zero."""
+    """Store coefficients of t and q up to order 1, and of v and early operations of order 0; set r and c to zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -288,7 +288,7 @@ def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
 
 @merged
 def integrate_coefficients(K, unit, N, series, a):
-    """Store coefficients K of v and K + 1 of q in N and `series`: integrals of a (n), coefficient K - 1."""
+    """Store in N and `series` coefficient K of v and K + 1 of q: the integrals of coefficient K - 1 of a (n)."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
     for j in range(n):

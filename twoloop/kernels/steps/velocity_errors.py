@@ -20,8 +20,8 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# largest factor on the duration of a velocity error that changes as slowly as the motion: no vibration causes such an
-# error, which keeps its sign in later steps, so that errors add up
+# a velocity error that changes as slowly as the motion is not due to a vibration: it keeps its sign in later steps, so
+# that position errors add up. To allow for this, its duration is multiplied by up to this factor
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, in units of tolerances[GAP]
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
@@ -73,7 +73,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return max|v| of `state` over max|a| of accelerations a (n_q), s, at most LONGEST_GAPS * tolerances[GAP]."""
+    """Return max|v| / max|a| (s) for `state` and accelerations a (n_q), at most LONGEST_GAPS * tolerances[GAP]."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
