@@ -44,7 +44,7 @@ MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions where this error is mea
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations at `inputs`, [t, q, v]; return their values, and a flag: whether they are valid.
+    """Write code for the accelerations at `inputs`, [t, q, v]; return their values and a flag (whether they are valid).
 
     On return, the builder's current block may be another one. `emit` must have the pointers to the coefficients.
     """
@@ -103,7 +103,7 @@ def call_accelerations(
 def _accelerations(
     emit: Emitter, equations: Elimination, lowering: Lowering, state: Callable[[], list[Value]]
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations; return their values, and a flag: whether they are valid.
+    """Write code for the accelerations; return their values and a flag (whether they are valid).
 
     If pivots are small, the code calls a function whose elimination begins with M. The function `state`, which may
     write code, returns the arguments of this call: t and pointers to q and v.
@@ -161,7 +161,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return the pointer to the array of coefficients; in SIMD lanes: to varying, and to shared coefficients."""
+    """Return the pointer to the coefficients; in SIMD lanes, to coefficients that vary, and to shared ones."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -170,8 +170,9 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# projections with more operations than SPLIT_PROJECTIONS are split into functions, which halves the time to compile. If
-# accelerations have no reduced program, SPLIT_ALL is the limit: then they are split, too, and take 50 % longer to run
+# equations with more operations than SPLIT_PROJECTIONS have their projections split into functions, which halves the
+# time to compile. Without a `reduced_program` (elimination.py), accelerations are split, too, and take 50 % longer to
+# run; so the threshold is then SPLIT_ALL
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
@@ -280,7 +281,7 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Write code that stores q after a Newton step in `out`, its change in `moved`; return whether it succeeds."""
+        """Write code that stores q after a Newton step in `out`, and its change in `moved`; return whether it works."""
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         _write_zeros(emit, self.n, r)
@@ -486,7 +487,7 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
     """Return the largest relative error of accelerations by generated code, for zero velocities at and near a start.
 
-    Accelerations are computed with and without a projection: by two functions, whose pivots may differ. The error is
+    Accelerations are computed with and without a projection, by two functions whose pivots may differ. The error is
     infinite if pivots are too small at all positions.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q

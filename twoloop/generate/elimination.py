@@ -50,11 +50,10 @@ PIVOT_FRACTION = 0.01  # the pivot of a row of G must be at least this fraction 
 # possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to the pivot that this
 # row has without the other rows. With pivots below the last value, rounding errors would dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
-# MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] at most the smallest pivot at the start; without such an
-# i, MIN_PIVOTS[-1] is chosen
+# MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] <= smallest pivot at the start, else MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 N_FEW_COORDINATES = 24  # with more coordinates, MIN_INDEX_MANY replaces MIN_INDEX_FEW
-# all rows of G may be added to M if pivots are small: if the index of their limit in MIN_PIVOTS is at least
+# all rows of G may be added to M if pivots are so small that the index of their limit in MIN_PIVOTS is at least:
 # MIN_INDEX_FEW, for up to N_FEW_COORDINATES coordinates; MIN_INDEX_FEW_SINGULAR, if M is also singular, because Euler
 # parameters lose two digits even in sound models; MIN_INDEX_MANY, for more coordinates, because code gets longer
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
@@ -62,7 +61,7 @@ ADDED_SIZE = 16.0  # if s G^T G is added to M, approximate ratio of its largest 
 MAX_PIVOT_RATIO = 1e5  # solutions need refinement if an entry of M with added rows exceeds this multiple of its pivot
 SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large step, so that they rarely depend on the start
 DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
-MIN_GAIN = 2  # rows are added to M only if this makes min_pivot larger, by at least this number of places in MIN_PIVOTS
+MIN_GAIN = 2  # rows are added to M only if min_pivot becomes larger, by at least this number of steps in MIN_PIVOTS
 # dependent coordinates are eliminated if G has at least this number of rows per coordinate; with fewer rows, the linear
 # system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
@@ -291,18 +290,18 @@ class Elimination:
 
     Fields:
     graph : graph of the operations; its first inputs are t, q and v.
-    mass_first_program : program for "a" (n_q,), the accelerations at a state, by an elimination that begins with M.
+    mass_first_program : program for the accelerations "a" (n_q,) at a state, by an elimination that begins with M.
     reduced_program : program for "a" that eliminates dependent coordinates, if it takes fewer operations; valid at
         fewer positions.
-    right_sides : program for "r" (n_q,), Q, and "c" (n_c + n_a,), the right-hand sides of the rows of G; 0 for unused
-        rows.
-    position_projection : program for "q" (n_q,), the position after one Newton step towards the constraints, and
-        "moved" (n_q,), the change of the position, x, with A x = 0.
-    projection : program for "q", "moved", "v" (n_q,), the projected velocity, and "a" (n_q,) and "lam" (n_c + n_a,) at
-        this velocity. M, G and Q are evaluated at the position before the step.
+    right_sides : program for the forces "r" (n_q,) and the right-hand sides "c" (n_c + n_a,) of the rows of G; 0 for
+        unused rows.
+    position_projection : program for the position "q" (n_q,) after one Newton step towards the constraints, and for its
+        change "moved" (n_q,), a vector x with A x = 0.
+    projection : program for "q" and "moved", for the projected velocity "v" (n_q,), and for the accelerations "a" and
+        multipliers "lam" (n_c + n_a,) at this velocity. M, G and Q are evaluated at the position before the step.
     basic_projection : as `projection`, but "lam" is 0 for dependent rows (in `projection`, "lam" has the least norm).
-    position_errors, velocity_errors : programs for "c" (n_c + n_a,), the right-hand sides of the corrections of
-        positions, and of velocities.
+    position_errors, velocity_errors : programs for the right-hand sides "c" (n_c + n_a,) of corrections of positions,
+        and of velocities.
     redundant_rows : program without arrays; its conditions hold if the redundant constraints are satisfied.
     split_functions : generator that splits long equations into several functions, set by compile_equations.py.
     n_operations : number of operations of callbacks and factorization, but not of the solution with the factors.
@@ -416,7 +415,7 @@ class Elimination:
 
     @property
     def accelerations(self) -> list[Program]:
-        """Return `reduced_program`, if there is one, and `mass_first_program`, for states where it is not valid."""
+        """Return the programs for accelerations, in order: `reduced_program` (if it exists), `mass_first_program`."""
         return (
             [self.mass_first_program]
             if self.reduced_program is None
@@ -425,13 +424,13 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for "r", Q, and "c", the right-hand sides of the rows of G."""
+        """Return the program for "r" (the forces Q) and "c" (right-hand sides of the rows of G; 0 for unused rows)."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return the accelerations and the multipliers of the independent rows, at velocities v, and conditions."""
+        """Return one list (accelerations, multipliers of the independent rows) at velocities v, and its conditions."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
@@ -443,13 +442,13 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for "c", the right-hand sides -C of position corrections; 0 for dependent rows and A."""
+        """Return the program for the right-hand sides "c" = -C of position corrections; 0 in dependent rows and A."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for "c", the right-hand sides -G v - G_t of velocity corrections; 0 for dependent rows."""
+        """Return the program for the right-hand sides "c" = -G v - G_t of velocity corrections; 0 in dependent rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -460,7 +459,7 @@ class Elimination:
 
     @cached_property
     def position_projection(self) -> Program:
-        """Return the program for "q", the position after one Newton step, and "moved", the change of the position."""
+        """Return the program for the position "q" after one Newton step, and for its change "moved"."""
         moved = self._correction(self.position_errors)
         position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
         return Program(self.graph, position, self.conditions)
@@ -488,7 +487,7 @@ class Elimination:
         )
 
     def _correction(self, c: Program) -> list[Affine]:
-        """Return the change x (n_q) of least norm in the metric of M with G x = c; `c`: program with the array "c"."""
+        """Return the solution x (n_q) of G x = c of least norm in the metric of M; `c`: program with the array "c"."""
         n = self.system.n_q
         return self.factors.solve([*([self.zero] * n), *(c.arrays["c"][k] for k in self.choice.rows)])[:n]
 

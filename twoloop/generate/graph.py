@@ -26,7 +26,7 @@ from twoloop.kernels.evaluation import operations as op
 MAX_TRACED_OPERATIONS = 20_000
 # A product is recorded once for all its multiples: the constant factors of both arguments are taken out, unless this
 # might underflow or overflow. They are not taken out if the magnitude of their product is not between MIN_FACTOR and
-# 1 / MIN_FACTOR, nor from the squares of which a power with an exponent above HIGH_EXPONENT is composed.
+# 1 / MIN_FACTOR, nor from the squares that make up a power with an exponent above HIGH_EXPONENT.
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 # reason in messages about a callback that compares an expression, or converts it to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"

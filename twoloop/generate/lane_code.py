@@ -84,7 +84,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Store and return UNIT, the unit of time of the series, s; choose it in new runs and after accepted steps."""
+        """Store and return UNIT, the unit of time of the series (s); choose it in new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -320,7 +320,7 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
     """Return a mask of the lanes where det G1 G0^T <= 0: steps in these lanes may have passed a singular position.
 
     G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula,
-    the determinant is the inner product of two vectors, the maximal minors of G0 and of G1, and is positive if these
+    the determinant is the inner product of the vectors of maximal minors of G0 and G1. It is positive if these vectors
     are similar. A step through a position at which the rows become dependent may lead to another assembly: then all
     minors pass through zero and change their signs. A lane with a zero pivot is in the mask, too.
     """
@@ -585,7 +585,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct the positions NEW once in lanes with ACTIVE = 1; set ACTIVE and UNCONVERGED: 1 if this succeeds."""
+        """Correct the positions NEW once in lanes with ACTIVE = 1; set ACTIVE and UNCONVERGED (1: success)."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -714,7 +714,7 @@ class LaneConstraints(LaneSteps):
         clear_active_unless(emit, work, lowering.is_valid(self._program, values))
 
 
-SECONDS_PER_QUANTITY = 3e-4  # estimated time to compile the operation of one quantity, s
+SECONDS_PER_QUANTITY = 3e-4  # estimated time (s) to compile the operation of one quantity
 ELIMINATION_MODULES = (elimination, null_space, compile_equations)  # modules that write the code of accelerations
 # modules that write the code: cached code is invalid after a change of one of them
 CODE_MODULES = (series, *ELIMINATION_MODULES, program, lane_series, llvm_code, llvm_text)
@@ -726,7 +726,7 @@ FILE_PREFIX = "lanes"  # first part of the names of cached files
 class GeneratedLanes(Generic[Code]):
     """Compiled code of a mechanism for SIMD lanes; its coefficients are computed from parameters.
 
-    tape : tape of the parameters in the traces of `code`.
+    tape : ParameterTape (parameter_expressions.py) of the traces of `code`.
     """
 
     def __init__(self, tape: ParameterTape, code: Code):
@@ -746,7 +746,7 @@ class GeneratedLanes(Generic[Code]):
 
     @property
     def seconds_to_build(self) -> float:
-        """Return the estimated time to compile the code, s; 0 if the code is in memory or on the disk."""
+        """Return the estimated time (s) to compile the code; 0 if the code is in memory or on the disk."""
         if are_cached(FILE_PREFIX, _stamp(), self.code.structure):
             return 0.0
         return SECONDS_PER_QUANTITY * self.code.n_quantities

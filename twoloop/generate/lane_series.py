@@ -199,7 +199,7 @@ class LaneSeries:
 
     `scratch` contains, in this order, as vectors: the factors of the linear equations; their right-hand side r; the
     reciprocal divisors in recurrences of roots, logarithms and arctangents; sums that are carried over to the next
-    order; a row of zeros; and one row of factors for each order from 0 on.
+    order; a row of zeros; and one row of factors for each order, beginning with 0.
     """
 
     def __init__(

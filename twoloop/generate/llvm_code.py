@@ -258,7 +258,7 @@ def write(
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
-LARGEST_ANGLE = 1e6  # largest accepted angle, rad; for larger angles, HALF_PI, a sum of two numbers, is not accurate
+LARGEST_ANGLE = 1e6  # largest accepted angle (rad); HALF_PI, a sum of two numbers, is too inaccurate for larger ones
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # pi/2 as a sum: angles are reduced by multiples of pi/2
 # coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from Moshier's Cephes, sin.c
 SINES = (

@@ -34,7 +34,7 @@ class Block(NamedTuple):
 
 
 class Factors:
-    """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; the pivots are its diagonal blocks.
+    """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; the pivots are the blocks of D.
 
     blocks : blocks in the order of elimination.
     conditions : for rows of G (index `n` and later), pairs: a pivot, and this pivot without the other rows of G. The
@@ -369,10 +369,10 @@ def solve_refined(
     """Return a and lam (independent rows) with M a + G^T lam = r, G a = c; refine them if `choice.is_refined`.
 
     Also return conditions: pairs of expressions; unless the solution has lost too many digits, the first one is larger.
-    If a is small, near equilibrium, it counts as large as the acceleration of all masses by r.
+    Near equilibrium, where a is small, the acceleration of all masses by r alone counts instead of a.
 
-    `solve`: function that solves a linear system with the factors of [M + s g^T g, G^T; G 0], with rows g added to M as
-    in PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.
+    `solve`: function that solves a linear system by the factors of [M + s g^T g, G^T; G 0], where rows g were added to
+    M as in PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:

@@ -151,16 +151,16 @@ class ParameterTape(SymbolicObject):
 
         return product
 
-    def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
-        """Return the values (n_runs, len(numbers)) that `numbers` take at `parameters` (n_runs, n_p)."""
+    def evaluate(self, expressions: Sequence["Parameter"], parameters: Array) -> Array:
+        """Return the values (n_runs, len(expressions)) of expressions for the parameters `parameters` (n_runs, n_p)."""
         product = self.product_evaluator(parameters)
-        rows = {powers: k for k, powers in enumerate(dict.fromkeys(parameter.powers for parameter in numbers))}
+        rows = {powers: k for k, powers in enumerate(dict.fromkeys(parameter.powers for parameter in expressions))}
         products = np.empty((len(rows), len(parameters)))
         with np.errstate(all="ignore"):
             for powers, k in rows.items():
                 products[k] = product(powers)
-            scales = np.array([[parameter.scale] for parameter in numbers]).reshape(-1, 1)
-            values = scales * products[[rows[parameter.powers] for parameter in numbers]]
+            scales = np.array([[parameter.scale] for parameter in expressions]).reshape(-1, 1)
+            values = scales * products[[rows[parameter.powers] for parameter in expressions]]
         return np.ascontiguousarray(values.T)
 
 

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a traced function of the user is compared with calls of the function
-TIME_SPACING = 0.37  # time between successive compared states, s; unlikely to be the period of a force
+TIME_SPACING = 0.37  # time (s) between successive compared states; unlikely to be the period of a force
 MAX_TRACE_DIFFERENCE = 1e-10  # relative differences between trace and call up to this size may be rounding errors
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
@@ -126,7 +126,7 @@ class Program:
 class ArrayAlgebra(Algebra[Any]):
     """Algebra of NumPy arrays (n_runs,): a value is an array with one number for each run, or one number for all runs.
 
-    tape : tape of the coefficients that are Parameters.
+    tape : ParameterTape of the coefficients that are Parameters.
     """
 
     functions: Mapping[int, Callable[[Any], Any]] = MappingProxyType(

@@ -194,9 +194,9 @@ def _sum_of_products(
 ) -> Affine:
     """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
 
-    Terms are collected by factors, or by the quantities in the factors, whichever needs fewer products. If both need
-    the same number, rates (`of_rates`) are collected by quantities. This leads to products such as (cos x) x', whose
-    sums are computed in the recurrence of sin x anyway, see `_shared_sums` in lane_series.py.
+    Terms are collected by factors, or by the quantities in the factors, whichever needs fewer products. In a tie,
+    they are collected by quantities if `of_rates` (the sum is the rate of a constraint, G v + G_t), else by factors.
+    Quantities lead to products such as (cos x) x', whose sums are computed for sin x anyway, see lane_series.py.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -223,7 +223,7 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return the key of a product, its constant, and its two factors, of which the second is normalized."""
+    """Return key, scale, first, second: factor * multiplier is scale * first * second, with `second` normalized."""
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier
 

@@ -552,7 +552,7 @@ def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make:
 
 
 def load_checked_bounds(system: ConstrainedSystem) -> None:
-    """Add kinds of callbacks, whose indices were checked in other systems with the same traces, to `within_bounds`."""
+    """Add to `within_bounds` the kinds of callbacks whose indices were checked in systems with the same traces."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 

@@ -39,7 +39,7 @@ MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run:
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 # a trace is wrong if it differs from a call by more than this fraction; see also `_is_systematic`
 CLEAR_DIFFERENCE = 1e-6
-PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # of states near a state, see `_is_systematic`: largest relative distance, number
+PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # neighbours in `_is_systematic`: largest relative distance, number
 MARGIN = 0.01  # margin of a CheckedRegion, relative to its ranges; small compared with the steps of a run
 MARGIN_AT_REST = 1e-9  # margin added for coordinates at rest, whose range is 0, relative to the largest range
 
@@ -239,7 +239,7 @@ def _random_directions(n_q: int) -> Array:
 
 
 def extreme_states(t: Array, rows: Array) -> Array:
-    """Return those states, as rows [t, q, v], at which t or an entry of `rows` [q, v] is smallest or largest."""
+    """Return, as rows [t, q, v], the states at which t or an entry of `rows` [q, v] is smallest or largest."""
     states = np.column_stack([t, rows])
     return states[np.unique([states.argmin(axis=0), states.argmax(axis=0)])]
 
