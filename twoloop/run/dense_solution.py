@@ -32,7 +32,7 @@ Integers = NDArray[np.int64]
 MAX_DIVIDED_INTERVALS = 512  # largest number of intervals with cached interior states
 MAX_ACCURATE_INTERVALS = 65536  # largest number of cached intervals that need no interior states
 # a polynomial is accurate if its residual in constraints and equations of motion, relative to the tolerances, is at
-# most MAX_ERROR. Across singular positions, where velocity errors were ten times the residual: MAX_ERROR_ACROSS
+# most MAX_ERROR. Across singular positions, where velocity errors were ten times the residual, use MAX_ERROR_ACROSS
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
 N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
 

@@ -139,7 +139,7 @@ def interrupted_fields(system: ConstrainedSystem, t0: float, events: list[Any] |
 
 BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
 BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
-CHUNK_TO_EVENT = 16  # attempted steps per chunk if an event may end the run: steps beyond the event are wasted
+CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, because steps beyond the event are wasted
 # chunks do not grow further once a chunk takes more than this CPU time (s), so that Ctrl-C is noticed soon
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
@@ -282,7 +282,7 @@ class IntegrationLoop:
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
-                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # a node may be where no motion gets
+                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # a node may be at a position that no motion reaches
             else:
                 self.code, self.callback_error = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:

@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # before the first call: in place of the arguments and options of the last call
+NO_OPTIONS: Any = (None,) * 12, None  # before the first call, it replaces the arguments and options of the last call
 
 
 def options_of(

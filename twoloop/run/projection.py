@@ -505,7 +505,7 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
 def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
-    """Return the message for a projection that fails as the rank of the `free` columns is too small; `why`: how."""
+    """Return the message for a projection that fails because the `free` columns lack rank; `why`: what failed."""
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
     name = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:

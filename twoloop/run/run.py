@@ -163,7 +163,7 @@ class Run:
         return code
 
     def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, first_size: float) -> None:
-        """Move a run's start from a state beside a singular position to this position; `first_size`: first step (s)."""
+        """Move a run's start from beside a singular position to this position; `first_size`: first step size (s)."""
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
@@ -187,7 +187,7 @@ class Run:
     def advance(
         self, outputs: Array, buffers: Buffers, filled: NDArray[np.int64], active: tuple[Plan, Array, Kit] | None = None
     ) -> int:
-        """Take compiled steps to the last of `outputs`, or until Python must act; return a code: the reason.
+        """Take compiled steps to the last of `outputs`, or until Python must act; return a code (why they ended).
 
         Steps end at all times in `outputs`. `filled` becomes the numbers of states and of steps in the buffers.
         `active`: plan, controls and kit for this call, if they differ from the attributes of the run.

@@ -167,7 +167,7 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return M scaled to unit masses, the rows scaled to unit norms, their divisors, and the units of the coordinates.
+    """Return M scaled to unit masses, the rows scaled to unit norms, divisors of the rows, and units of coordinates.
 
     The divisor of a row is its norm, or at least MIN_ROW_NORM times the norm expected from its derivative.
     """

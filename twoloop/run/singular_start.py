@@ -41,7 +41,7 @@ MAX_RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, 
 class Branch(NamedTuple):
     """Branch of the motion through a singular position: accelerations there, and a nearby state on the branch.
 
-    `rank`: rank of C_q near the position, on the branch. `first_size`: first step size to try, s.
+    `rank`: rank of C_q near the position, on the branch. `first_size`: first step size (s) to try.
     """
 
     a: Array
@@ -85,7 +85,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
     norm = float(np.linalg.norm(rows))
     step = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(direction).max()
-    speed = float(np.linalg.norm(derivative_of_rows(direction, step))) / norm  # relative change of the rows, 1/s
+    speed = float(np.linalg.norm(derivative_of_rows(direction, step))) / norm  # relative change (1/s) of the rows
     if not step * speed > MAX_DIFFERENCE_ERROR * DISPLACEMENT:
         return None
     step = CHANGE_PER_SAMPLE / speed

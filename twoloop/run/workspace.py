@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 # to find which forces depend on a coordinate or velocity x, x is displaced by this fraction of max(1, |x|)
 DISPLACEMENT = 1e-3
-# Newton's matrix gets sparse factors if its entries, and their operations, are at most this share of the dense ones
+# largest share of entries and operations, relative to dense factors, for which Newton's matrix gets sparse factors
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -114,7 +114,7 @@ MASSLESS_RATIO = 1e-10
 # a row can give mass to the massless directions of a body if its part along them is at least this fraction of the row
 MIN_MASSLESS_FRACTION = 1e-3
 MIN_SIZE_NEWTON = 1.6  # Newton's matrix may get sparse factors if n_q is at least this multiple of LARGE
-MAX_SHARE = 0.05  # sparse factors pay if entries of the matrix, and operations, are at most this share of dense ones
+MAX_SHARE = 0.05  # largest share of entries and operations, relative to dense matrices, for which sparse factors pay
 
 
 class FixedOrderForm(NamedTuple):
