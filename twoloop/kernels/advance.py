@@ -1,7 +1,7 @@
 """Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
 `advance` serves all methods: the functions of a method are in the kit `f`, its data in `options` and `memory`. `w` is
-the workspace, `Work`; `t`: time (s); `size`: step size (s); `state`, `new_state`: [q, v, a, lam] before and after it.
+the workspace, `Work`; `t`, `size`: time, step size (s); `state`, `new_state`: [q, v, a, lam] before and after a step.
 """
 
 import numpy as np

@@ -149,7 +149,7 @@ def split_steps(steps, counts, h, changes, used_newton):
 # previous run chose do not suit this start. IN_DOUBT: the start may violate the constraints, and needs a closer check.
 # UNUSUAL: Python must read the report, and may have to continue the run. UNCHOSEN: Python must choose the rows
 REFUSED, IN_DOUBT, UNUSUAL, UNCHOSEN = -1, -2, -3, -4
-# which checks of a start Python has made: none; the start is consistent; also, it has the same rows and coordinates
+# which checks of a start Python has made: none; that it is consistent; also, that rows and coordinates are the same
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
 # arrays that runs from different starts share: for checks of a start, the choice of rows, and the steps. Among them are

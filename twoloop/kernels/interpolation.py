@@ -47,8 +47,8 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
     """Store nodes in z and coefficients in c of the Hermite polynomial through rows lo to hi; return their number.
 
     The polynomial, in Newton's form, has the variable (time - t[i]) / h. It interpolates n columns of `states`,
-    beginning with index `column`, minus their values in row i. The next two times n columns are the first and the
-    second derivatives; the polynomial interpolates values and order - 1 derivatives.
+    beginning with index `column`, minus their values in row i. The next n columns are the first derivatives, and the
+    next n the second derivatives; the polynomial interpolates values and order - 1 derivatives.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order

@@ -302,8 +302,8 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
     """Compile a callback of a mechanism with the signature of its kind.
 
     The arguments are the time, the coordinates `q` (n_q,), in some kinds the velocities `v` (n_q,) or the multipliers
-    `lam` (n_c,), the parameters `p`, and the array to fill. This array contains zeros at first; for a tangent of a
-    system with a bandwidth, only the band does: add to it. The function must not write to the other arrays::
+    `lam` (n_c,), the parameters `p`, and the array to fill. Add to this array, which contains zeros at first (for a
+    tangent of a system with a bandwidth, only in the band). The function must not write to the other arrays::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):

@@ -204,7 +204,7 @@ _LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of events tha
 
 
 def _skip_lock_events(report: Any) -> Any:
-    """Return a function that reports all events except those of locks, of which each kernel would cause thousands."""
+    """Return a function that reports all events except events of locks, of which each kernel would cause thousands."""
     return lambda kind, *args, **named: None if kind in _LOCK_EVENTS else report(kind, *args, **named)
 
 

@@ -45,7 +45,7 @@ SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b i
 
 @compiled
 def _sample_rates(f, w, t, q, velocity, begin, end):
-    """Store C_t and b in rows of w.rates: at thirteen times from `begin` to `end`, at q + velocity (time - t)."""
+    """Store in rows of w.rates C_t and b at thirteen times from `begin` to `end`, and at q + velocity (time - t)."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
@@ -198,7 +198,7 @@ def _sample_forces(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _least_ranges(tolerances, largest, n):
-    """Return the smallest ranges of samples to be examined: of forces (the first n components), and of C_t and b."""
+    """Return the smallest range of samples to be examined, for forces (the first n components) and for C_t and b."""
     least = LEAST_RANGE * tolerances[RTOL]
     return max(LEAST_VALUE, least * largest_of(largest[:n])), max(LEAST_VALUE, least * largest_of(largest[n:]))
 
@@ -401,7 +401,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # dense samples along the motion replace samples at a fixed state, unless these must go on at a known change
+    # dense samples along the motion replace samples at a fixed state, unless these must continue at a known change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)

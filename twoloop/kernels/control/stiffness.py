@@ -106,7 +106,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     T_BEGIN,  # beginning (s) of the measurement of the cost per second
     COST_BEGIN,  # cost of the run at the time T_BEGIN, in evaluations
     COST_PER_SECOND,  # cost of a second of motion, in evaluations, by the method used before the trial
-    RATE,  # last estimate of rho, 1/s
+    RATE,  # last estimate of rho (1/s)
     FIRST_MEMORY,  # number of entries of the memory of the first method
     H_MEAN,  # mean step size (s)
     HISTORY,  # index at which the history of step-size control in this phase begins: 2 numbers, see loop_state.py

@@ -50,7 +50,7 @@ class Work(NamedTuple):
     augmented: Any  # view of the memory of `G` and, after it, of `M`
     S: Any  # (r_v, r_v) G M^-1 G^T for the independent rows of G; its factors replace it
     W: Any  # (r_v, n_q) G M^-1 for the independent rows of G
-    A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
+    A: Any  # (n_dof, n_dof) T^T M T; its factors replace it; empty where S is used
     MT: Any  # (n_q, n_dof) M T
     D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T; last row: dependent velocities for v_i = 0; columns in elimination order
     Gx: Any  # (n_c + n_a, n_q) C_q and A at a displaced position (for Gamma by differences); scratch for full pivoting

@@ -82,7 +82,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     WIDEST_GAP,  # longest time (s) between two evaluations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of C_t or b
     NEXT_JUMP,  # time (s) of the next known jump of C_t or b
-    MAX_COEFFICIENT,  # redundant rows are combinations of independent rows: largest coefficient, at the last partition
+    MAX_COEFFICIENT,  # largest coefficient of an independent row in a redundant row at the last partition; 0: unknown
     SMALLEST,  # fixed-order form: smallest squared sine of the angle from a row to previous rows, see sparse_ldl.py
     TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
     N_NOTES,

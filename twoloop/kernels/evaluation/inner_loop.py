@@ -1,7 +1,7 @@
 """Evaluate accelerations, and move states onto the constraints: the inner loop, which the steps of all methods call.
 
 The inner loop is compiled once, as one function, and passed to steps in a `Kit`; steps call it through the functions at
-the end of this file, one for each task. Accelerations and multipliers are those of eqs. (6)-(8) of the paper.
+the end of this file, one for each task. Accelerations and multipliers follow from eqs. (6)-(8) of the paper.
 
 If a step integrates all coordinates, its states are off the constraints by the error of the formula. One pass of a
 projection moves positions and velocities to the nearest state on the constraints, in the metric of M, which does not
@@ -179,7 +179,7 @@ def _find_least_correction(f, w):
 
 @merged
 def _find_corrections(f, w, v):
-    """Correct v in place with the factors at q, and store the correction of q in w.y; return max|corrections|."""
+    """Correct v in place by the factors at q, and store the correction of q in w.y; return max|corrections|."""
     rows, n_c = w.rows_v, w.C.size
     row_residual(w, v, rows)
     for i in range(rows.size):

@@ -7,7 +7,7 @@ not the largest is chosen but the one that causes the least fill-in: so nearby p
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel, merged
 
 NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries of G: always zero, constant, varying
-ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows: those with the fewest entries
+ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows, which have the fewest entries
 # limits of a pivot block, in three tiers, which are tried in this order
 # - MAX_SQUARES: largest sum of squares of the changes of the block's coordinates if each other coordinate moves by 1
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest

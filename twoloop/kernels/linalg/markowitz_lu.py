@@ -3,7 +3,7 @@
 A mechanism's Jacobian has few nonzero entries, and their pattern does not change. So the order of elimination is chosen
 once for each partition (Markowitz's rule with a threshold), and written as a program, a list of operations. Later
 factorizations follow this program, without a search for pivots and without tests for zeros. If multipliers of the
-elimination become large, another order is chosen. If the program is nearly as long as that of a full matrix, dense
+elimination become large, another order is chosen. If the program is nearly as long as for a full matrix, dense
 factors replace the sparse ones.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the

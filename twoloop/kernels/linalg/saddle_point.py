@@ -172,7 +172,7 @@ def factor_mass(f, w):
 
 @merged
 def _apply_inverse_mass(f, w, x, y):
-    """Store M^-1 x in y, by w.L; unless M is constant, dense and not diagonal, x and y may be the same array."""
+    """Store M^-1 x in y, using w.L; unless M is constant, dense and not diagonal, x and y may be the same array."""
     n = x.size
     if f.diagonal_mass == 1:
         for i in range(n):

@@ -50,7 +50,7 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Supports (ground, hubs not eliminated yet) of each part: a set of bodies that eliminated joints connect."""
+    """Supports (ground, hubs not eliminated yet) of parts; a part is a set of bodies that eliminated joints connect."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet

@@ -261,9 +261,9 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 
 @compiled
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
-    """Return the norm of the difference between a step and two half steps, in units of the tolerances, eq. (26).
+    """Return the norm of the difference between a step and two half steps, in units of the tolerances (eq. 26).
 
-    The norm is the largest |component| of positions and velocities if `largest`, else the root mean square, eq. (27).
+    The norm is the largest |component| of positions and velocities if `largest`, else the root mean square (eq. 27).
     """
     rtol = tolerances[RTOL]
     total = 0.0

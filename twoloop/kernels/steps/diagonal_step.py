@@ -93,7 +93,7 @@ def factor_newton_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        # L D L^T fails for an indefinite matrix, as of a compressed beam, and overwrites it: fill it again, and use L U
+        # L D L^T fails for an indefinite matrix (for example, with a compressed beam): fill it again, and use L U
         _fill_newton_matrix(w, memory, n, m, z, storage)
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
@@ -159,7 +159,7 @@ def correct_stage(w, memory, residual, a):
 
 @compiled
 def filter_dense_error(w, memory, z, e_q, e_v):
-    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with the factors of `factor_newton_matrix`."""
+    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), by the factors of `factor_newton_matrix`."""
     n = w.Q.size
     m = e_q.size
     N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
@@ -315,7 +315,7 @@ MAX_RATIO_BY_ONE_JUMP = 0.174
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma and the factors that were computed last.
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, using the factors that were computed last.
 
     J is the Jacobian of (v, F) by (q_i, v_i). Only the first n_dof numbers of e_q and e_v (n_q) are read and changed.
     """

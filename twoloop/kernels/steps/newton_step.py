@@ -238,8 +238,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage, where stiff directions differ least from those at other stages.
-            # Between the stages, a force might act that acts at no stage
+            # compute derivatives at the middle stage, where stiff directions differ least from directions at other
+            # stages. Between the stages, a force might act that acts at no stage
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])
@@ -270,7 +270,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the extrapolated state of the middle stage may be wrong, and so may its derivatives, such as of friction: the
+        # the extrapolated state of the middle stage may be wrong, and so may its derivatives (of friction, e.g.): the
         # step is repeated with derivatives at its beginning
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0

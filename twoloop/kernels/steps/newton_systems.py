@@ -401,7 +401,7 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_tangents(f, w, memory, s, t, q, v):
-    """Store the bands of K and D at (t, q, v), the last evaluated state, and the border as matrices; return a code."""
+    """Store in w.matrices bands of K and D at (t, q, v), the last evaluated state, and the border; return a code."""
     n = q.size
     b = f.bandwidth
     w.n_jacobians += 1

@@ -92,7 +92,7 @@ def interpolate(c, theta, A_stage, weights, a):
 
 @compiled
 def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
-    """Return an estimate of the error of a step, in units of the tolerances (26), from the stage accelerations (s, n).
+    """Estimate the error of a step, in units of the tolerances (eq. 26), from the stage accelerations (s, n).
 
     The stage accelerations have a range w of order h. At the ends of the step, the polynomial through the stages
     differs from the accelerations by e, of order h^s. If terms of successive orders decrease by a constant factor f,

@@ -312,7 +312,7 @@ def finish_series(w, order, series):
 def compute_coefficients(f, w, options, memory, t, state, unit):
     """Compute the series about `state` at t, in the unit of time `unit` (s), as series TARGET; return a code.
 
-    The linear equations of each order are solved with the factors in w.
+    The linear equations of each order are solved by the factors in w.
     """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = array_views(options, memory, n, n_rows)
@@ -518,7 +518,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
-        error = x / memory[ALLOWED_SIZE]  # the error is about a power of this ratio, which is a bound if at most 1
+        error = x / memory[ALLOWED_SIZE]  # the error is about a power of this ratio; a ratio up to 1 bounds it
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)

@@ -4,7 +4,7 @@ A velocity error e changes the positions until e changes its sign or decays. Its
 J is the Jacobian of (v, F), with accelerations F. So an error due to a force that jumps within a step lasts long and
 counts, and an error of fast vibrations hardly counts. There are two exceptions:
 
-- The duration is that of the fastest component of e. If a stiff damper acts beside a contact, the component in slow
+- The duration belongs to the fastest component of e. If a stiff damper acts beside a contact, the component in slow
   directions lasts much longer. A filter with the time constant of several steps leaves only this component.
 - If J was computed by differences before a contact began or ended, the duration is wrong, although Newton's method
   still converges. `derivatives_agree` detects this. (`w`: workspace, `f`: kit)
