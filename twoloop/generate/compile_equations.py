@@ -161,7 +161,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return the pointer to the coefficients; in SIMD lanes, to coefficients that vary, and to shared ones."""
+    """Return the pointer to the coefficients; in SIMD lanes, pointers to varying and to shared coefficients."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 

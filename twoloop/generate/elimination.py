@@ -501,7 +501,7 @@ def multipliers_of_least_norm(
 ) -> list[Affine]:
     """Return the multipliers lam (one per row) of least norm with the same G^T lam as the `independent` multipliers.
 
-    `all_rows`: G. `rows`, `independent`: indices and multipliers of the independent rows. `solve`: solution with the
+    `all_rows`: G. `rows`, `independent`: indices and multipliers of the independent rows. `solve`: solves with the
     factors of [M G^T; G 0]. A dependent row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of
     G^T is spanned by e_i - sum_k Z_ik e_k. The component of lam in this null space is subtracted.
     """

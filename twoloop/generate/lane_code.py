@@ -84,7 +84,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Store and return UNIT, the unit of time of the series (s); choose it in new runs and after accepted steps."""
+        """Store and return UNIT, the unit of time (s) of the series; choose it in new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -171,7 +171,7 @@ class LaneSteps:
         return positions
 
     def evaluate_defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store DEFECT, the defect of a step at its end, see `compute_defect`, with the accelerations in memory."""
+        """Store DEFECT, the defect at the end of a step (see `compute_defect`), from the accelerations in memory."""
         memory = self.memory(emit, order, control, work)
         a = [emit.load(memory.a, j) for j in range(self.n)]
         emit.store(self.compute_defect(emit, control, memory, a), work, lanes.DEFECT)

@@ -174,7 +174,7 @@ class Sample:
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add the states of a chunk of steps: `rows` [q, v, ...] at times `t`, and the last one: `state`, at `end`."""
+        """Add the states of a chunk of steps: `rows` [q, v, ...] at times `t`, and the last state: `state` at `end`."""
         stride = 1 + len(t) // MAX_STATES_OF_CHUNK
         times = t[::stride]
         states = np.empty((len(times) + 1, 1 + self._n))
