@@ -294,7 +294,7 @@ class IntegrationLoop:
 
     @contextmanager
     def _deadline_timer(self) -> Iterator[None]:
-        """Return a context in which, if a single step may take long, a timer stops machine code at the deadline."""
+        """Return a context in which a timer stops machine code at the deadline, if a single step may take long."""
         run, notes = self.run, self.run.work.notes
         if self.deadline == np.inf or (run.system.n_q <= SMALL_SYSTEM and not run.system.called_in_python):
             yield

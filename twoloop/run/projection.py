@@ -450,7 +450,7 @@ def _gauss_newton(
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff: float = LSTSQ_CUTOFF) -> Array:
-    """Return the smallest change dq (n_q,), in the `free` coordinates only, with C_q dq = values."""
+    """Return the smallest dq (n_q,) with C_q dq = values that changes only the `free` coordinates."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
     change = np.zeros(jacobian.shape[1])
