@@ -176,7 +176,7 @@ MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a sudden change exceeds this multiple of the changes next to it; a smooth slope does not
 SHORT_STEP = 0.5  # a discontinuity is suspected if a step is below this fraction of the longest of the last steps
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
-# accelerations decay, see _acceleration_lasts, if one changes by more than this fraction of the largest acceleration
+# accelerations decay (see _acceleration_lasts) if one changes by more than this fraction of the largest acceleration
 # while a velocity changes by its tolerance
 MAX_LASTING_CHANGE = 0.5
 CHANGE_MARGIN = 0.01  # changes up to this time (in spacings of samples) after the beginning of a step count as passed

@@ -105,7 +105,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, left, crosses_jump):
-    """Return the size (s) of a step, at most about h, and whether the step reaches the goal, `left` seconds ahead."""
+    """Return the size (s) of a step (at most about h), and whether it reaches the goal, which is `left` s ahead."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:

@@ -374,7 +374,7 @@ def finite(A):
 
 @compiled
 def not_finite(w, kind, t, q):
-    """Store t, and the kind of the callback whose value is not finite (-1: q is not finite), in w; return a code."""
+    """Store in w the time t and the kind of the callback whose value is not finite (-1: q itself); return a code."""
     w.fault_kind = kind if finite_vector(q) else -1.0
     w.fault_time = t
     return NOT_FINITE

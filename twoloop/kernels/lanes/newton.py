@@ -122,7 +122,7 @@ def pivots_offset(memory, n, s, n_systems, k):
 
 @compiled
 def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
-    """Store a state in the middle of the step, and its accelerations, in MIDDLE_Q, MIDDLE_V and MIDDLE_A.
+    """Store in MIDDLE_Q, MIDDLE_V and MIDDLE_A a state in the middle of the step, and its accelerations.
 
     The state is extrapolated from the beginning of the step, and its positions are moved towards the constraints.
     """
@@ -144,7 +144,7 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 
 @compiled
 def compute_derivatives(code, settings, control, c, work):
-    """Store the derivatives of accelerations by q and v, in the middle of the step, in lanes with ACTIVE = 1.
+    """In lanes with ACTIVE = 1, store the derivatives of accelerations by q and v in the middle of the step.
 
     "Middle" is the time of a stage, because forces that act only between two stages must not affect the step.
     """

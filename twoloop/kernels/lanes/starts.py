@@ -222,7 +222,7 @@ OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def offsets_in_memory(memory, n, n_rows, n_entries, n_redundant):
-    """Return the offsets, in vectors, of the parts of the method's memory, which begins at `memory`, and its end.
+    """Return the offsets (in vectors) of the parts of the method's memory, which begins at `memory`, and of its end.
 
     The memory begins with C and C_t (n_rows each), and the entries of G; the generated code writes these parts. The
     other parts are a right-hand side x (n_rows); a change of positions or velocities, the projected positions, the

@@ -1,7 +1,7 @@
 """Factor and solve banded matrices by LAPACK: the mass matrix, and Newton matrices with a border of constraints.
 
-In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of a C-ordered array, with top = b for the
-upper triangle of M, and top = 2 b for an LU, whose row exchanges fill another b diagonals (b: bandwidth).
+In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of a C-ordered array (b: bandwidth). For
+the upper triangle of M, top is b. For an LU, top is 2 b, because row exchanges fill another b diagonals.
 
 The LAPACK library comes with SciPy. Kernels are stored on disk, but addresses of LAPACK routines differ from process to
 process, and must not be part of compiled code. So a run stores `lapack_addresses` in its workspace `w`, and passes one

@@ -84,7 +84,7 @@ def _merge_columns(columns, row_sizes, i, k, union):
 
 @compiled
 def _find_varying_pivots(R, K, columns, row_active, row_sizes, column_sizes, squared_norms, rows, union, block):
-    """Store the two rows and two columns of a pivot block of varying entries in `block`; return False if none is found.
+    """Store in `block` the two rows and two columns of a pivot block of varying entries; return False if none is found.
 
     A single pivot has its row and its column twice. `rows` and `union` are scratch.
     """

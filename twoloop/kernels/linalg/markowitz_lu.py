@@ -33,9 +33,9 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
 # After these numbers, `index` contains arrays: rows (r) and columns (r) of the matrix in the order of elimination; row
 # exchanges of dense factors (r); for each row of U, the index of its first entry (r) and the index after its last entry
 # (r); for each row of L, the index of its first entry, followed by the end of L (r + 1); for each entry, its row, its
-# column and its source, the flat index in G of its initial value (of a zero for fill-in); for each subtraction, the
-# index of the entry that it changes; and the lists for choosing an order. The entries are sorted: first the diagonal,
-# then U from its last row up, then L from its first row down
+# column and its source, the index in `entries` (see `factor`) of its initial value, or of a zero for fill-in; for each
+# subtraction, the index of the entry that it changes; and the lists for choosing an order. The entries are sorted: first
+# the diagonal, then U from its last row up, then L from its first row down
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
 # indices of arrays with one number per row or column. ROW_SIZE: number of entries in the list of a row. COLUMN_SIZE:
 # number of entries in the list of a column, without eliminated rows. ACTIVE_ROW_SIZE: number of entries of a row in
@@ -144,7 +144,7 @@ def put_entry(matrix, i, j, number, source):
 def _choose_pivot(matrix, rows, columns, k):
     """Return row and column of pivot k; (-1, -1) if no entry is large enough.
 
-    Among the entries that are large enough, see MIN_PIVOT_RATIO, the pivot causes the least fill-in. If several cause
+    Among the entries that are large enough (see MIN_PIVOT_RATIO), the pivot causes the least fill-in. If several cause
     equal fill-in, the largest of them is chosen; among equally large ones, the first in the order so far.
     """
     counts, lists, numbers = matrix

@@ -114,7 +114,7 @@ def _begin_history(memory, differences, state, h, order):
 
 @compiled
 def _predict_state(memory, differences, trial, h, prediction, rate):
-    """Store the differences, scaled to a step of size h, in `trial`; also store `prediction` and its `rate`.
+    """Store in `trial` the differences, scaled to a step of size h; also store `prediction` and its `rate`.
 
     `prediction` is the value, and `rate` the derivative, of the polynomial of degree ORDER at the end of the step.
     NEW_SPANS and ERROR_CONSTANTS are stored in `memory`.

@@ -140,7 +140,7 @@ def _begin_history(memory, n, state):
 
 @merged
 def _compute_coefficients(memory, h, k):
-    """Store psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of size h in `memory`."""
+    """Store in `memory` psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of size h."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
     g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
     new_psi[0] = h

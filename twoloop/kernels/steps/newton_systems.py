@@ -234,7 +234,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store J_q (J_v if `by_v`) at (t, q, v), where accelerations are a, in J; return a code. The rest is scratch."""
+    """Store in J the matrix J_q (J_v if `by_v`) at (t, q, v), where accelerations are a; return a code."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     for column in range(w.independent.size):
         j = w.independent[column]
@@ -284,7 +284,7 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense_matrix(w, memory, s, index, z, matrix):
-    """Store the LU factors of I - z^2 J_q - z J_v in `matrix`, and in `memory` the pivots `index`; return a code."""
+    """Store in `matrix` the LU factors of I - z^2 J_q - z J_v, and in `memory` the pivots `index`; return a code."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
     damped = memory[at.HAS_DAMPING] == 1.0
@@ -683,7 +683,7 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
 
 @compiled
 def _factor_sparse_matrix(f, w, z, factors):
-    """Store the factors of the bordered matrix for z in `factors`, real or complex as z is; return a code."""
+    """Store in `factors` the factors of the bordered matrix for z, real or complex as z is; return a code."""
     mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
     w.n_factorizations += 1
@@ -693,7 +693,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store [M r; G r], the right-hand side of the bordered system, in `right`; redundant rows may stiffen M."""
+    """Store in `right` the right-hand side of the bordered system, [M r; G r]; redundant rows may stiffen M."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -735,7 +735,7 @@ def fill_derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
-    """Store the factors of I - z^2 J_q - z J_v, real or complex as z is, in `numbers`; see `_factor_banded`."""
+    """Store in `numbers` the factors of I - z^2 J_q - z J_v, real or complex as z is; see `_factor_banded`."""
     w.n_factorizations += 1
     if f.bandwidth >= 0:
         return _factor_banded(w, memory, s, f.bandwidth, index, z, numbers, factorize, substitute)

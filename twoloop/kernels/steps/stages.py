@@ -128,8 +128,8 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 # indices of the scalars that newton_options adds to `options`, counted from `newton_options_index`. N_REAL, N_PAIRS:
 # number of real eigenvalues of A, and of complex pairs; GAMMA0: first real eigenvalue or, if there is none, smallest
 # absolute value of an eigenvalue; TESTS_VELOCITIES: 1 if the error test includes velocities. After the scalars,
-# `options` contains the weights e (s) of the error estimate, and for each eigenvalue its real and imaginary part, its
-# row of T^-1 and its column of T (for both s real parts, then s imaginary parts); T contains the eigenvectors of A
+# `options` contains the weights e (s) of the error estimate. For each eigenvalue follow its real and imaginary part,
+# its row of T^-1 and its column of T (for both s real parts, then s imaginary parts); T has the eigenvectors of A
 N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # indices of the scalars in `memory`

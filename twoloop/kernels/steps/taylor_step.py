@@ -132,7 +132,7 @@ def sum_of_products(X, Y, K, total):
 
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
-    """Store the arguments of the operations in group g (sums of `values`, without their constants) in `out`."""
+    """Store in `out` the arguments of the operations in group g (sums of `values`, without their constants)."""
     column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
@@ -144,7 +144,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store each of the `sums` of `values`, multiplied by `scale` and without its constant, in `out`."""
+    """Store in `out` each of the `sums` of `values`, multiplied by `scale` and without its constant."""
     column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -354,8 +354,8 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
 
 # ends of steps should have this distance from the constraints, before projection, relative to the allowed distance
 TARGET_PREDICTION_ERROR = 0.3
-# a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
-# times the defect near the beginning of the step, where the series is exact
+# near the beginning of a step, the series is exact, so that its defect is a rounding error. A defect up to MAX_NOISE
+# allowed defects also counts as a rounding error if it is at most NOISE_RATIO times this defect
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
 # the times at which the defect is checked shift by this fraction of their spacing at each attempt: multiples of the
