@@ -208,8 +208,8 @@ class PivotChooser:
     def _try_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
         """Return the choice for M + s G^T G if its smallest pivot is much larger than for M, else `choice`.
 
-        G: the independent rows. `index`: index in MIN_PIVOTS of the choice for M. If a body has little inertia about
-        its joints, such as a rod with a mass in its middle, rows are nearly dependent in the metric of M, and a
+        G: the independent rows. `index`: index in MIN_PIVOTS of the choice for M. A body may have little inertia about
+        its joints, such as a rod with a mass in its middle. Then rows are nearly dependent in the metric of M, and a
         smallest pivot of 10^-k costs up to 2 k digits of accelerations. In the metric of M + s G^T G, rows are not
         nearly dependent. If s G^T G is 10^k times as large as M, k digits are lost, and refinement restores them.
         """

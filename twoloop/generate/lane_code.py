@@ -704,7 +704,7 @@ class LaneConstraints(LaneSteps):
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._program.quantities())
 
     def compute_rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store C, C_t and the entries of C_q, at the state NEW and the time T_NEW, in `LaneMemory.series`."""
+        """Store in `LaneMemory.series` C, C_t and the entries of C_q at the state NEW and the time T_NEW."""
         memory = self.memory(emit, order, control, work)
         inputs = [emit.load(work, lanes.T_NEW), *(emit.load(memory.new, i) for i in range(2 * self.n))]
         lowering, arrays = lower_program(emit, self._program, inputs, self.numbers)

@@ -276,8 +276,8 @@ class LaneSeries:
         """Return the factors of the sums that products (cos x) x' and (sin x) x' share with recurrences of sin and cos.
 
         Keys: quantities that are such products. Values: pairs of factors, see `_factors`. (cos x) x' is the derivative
-        of sin x. So one part of its coefficient k, which is known before order k is solved, is a sum in the recurrence
-        of sin x for order k + 1, divided by the unit of time. The same holds for (sin x) x' and cos x.
+        of sin x. So a part of its coefficient k is a sum in the recurrence of sin x for order k + 1, divided by the
+        unit of time. This part is known before order k is solved. The same holds for (sin x) x' and cos x.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:

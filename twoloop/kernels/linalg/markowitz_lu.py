@@ -34,7 +34,7 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
 # exchanges of dense factors (r); for each row of U, the index of its first entry (r) and the index after its last entry
 # (r); for each row of L, the index of its first entry, followed by the end of L (r + 1); for each entry, its row, its
 # column and its source, the index in `entries` (see `factor`) of its initial value, or of a zero for fill-in; for each
-# subtraction, the index of the entry that it changes; and the lists for choosing an order. The entries are sorted: first
+# subtraction, the index of the entry that it changes; and the lists for choosing an order. Entries are sorted: first
 # the diagonal, then U from its last row up, then L from its first row down
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
 # indices of arrays with one number per row or column. ROW_SIZE: number of entries in the list of a row. COLUMN_SIZE:
