@@ -129,6 +129,7 @@ class Memory:
     def __init__(self, stack: ExitStack, kind: str, start: Array, task: Task, *given: int):
         self.kind, self.state, self.start, self.task = kind, start.copy(), start, task
         self.stack, self.own, self.sundials = stack, context(stack), library()
+        self.wrapped: list[Array] = []  # arrays that vectors wrap, and that must live as long as the vectors
         self.vectors = [self.vector(values) for values in self.state]
         free = getattr(self.sundials, f"{kind}Free")
         release = lambda pointer: free(ctypes.byref(pointer))  # noqa: E731
@@ -138,6 +139,7 @@ class Memory:
     def vector(self, values: Array) -> Any:
         """Return a SUNDIALS vector that wraps an array."""
         free = self.sundials.N_VDestroy
+        self.wrapped.append(values)
         return create_object(self.stack, "N_VMake_Serial", free, values.size, values.ctypes.data, self.own)
 
     def call(self, name: str, *arguments: Any) -> None:
