@@ -35,12 +35,10 @@ def test_the_tables_are_exact_for_polynomials():
 )
 def test_runs_find_across_at_tight_tolerances(n, options):
     """Three passages in 5 s: rounding stopped steps, or changed velocities by a hundred tolerances in one of them."""
-    m, ended = mechanism(f"A02, N = {n}"), 0
+    m = mechanism(f"A02, N = {n}")
     for tolerance in (1e-8, 1e-9, 1e-10, 1e-11):
         result = solve_dae(m.system(), (0.0, 5.0), *m.start, rtol=tolerance, atol=tolerance, **options)
-        ended += result.success
-        assert not result.success or error(m, result) < 1e3 * tolerance
-    assert ended >= 3
+        assert result.success and error(m, result) < 1e3 * tolerance, result.message
 
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
@@ -61,4 +59,4 @@ def test_no_length_is_tried_twice():
     for longest, allowed in ((0.1, 0.02), (0.01, 0.02)):
         lengths = sizes_across(longest, allowed)
         assert lengths[0] == min(longest, allowed) and len(set(lengths)) == len(lengths)
-        assert lengths == sorted(lengths, reverse=True)
+        assert max(lengths) <= allowed and min(lengths) < 0.02 * longest

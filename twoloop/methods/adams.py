@@ -67,6 +67,7 @@ class Adams:
             kernels.ADAMS,
             np.array([LARGEST_MOVE]),
             np.zeros(kernels.memory_size(n_q)),
+            checks_within=True,
             projects=True,
             exponent=1.0,  # not used: the order varies, and the step returns the ratio of step sizes for its order
             stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],

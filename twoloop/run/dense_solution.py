@@ -277,7 +277,7 @@ class Interpolator:
         if self.fixed_order is not None:
             return None
         plan, (begin, end), n = crossing_plan(self.system.n_q), table.t[i : i + 2].tolist(), self.system.n_q
-        kernels.begin_polynomial(plan.memory, 0.0, begin)
+        kernels.begin_polynomial(plan.memory, 0.0, begin, True)
         tolerances = self.tolerances.copy()
         tolerances[[indices.ESTIMATE, indices.GAP]] = 1.0, np.inf
         tolerances[indices.LEAST] = tolerances[[RTOL, *range(ATOL, ATOL + n)]].min()

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
+from twoloop.kernels.evaluation import tasks
 from twoloop.methods.plan import Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import warn_user
 from twoloop.run.run import Run
-from twoloop.run.singular_positions import TimedState, least_singular_value
+from twoloop.run.singular_positions import TimedState
 from twoloop.run.workspace import kit_for_plan, make_kit
 
 # limits of the duration of the shortest change of forces or drives, divided by the longest time between evaluations.
@@ -91,18 +92,18 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
 
 
-# step sizes to try across a singular position, relative to H_LONG, the longest of the last steps. Sizes are
-# tried in this order until no node of the step is at the position
-STEP_RATIOS = tuple(0.85**k for k in range(28))
-# step sizes, relative to H_LONG, to try afterwards if too few nodes of a step are beyond the singular position
-LARGER_RATIOS = tuple(1.4**k for k in range(1, 7))
+# step sizes to try across a singular position, relative to the first, in this order: larger ones if too few nodes of a
+# step are beyond the position, smaller ones if the error of a step is too large or a node is at the position
+SIZE_RATIOS = (1.0, *(1.2**k for k in range(1, 12)), *(0.85**k for k in range(1, 28)))
+LARGEST_RATIO = max(SIZE_RATIOS)
 # "distance" of a state from a singular position: smallest pivot of C_q, relative to the largest such pivot of the run.
 # The base, the state at which the polynomial across the position begins, should have at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
 # limits of steps across a singular position. STRICT: the limits of the run. WIDER: evaluations may be GAP_FACTOR times
-# as far apart (arbitrarily far if no force can be short). LOOSER: also, tolerances are multiplied by TOLERANCE_FACTOR
+# as far apart (arbitrarily far if no force can be short). NEARER: also, steps may end before the position. LOOSER:
+# also, tolerances are multiplied by TOLERANCE_FACTOR
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
-STRICT, WIDER, LOOSER = range(3)
+LIMITS = STRICT, WIDER, NEARER, LOOSER = tuple(range(4))
 
 
 class Origin(NamedTuple):
@@ -110,17 +111,12 @@ class Origin(NamedTuple):
 
     earliest: float  # no node of the polynomial is before this time (s)
     base: TimedState | None  # earlier state at which the polynomial begins; None: it begins at the current state
-    limits: int = STRICT  # STRICT, WIDER or LOOSER
+    limits: int  # STRICT, WIDER, NEARER or LOOSER
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# largest age of a base: the larger of MAX_AGE_IN_H_LONG times H_LONG, and MAX_AGE_IN_MIRRORED times the size of a
-# step that ends as far beyond the singular position as the current state is before it (see _find_base_state)
-MAX_AGE_IN_H_LONG, MAX_AGE_IN_MIRRORED = 1.5, 4.0
 # if the distance of an earlier state is below this fraction of the base's, another singular position is between them
 MIN_DISTANCE_RATIO = 0.5
-MIN_DIVISOR = 1e-300  # lower bound of a divisor, to avoid a division by zero
-FAR_BEYOND = 0.3  # beyond a singular position, the run's own method continues at this distance or farther away
 
 
 def requires_crossing(run: Run, code: int) -> bool:
@@ -173,12 +169,13 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     # too few nodes; a polynomial from an old base may be too long. So several origins are tried
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and clock[a.T] - clock[a.T_START] < h_long
-    near_end = compiled and clock[a.T] + LARGER_RATIOS[-1] * h_long > run.t1
+    near_end = compiled and clock[a.T] + LARGEST_RATIO * h_long > run.t1
     origins = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
-    run.origins = [*[Origin(*start) for start in origins], Origin(np.inf, None)]
-    if not has_fixed_step:
-        variants = [(limits, beyond) for limits in (STRICT, WIDER, LOOSER) for beyond in (False, True)[: 1 + near_end]]
-        run.origins += [Origin(*start, *variant) for variant in variants[1:] for start in origins]
+    origins.append((np.inf, None))
+    ends = [False, True] if near_end and not has_fixed_step else [False]
+    if run.mirrored_size > run.t1 - clock[a.T]:  # the run ends nearer to the position: try first to end beyond the run
+        ends.reverse()
+    run.origins = [Origin(*start, limits, beyond) for limits in _limits(run) for beyond in ends for start in origins]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
@@ -192,13 +189,21 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     return plan, control
 
 
+def _limits(run: Run) -> tuple[int, ...]:
+    """Return the limits of steps across a singular position to try, in this order."""
+    if run.control[run.a.FIXED_STEP] > 0.0:
+        return (STRICT,)
+    return LIMITS if any(run.short_forces) or run.may_be_steep else LIMITS[WIDER:]
+
+
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     """Move the first of `run.origins` to the plan's memory, and set the step sizes and limits to try with it."""
     from twoloop.kernels.steps.crossing_step import begin_polynomial
 
     a, clock = run.a, run.clock
     earliest, base, limits, beyond = run.origins.pop(0)
-    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], earliest, base)
+    may_approach = limits in (NEARER, LOOSER) or control[a.FIXED_STEP] > 0.0
+    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], earliest, may_approach, base)
     run.crossing_tolerances = run.tolerances
     if limits != STRICT:
         run.crossing_tolerances = run.tolerances.copy()
@@ -212,11 +217,9 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     min_size = time_left if beyond else 0.0
     if not beyond and control[a.FIXED_STEP] == 0.0:
         max_size = min(max_size, time_left)
-    first_size = max(h_long, min(run.mirrored_size, LARGER_RATIOS[-1] * h_long))
-    run.sizes_to_try = [size for size in sizes_across(first_size, max_size) if size > min_size]
-    run.larger_sizes = [h_long * r for r in LARGER_RATIOS if max(first_size, min_size) < h_long * r <= max_size]
-    if not run.sizes_to_try:
-        run.sizes_to_try, run.larger_sizes = run.larger_sizes or [min(first_size, max_size)], []
+    first_size = max(h_long, run.mirrored_size)
+    sizes = sizes_across(first_size, max_size)
+    run.sizes_to_try = [size for size in sizes if size > min_size] or sizes[:1]
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
     run.crossing_size = float(clock[a.H_NEXT])
 
@@ -228,28 +231,36 @@ def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | Non
     if none is far, the farthest state; None if the current state is farther. If the distance changes linearly, a step
     of the mirrored size ends as far beyond the position as the base is before it; 0: the distance grows.
     """
-    a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
-    singular_value = least_singular_value(run.system, t, run.state[:n], run.rank)
-    farthest = distance_now = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
-    scale = distance_now / singular_value if singular_value > 0.0 else np.inf
+    a, clock, t, n = run.a, run.clock, float(run.clock[run.a.T]), run.system.n_q
+
+    def distance_of(time: float, state: Array) -> float:
+        q, arguments = state[:n], (0.0, run.work.x, run.work.lam)
+        code = entry_point(run.kit.inner)(run.kit, run.work, tasks.RENEW_PARTITION, time, q, q, *arguments)
+        if code != indices.DONE:
+            return 0.0
+        pivot = float(run.work.notes[indices.PIVOT])
+        clock[a.LARGEST_PIVOT] = max(clock[a.LARGEST_PIVOT], pivot)
+        return pivot / float(clock[a.LARGEST_PIVOT])
+
+    farthest = distance_now = distance_of(t, run.state)
     base: TimedState | None = None
-    size, max_age = 0.0, MAX_AGE_IN_H_LONG * float(run.clock[a.H_LONG])
+    size = 0.0
     for time, state in reversed(past):
-        distance = scale * least_singular_value(run.system, time, state[:n], run.rank)
-        if (farthest >= FAR_BEFORE and size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest or t - time > max_age:
+        distance = distance_of(time, state)
+        if (farthest >= FAR_BEFORE and size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest:
             break
         if distance > farthest:
             size = 2.0 * distance_now * (t - time) / (distance - distance_now)
-            max_age = max(max_age, MAX_AGE_IN_MIRRORED * size)
             if farthest < FAR_BEFORE:
                 farthest, base, size = distance, (time, state.copy()), size + t - time
-    return base, size
+    longest = LARGEST_RATIO * max(float(clock[a.H_LONG]), 0.0 if base is None else t - base[0])
+    return base, min(size, longest)
 
 
-def sizes_across(longest: float, allowed: float) -> list[float]:
-    """Return the step sizes (s) to try across a singular position: `longest` times STEP_RATIOS, at most `allowed`."""
-    first_size = min(longest, allowed)
-    return [first_size, *(longest * part for part in STEP_RATIOS if longest * part < first_size)]
+def sizes_across(first_size: float, allowed: float) -> list[float]:
+    """Return step sizes (s) to try across a singular position: `first_size` times SIZE_RATIOS, at most `allowed`."""
+    sizes = [first_size * ratio for ratio in SIZE_RATIOS]
+    return [min(first_size, allowed), *(size for size in sizes[1:] if size < allowed)]
 
 
 def crossing_kit(kit: Kit) -> Kit:
@@ -270,7 +281,9 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
     from twoloop.kernels.steps import crossing_step as kernels
 
     a, clock = run.a, run.clock
-    end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # time at which the polynomial ends; -inf: no polynomial
+    stored = plan.memory[-kernels.N_STORED :]
+    end = float(stored[kernels.END])  # time at which the polynomial ends; -inf: no polynomial
+    clock[a.LARGEST_PIVOT] = max(clock[a.LARGEST_PIVOT], stored[kernels.LARGEST_PIVOT])
     # the current time, with a margin because the end of a piece may have a rounding error
     t_now = float(clock[a.T] + kernels.ROUNDING * run.crossing_size + 4.0 * np.spacing(abs(clock[a.T])))
     if code in (a.PAUSED, a.RANK_LOST) and end > t_now:
@@ -286,7 +299,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
         if run.piece_ends:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.piece_ends[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
-    run.piece_ends, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
+    run.piece_ends, stored[kernels.END] = [], -np.inf
     at_singular_start = run.starts_singular and clock[a.T] == run.t0  # no partition can be chosen there
     if at_singular_start and code == a.RANK_LOST:
         code = a.PAUSED
@@ -295,17 +308,17 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
         clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossing_size)
     if code == a.PAUSED and n_accepted == 0:
         if clock[a.FAILURE_CODE] not in (indices.SINGULAR, indices.OUTER_DIVERGED):
-            run.larger_sizes = []
-        if run.larger_sizes or run.sizes_to_try:
-            clock[a.H_NEXT], clock[a.H_LIMIT] = (run.larger_sizes or run.sizes_to_try).pop(0), np.inf
+            run.sizes_to_try = [size for size in run.sizes_to_try if size < run.crossing_size]
+        if run.sizes_to_try:
+            clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
             run.crossing_size = float(clock[a.H_NEXT])
             return plan, control, code
         if run.origins:
             _prepare_next_origin(run, plan, control)
             return plan, control, code
-    if code == a.PAUSED and n_accepted > 0 and (run.work.notes[indices.PIVOT] < FAR_BEYOND * clock[a.LARGEST_PIVOT]):
+    if code == a.PAUSED and n_accepted > 0 and run.work.notes[indices.PIVOT] < kernels.FAR_END * clock[a.LARGEST_PIVOT]:
         proposed_size = min(float(clock[a.H_NEXT]), run.t1 - float(clock[a.T]))
-        run.origins = [Origin(float(clock[a.T]), None, limits) for limits in (STRICT, WIDER, LOOSER)]
+        run.origins = [Origin(float(clock[a.T]), None, limits) for limits in _limits(run)]
         _prepare_next_origin(run, plan, control)
         clock[a.H_NEXT] = run.crossing_size = proposed_size
         return plan, control, code

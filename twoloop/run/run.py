@@ -116,7 +116,6 @@ class Run:
         self.mirrored_size = 0.0  # size (s) of a step that begins and ends equally far from the position
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) that are still to be tried
-        self.larger_sizes: list[float] = []  # larger sizes (s) to try if too few nodes are beyond the position
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
         self.piece_ends: list[float] = []  # ends (s) of the next pieces of the polynomial across a position
         self.origins: list[Any] = []  # an `Origin` for each polynomial across the position that is still to be tried

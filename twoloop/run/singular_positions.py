@@ -74,12 +74,6 @@ def _singular_value_ratio(rows: Array, rank: int) -> float:
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
-def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the `rank`-th largest singular value of the rows; 0 if there are no rows."""
-    values = np.linalg.svd(system.rows(t, q), compute_uv=False)[:rank]
-    return float(values[-1]) if len(values) else 0.0
-
-
 def _least_ratio_between(
     system: ConstrainedSystem, before: TimedState, after: TimedState, rank: int, ratio: Ratio = singular_ratio
 ) -> float:

@@ -37,17 +37,17 @@ MIN_END_RATIO = 0.25  # fixed-order form: a step is halved if its last pivot is 
 
 @merged
 def is_near_singular(f, w, control, clock, t, q):
-    """Return whether control[MAY_CROSS] is 1 and a singular position was near when the partition was chosen.
+    """Return whether control[MAY_CROSS] is 1 and a singular position is near (t, q), where the partition is renewed.
 
-    Steps of generated code do not use the partition, which may then be old: it is first renewed at (t, q) if the run
-    has come near a singular position before.
+    It is only renewed if a singular position was near when the partition was chosen, or if the partition may be old:
+    steps of generated code do not use it.
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
     is_old = f.is_generated == 1 and w.nearly_singular == 1.0
-    if is_old and renew_partition(f, w, t, q) != DONE:
-        return True
-    return w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
+    if not is_old and w.pivot >= SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
+        return False
+    return renew_partition(f, w, t, q) != DONE or w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
 
 
 @merged

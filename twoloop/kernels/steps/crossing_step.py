@@ -39,9 +39,9 @@ MAX_SWEEPS, FEW_SWEEPS = 40, 12
 # nodes with pivots below a limit are left out; after FEW_SWEEPS sweeps without convergence, this multiplies the limit
 DISTANCE_FACTOR = 2.0
 MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
-# indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, BASE (a time, s): arguments of
+# indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, MAY_APPROACH, BASE (a time, s): arguments of
 # `begin_polynomial`. BEGIN, DURATION, END (s): of the polynomial of the last converged attempt; if none, END = -inf
-LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
+LARGEST_PIVOT, EARLIEST, MAY_APPROACH, BASE, BEGIN, DURATION, END, N_STORED = range(8)
 # duration of the shortest and of the longest step along the polynomial, relative to the duration of the polynomial
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 # longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
@@ -52,9 +52,9 @@ ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error in the step size
 PROJECTION_WEIGHT = 0.5
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning
-# the pivot at the end of a step must be at least this multiple of the limit below which nodes are left out, or at least
-# the pivot at the beginning of the step
-END_MARGIN = 4.0
+END_MARGIN = 2.0  # smallest ratio of the pivot at the end to the limit below which nodes are left out
+FAR_END = 0.3  # the end of a step is far from the singular position if the pivot is this fraction of the largest
+LATE = S - 4  # node near the end: if the pivot is larger there than at the end, the end is before the singular position
 # error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
 REPEAT_FACTOR = 2.0
 TINY = 1e-300  # lower bound of divisors that may be zero
@@ -72,16 +72,18 @@ def memory_size(n):
     return (S + 7) * n + 3 * S + N_STORED
 
 
-def begin_polynomial(memory, largest_pivot, earliest, base=None):
+def begin_polynomial(memory, largest_pivot, earliest, may_approach, base=None):
     """Store the conditions for the next polynomial in `memory`, and discard the stored polynomial.
 
-    `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). The
-    polynomial goes through q and v of `base`, the time (s) and state [q, v, ...] of an earlier step that was farther
-    from the singular position; without `base`, through q and v at the beginning of the step.
+    `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
+    `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. It goes through q
+    and v of `base`, the time (s) and state [q, v, ...] of an earlier step that was farther from the singular position;
+    without `base`, through q and v at the beginning of the step.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
-    stored[LARGEST_PIVOT], stored[EARLIEST], stored[END] = largest_pivot, earliest, -np.inf
+    stored[LARGEST_PIVOT], stored[EARLIEST], stored[MAY_APPROACH] = largest_pivot, earliest, may_approach
+    stored[END] = -np.inf
     if base is not None:
         n = (memory.size - 3 * S - N_STORED) // (S + 7)
         stored[BASE], memory[(S + 5) * n : (S + 7) * n] = base[0], base[1][: 2 * n]
@@ -94,7 +96,7 @@ def piece_ends(memory, c, t):
     otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
     """
     stored = memory[-N_STORED:]
-    left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] == 1.0
+    left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] < 0.0
     least, ends = (t - stored[BEGIN]) / stored[DURATION], []
     for j in range(1, S - 1):
         length = c[j] - (ends[-1] if ends else least)
@@ -157,40 +159,32 @@ def _integrate_polynomial(h, c, A, AA, a, q, v, q_end, v_end):
 
 
 @compiled
-def _interpolate_node(j, c, left_out, a):
-    """Set a[j] to the value at node c[j] of the polynomial through the accelerations a at nodes with left_out = 0."""
-    a[j, :] = 0.0
-    for k in range(S):
-        if left_out[k] == 0.0:
-            weight = 1.0
-            for i in range(S):
-                if i != k and left_out[i] == 0.0:
-                    weight *= (c[j] - c[i]) / (c[k] - c[i])
-            for m in range(a.shape[1]):
-                a[j, m] += weight * a[k, m]
-
-
-@compiled
-def _widest_gap(c, c0, left_out):
-    """Return the longest part of [c0, 1] without an evaluated node (left_out = 0), as a fraction of the polynomial."""
+def _widest_gap(c, c0, kept):
+    """Return the longest part of [c0, 1] without an evaluated node (kept >= 0), as a fraction of the polynomial."""
     widest, before = 0.0, c0
     for k in range(S):
-        if left_out[k] == 0.0 and c[k] > c0:
+        if kept[k] >= 0.0 and c[k] > c0:
             widest, before = max(widest, c[k] - before), c[k]
     return max(widest, 1.0 - before)
 
 
 @merged
-def _choose_partition_at_end(f, w, t, q, pivot, min_node_pivot):
-    """Choose the partition at the end (t, q) of a step; return a code.
+def _choose_partition_at_end(
+    f, w, t, h, stored, min_pivot, min_node_pivot, tables, a, q_0, v_0, q_late, v_late, q1, v1
+):
+    """Set (q1, v1) to the end of the polynomial of duration h, at the time t; choose the partition; return a code.
 
-    The code is SINGULAR if the end is too close to the singular position. `pivot` is the smallest pivot at the
-    beginning of the step; `min_node_pivot` is the pivot below which nodes are left out.
+    The code is SINGULAR if the end is too close to the singular position: the pivot is below FAR_END times the largest
+    and below `min_pivot`, or the end is before the position or below END_MARGIN times `min_node_pivot`.
     """
-    code = renew_partition(f, w, t, q)
-    if code == DONE and w.pivot < max(MIN_PIVOT_RATIO * pivot, min(END_MARGIN * min_node_pivot, pivot)):
-        return SINGULAR
-    return code
+    A, AA, b, bA, c = tables
+    if stored[MAY_APPROACH] == 0.0:
+        _integrate_polynomial(h, c[LATE], A[LATE], AA[LATE], a, q_0, v_0, q_late, v_late)
+        if renew_partition(f, w, t - (1.0 - c[LATE]) * h, q_late) == DONE:
+            min_pivot = max(min_pivot, w.pivot, END_MARGIN * min_node_pivot)
+    _integrate_polynomial(h, 1.0, b, bA, a, q_0, v_0, q1, v1)
+    code = renew_partition(f, w, t, q1)
+    return SINGULAR if code == DONE and w.pivot < min(min_pivot, FAR_END * stored[LARGEST_PIVOT]) else code
 
 
 @compiled
@@ -219,17 +213,17 @@ def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 
 @compiled
-def _extrapolate_node(j, c, last, a):
-    """Set a[j] to the value at node c[j] of the polynomial through the accelerations at nodes `last` (-1: no node)."""
-    a[j, :] = 0.0
-    for k in last:
-        if k >= 0:
-            weight = 1.0
-            for i in last:
-                if i >= 0 and i != k:
-                    weight *= (c[j] - c[i]) / (c[k] - c[i])
-            for m in range(a.shape[1]):
-                a[j, m] += weight * a[k, m]
+def _interpolate(x, c, nodes, a, value):
+    """Set `value` (n) to the value at x of the polynomial through the accelerations a (S, n) at `nodes` (-1: none)."""
+    value[:] = 0.0
+    for node in nodes:
+        if node >= 0:
+            k, weight = int(node), 1.0
+            for other in nodes:
+                if other >= 0 and other != node:
+                    weight *= (x - c[int(other)]) / (c[k] - c[int(other)])
+            for m in range(value.size):
+                value[m] += weight * a[k, m]
 
 
 @compiled
@@ -242,14 +236,7 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
     for m in range(q.size):
         q[m] = q_0[m] + duration * (fraction * v_0[m] + duration * q[m])
         v[m] = v_0[m] + duration * v[m]
-    acceleration[:] = 0.0
-    for k in range(S):
-        weight = 1.0
-        for i in range(S):
-            if i != k:
-                weight *= (fraction - c[i]) / (c[k] - c[i])
-        for m in range(q.size):
-            acceleration[m] += weight * a[k, m]
+    _interpolate(fraction, c, range(S), a, acceleration)
 
 
 @merged
@@ -308,11 +295,11 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     b, bA, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage, offset = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n)), (S + 7) * n
     q_stage, v_stage, a_stage, q_0, v_0 = stage[0], stage[1], stage[2], stage[3], stage[4]
-    left_out, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))
+    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # `kept`: node number; -1: left out
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
     is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.is_generated == 1
-    min_node_pivot, duration = MIN_NEAR_RATIO, h
+    min_node_pivot, duration, t_base = MIN_NEAR_RATIO, h, t
     q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
     if is_estimated:
         min_node_pivot = near_pivot_ratio(tolerances)
@@ -322,29 +309,32 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return _finish_piece(f, w, t + h, min_node_pivot * largest_pivot, options, tolerances, stage, state, new_state)
     stored[END] = -np.inf
     if time_of_base <= t:
-        duration = t + h - time_of_base
+        duration, t_base = t + h - time_of_base, time_of_base
     else:
         copy(q, q_base)
         copy(v, v_base)
         if is_estimated:
             duration = h + max(0.0, min(h * BACKWARD_FRACTION / (1.0 - BACKWARD_FRACTION), t - earliest))
     begin, c0 = t + h - duration, (duration - h) / duration
-    c_base = 0.0 if time_of_base <= t else c0  # time of the state `base`, as a fraction of the polynomial
+    c_base = c0 if t_base == t else 0.0  # time of the state `base`, as a fraction of the polynomial
     _fill_integral_weights(b, c, c_base, weights_v, weights_q)
     n_before_base = 0  # number of nodes before the state `base`
     while n_before_base < S and c[n_before_base] < c_base:
         n_before_base += 1
     w.n_outer += 1
-    code = renew_partition(f, w, t, q)
+    code = renew_partition(f, w, t_base, q_base)
     pivot = w.pivot if code == DONE else 0.0
+    tables, states = (A, AA, b, bA, c), (q_0, v_0, q_stage, v_stage, q1, v1)
     for j in range(S):
         copy(state[2 * n : 3 * n], a[j])
-    left_out[:] = 0.0
+        kept[j] = j
     previous_change, has_converged, largest_move, n_kept = np.inf, False, 0.0, S
     last_0, last_1, last_2 = -1, -1, -1  # the last evaluated nodes, from which the first sweep extrapolates; -1: none
     for sweep in range(MAX_SWEEPS):
         change, largest_move = 0.0, 0.0
         chooses_nodes = sweep in (0, 2, FEW_SWEEPS)  # whether this sweep decides anew which nodes are left out
+        if chooses_nodes:
+            n_kept = S
         if is_estimated and chooses_nodes and sweep == FEW_SWEEPS:
             min_node_pivot = min(DISTANCE_FACTOR * min_node_pivot, MAX_NEAR_RATIO)
         for i in range(S):
@@ -354,12 +344,12 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 if i == n_before_base:
                     last_0, last_1, last_2 = -1, -1, -1
                     for k in range(n_before_base):
-                        if left_out[k] == 0.0:
+                        if kept[k] >= 0.0:
                             last_0, last_1, last_2 = k, last_0, last_1
                 if last_0 >= 0:
                     for k in range(S):
                         if k >= j if i >= n_before_base else k <= j or k >= n_before_base:
-                            _extrapolate_node(k, c, (last_0, last_1, last_2), a)
+                            _interpolate(c[k], c, (last_0, last_1, last_2), a, a[k])
             time = begin + c[j] * duration
             _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
             _integrate_polynomial(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
@@ -367,16 +357,16 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             renews_partition = not uses_generated_code or chooses_nodes
             if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
-                left_out[j] = 0.0
+                kept[j] = j
                 if code == DONE:  # in a run that begins near a singular position, earlier pivots may all be small
-                    largest_pivot = max(largest_pivot, w.pivot)
+                    stored[LARGEST_PIVOT] = largest_pivot = max(largest_pivot, w.pivot)
                 if is_estimated and (code != DONE or w.pivot < min_node_pivot * largest_pivot):
-                    left_out[j], code = 1.0, DONE
-            elif renews_partition and left_out[j] == 0.0:
+                    kept[j], n_kept, code = -1.0, n_kept - 1, DONE
+            elif renews_partition and kept[j] >= 0.0:
                 code = renew_partition(f, w, time, q_stage)
-            if left_out[j] == 1.0:
+            if kept[j] < 0.0:
                 if not chooses_nodes:
-                    _interpolate_node(j, c, left_out, a)
+                    _interpolate(c[j], c, kept, a, a[j])
                 continue
             while True:
                 if code == DONE:
@@ -400,22 +390,21 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not np.isfinite(change):
             return Attempt(OUTER_DIVERGED, np.inf, 0.0)
         if chooses_nodes:
-            n_kept = S - int(left_out.sum())
             if n_kept < S - MAX_LEFT_OUT_NODES:
                 return Attempt(SINGULAR, np.inf, 0.0)
-            if is_estimated and _widest_gap(c, c0, left_out) * duration > tolerances[GAP] * (1.0 + ROUNDING):
+            if is_estimated and _widest_gap(c, c0, kept) * duration > tolerances[GAP] * (1.0 + ROUNDING):
                 return Attempt(OUTER_DIVERGED, np.inf, 0.0)
             for j in range(S):
-                if left_out[j] == 1.0:
-                    _interpolate_node(j, c, left_out, a)
+                if kept[j] < 0.0:
+                    _interpolate(c[j], c, kept, a, a[j])
         elif change <= CONVERGED_CHANGE or (sweep > 3 and STALL_RATIO * previous_change <= change <= STALL_CHANGE):
             has_converged = True
             break
         _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
         # test the end of the step early: it is accurate enough after two sweeps, and most failing steps fail here
         if sweep == 1 and is_estimated:
-            _integrate_polynomial(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
-            code = _choose_partition_at_end(f, w, t + h, q1, pivot, min_node_pivot * largest_pivot)
+            min_pivots = MIN_PIVOT_RATIO * pivot, min_node_pivot * largest_pivot
+            code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
         previous_change = change
@@ -427,8 +416,8 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
-    _integrate_polynomial(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
-    code = _choose_partition_at_end(f, w, t + h, q1, pivot, min_node_pivot * largest_pivot)
+    min_pivots = MIN_PIVOT_RATIO * pivot, min_node_pivot * largest_pivot
+    code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     if is_estimated:  # the next steps are pieces of this polynomial
