@@ -216,11 +216,13 @@ class CollocationCode:
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
             if self.split_functions is not None and not self.has_reduced:
-                return self._evaluator(emit, work, 0)(inputs)
+                return self._evaluator(emit, work, state, 0)(inputs)
             program, lowering = self.equations.accelerations[0], Lowering(emit, self.numbers)
             (exprs,), graph = program.arrays.values(), self.equations.graph
             for quantity, value in enumerate(inputs):
                 lowering.define(quantity, value)
+            needed = graph.quantities_by_use([exprs[i] for i in self.iterated_coordinates])
+            lowering.expressions(graph, [graph.quantity(i) for i in needed if not graph.is_late[i]])
 
             def store_accelerations(coordinates: list[int]) -> None:
                 for i, value in zip(
@@ -233,7 +235,10 @@ class CollocationCode:
                 lowering.expressions(graph, [expr for pair in program.conditions for expr in pair])
                 return lowering.is_valid(program, self._accelerations(emit, work))
 
-            store_accelerations(self.iterated_coordinates)
+            with self._repeated(emit, work, state) as velocities:
+                for i, value in enumerate(velocities):
+                    lowering.define(1 + self.n + i, value)
+                store_accelerations(self.iterated_coordinates)
             return store_others
 
         def fallback() -> Value:
@@ -258,16 +263,21 @@ class CollocationCode:
             inner_emit, (work, state, tolerances, numbers) = emit.copy_for_builder(builder), builder.arguments
             inner_emit.numbers = inner_emit.constants = numbers
             self._call(inner_emit, "begin_nodes", self._predict_nodes, [work, state, tolerances])
-            mass_first, not_computed = self._evaluator(inner_emit, work, -1), constant(DOUBLE, float(mem.NOT_COMPUTED))
+            mass_first = self._evaluator(inner_emit, work, state, -1)
+            not_computed = constant(DOUBLE, float(mem.NOT_COMPUTED))
             builder.ret(self._iterate(inner_emit, work, state, tolerances, mass_first, lambda: not_computed))
         return name
 
-    def _evaluator(self, emit: LaneEmitter, work: Value, index: int) -> Callable[[list[Value]], Callable[[], Value]]:
+    def _evaluator(
+        self, emit: LaneEmitter, work: Value, state: Value, index: int
+    ) -> Callable[[list[Value]], Callable[[], Value]]:
         """Return the argument `evaluate` of `_iterate` that uses the program `index`, see `call_accelerations`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
-            is_valid = call_accelerations(emit, self.equations, index, inputs, self.numbers, accelerations)
+            with self._repeated(emit, work, state) as velocities:
+                arguments = [*inputs, *velocities]
+                is_valid = call_accelerations(emit, self.equations, index, arguments, self.numbers, accelerations)
             return lambda: is_valid
 
         return evaluate
@@ -370,11 +380,10 @@ class CollocationCode:
     ) -> Value:
         """Sweep over the stages until they converge, or the step is rejected; return the code of `iterate_step`.
 
-        `evaluate` stores the accelerations of the iterated coordinates at [t, q, v]; the function that it returns
-        stores the other accelerations, and returns whether all accelerations are valid. If not, `fallback` returns
-        the code.
+        `evaluate` stores the accelerations of the iterated coordinates at [t, q]; the function that it returns stores
+        the other accelerations, and returns whether all accelerations are valid. If not, `fallback` returns the code.
         """
-        builder, num, n = emit.builder, Emitter(emit.builder), self.n
+        builder, num = emit.builder, Emitter(emit.builder)
 
         def number(value: float) -> Value:
             return constant(DOUBLE, value)
@@ -403,13 +412,7 @@ class CollocationCode:
         sweeps, change_before, rho = carried
         for phi, value in zip(carried, (llvm_code.ZERO, llvm_code.ONE, rho_before), strict=True):
             phi.add_incoming(value, before)
-        q, v = [emit.constant(0.0)] * n, [emit.constant(0.0)] * n
-        for k, i in enumerate(self.iterated_coordinates):
-            q[i], v[i] = (
-                load_lanes(emit, work, self.q_offset + LANES * k),
-                load_lanes(emit, work, self.v_offset + LANES * k),
-            )
-        store_others = evaluate([times, *q, *v])
+        store_others = evaluate([times, *self._load_iterated(emit, num.pointer(work, self.q_offset))])
         change = stricter * self._integrate(emit, work, state)
         sweep = sweeps + 1.0
 
@@ -437,6 +440,38 @@ class CollocationCode:
         with builder.if_then(builder.compare("fcmp oeq", code, number(mem.CONVERGED)) & has_estimate):
             self._call(emit, "judge_nodes", self._estimate_error, [work, state])
         return code
+
+    @contextmanager
+    def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
+        """Return a context for instructions that compute accelerations, and run twice in each sweep if REPEATS is 1.
+
+        The context yields the velocities: at first those of the sweep, then integrals of the accelerations computed.
+        """
+        builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
+        before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
+        builder.jump(loop)
+        builder.position_at_end(loop)
+        offset = builder.phi(INTEGER)
+        offset.add_incoming(first_offset, before)
+        yield self._load_iterated(emit, num.pointer(work, offset))
+        is_first = builder.compare("icmp eq", offset, first_offset)
+        builder.branch(is_first & (num.load(work, mem.REPEATS) > 0.0), repeat, after)
+        builder.position_at_end(repeat)
+        h = emit.broadcast(num.load(work, mem.H))
+        with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
+            v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
+            of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
+            store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # spectra are stored after the last sweep
+        builder.jump(loop)
+        builder.position_at_end(after)
+
+    def _load_iterated(self, emit: LaneEmitter, pointer: Value) -> list[Value]:
+        """Return values at the nodes: those at `pointer` for the iterated coordinates, and 0 for the others."""
+        values = [emit.constant(0.0)] * self.n
+        for k, i in enumerate(self.iterated_coordinates):
+            values[i] = load_lanes(emit, pointer, LANES * k)
+        return values
 
     def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Store ERROR and CURVATURE, and the ratios FACTOR and FACTOR_OF_ERROR of the next step size to this one.

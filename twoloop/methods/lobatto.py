@@ -82,6 +82,7 @@ class Lobatto16:
             len(collocation.code.iterated_coordinates),
             collocation.code.n_rows,
         )
+        options[kernels.MAY_REPEAT] = float(collocation.code.split_functions is None or collocation.code.has_reduced)
         options[kernels.FREE] = 1.0 if self.narrow else 1.0 / LONGEST_GAP
         sizes = n_q, len(collocation.code.iterated_coordinates), collocation.code.n_rows
         plan = Plan(

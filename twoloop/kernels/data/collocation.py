@@ -40,7 +40,8 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     ALLOWED_H,  # largest size (s) that the error would have allowed for the last step
     SIZE,  # largest sum of a velocity and its change in the step, relative to the tolerances
     STRICTER,  # largest of all WEIGHTS, divided by the largest WEIGHT of an iterated coordinate
-) = range(28)
+    REPEATS,  # 1: each sweep evaluates accelerations twice, first at old and then at new velocities; 0: once
+) = range(29)
 # offsets of the arrays that follow the scalars
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE
 SCALED = 40  # offset of eight numbers: coefficients of a polynomial, multiplied by POWERS

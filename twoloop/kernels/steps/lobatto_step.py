@@ -10,6 +10,10 @@ derivatives of the accelerations. The step size is limited in two ways:
 - convergence: a target number of sweeps has to suffice;
 - accuracy: the last Legendre coefficients of the accelerations have to be as small as the tolerance requires.
 
+If convergence limits the step size, as in fast rotation or with damping, each sweep evaluates the accelerations twice
+at the same positions, the second time at the velocities that follow from the first evaluation. What depends on
+positions alone is evaluated once. The contraction is then approximately squared, unless positions dominate it.
+
 The integrator calls `lobatto_step` for a single step, or `lobatto_steps` for several steps in a row if nothing has to
 be checked between them. The ends of steps in a row are projected onto the constraints together, one in each lane.
 """
@@ -41,8 +45,9 @@ from twoloop.kernels.linalg.dense import copy
 
 # indices in `options`. THETA: largest last correction of a projection; N_ITERATED: number of coordinates whose
 # accelerations are iterated; N_ROWS: number of constraints; FREE: step size, in units of tolerances[DEFECT_GAP], above
-# which nodes are too far apart to detect short forces, and the defect is evaluated between nodes
-THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
+# which nodes are too far apart to detect short forces, and the defect is evaluated between nodes; MAY_REPEAT: 1
+# if a sweep may evaluate the accelerations twice, 0 if their code is split, so that the second time takes equally long
+THETA, N_ITERATED, N_ROWS, FREE, MAY_REPEAT, N_OPTIONS = range(6)
 
 START_CONTRACTION = 0.12  # contraction rho for which the first step size is chosen after its first guess is rejected
 MAX_GUESSES = 4  # largest number of guesses of the first step size
@@ -59,7 +64,12 @@ CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evalua
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
+MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
 LEAST_TREND = 0.4  # lower bound of the trend, the ratio of step sizes that the error allows in successive steps
+# ratio of the step sizes that the convergence allows with and without repeated evaluation at new velocities
+GAIN_BY_REPEATS = 1.5
+# the repetition ends if the convergence allows steps this many times as long as the error does: then it saves no time
+MAX_REACH = 2.5
 MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
 _array_offsets = merged(array_offsets)
 
@@ -102,7 +112,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     result = int(f.attempt_nodes(data, state, tolerances, f.own_numbers))
     n_sweeps = int(data[field.SWEEPS])
     w.n_outer += n_sweeps
-    w.n_evaluations += LANES * n_sweeps
+    w.n_evaluations += LANES * n_sweeps * (1 + int(data[field.REPEATS]))
     w.n_factorizations += LANES * n_sweeps
     if result == GUESSED:
         data[field.N_GUESSES] += 1.0
@@ -135,16 +145,23 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     # the motion may be stiff if accelerations hardly vary, but a step takes the target number of sweeps, or one less
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
-    factor = data[field.FACTOR]
     # extrapolate the step size that the error allows by its trend, which mostly changes little from step to step
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVATURE] >= MIN_CURVATURE:
         trend = 1.0 if is_first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
-        factor = min(factor, SAFETY * trend * data[field.FACTOR_OF_ERROR])
+        max_factor = min(max_factor, max(SAFETY * trend * data[field.FACTOR_OF_ERROR], MIN_FACTOR))
     data[field.ALLOWED_H] = h_allowed
     if extra_sweeps > 1.0:
         max_factor = min(max_factor, 0.9)
-    return CONVERGED, error, min(max(factor, 0.4), max_factor)
+    factor = max(data[field.FACTOR], MIN_FACTOR)
+    if data[field.REPEATS] == 1.0:
+        if is_limited or h * factor > MAX_REACH * h_allowed:
+            # a sweep with one evaluation reduces the error by about the square root of the contraction with two
+            data[field.REPEATS], data[field.RHO] = 0.0, math.sqrt(data[field.RHO])
+    elif options[MAY_REPEAT] == 1.0 and factor < max_factor and not is_limited:
+        data[field.REPEATS] = 1.0
+        factor *= GAIN_BY_REPEATS
+    return CONVERGED, error, min(factor, max_factor)
 
 
 @merged
