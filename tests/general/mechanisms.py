@@ -93,7 +93,7 @@ SINGULAR = {
     **{f"A02 of bodies, N = {n}": partial(windows, n, "bodies") for n in (1, 2)},
     "crossing lines": systems.crossing_lines,
 }
-ALL = {**REGULAR, **SINGULAR}
+ALL = {**REGULAR, **SINGULAR, "A02 of bodies, N = 40": partial(windows, 40, "bodies")}
 REDUNDANT = [name for name in REGULAR if "redundant" in name or name in RANKS]
 
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import pairwise
 from types import FrameType
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
+from twoloop.kernels.control.singular_positions import COLLAPSED_STEP
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import MAX_GAP_RATIO
@@ -144,7 +146,9 @@ CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, b
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-MAX_BASE_CANDIDATES = 16  # number of last states among which the base of a crossing step is sought
+# the base of a crossing step is one of the last N_RECENT states, or one of the last N_RECENT ends of long steps in the
+# last N_LAST_STATES: near a singular position, many steps may be short
+N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 # largest number of sets of buffers kept for later runs, and of floats in the buffer of states of such a set
@@ -193,7 +197,7 @@ class IntegrationLoop:
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
-        self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
+        self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last chunks, see _last_states
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet
         if self.request.store.append_only:
             self._store_step_fields()
@@ -319,7 +323,9 @@ class IntegrationLoop:
             self._store_step_fields()
         self.recorder.add(t, rows, kinds)
         if len(t):
-            self.latest_chunks = [*self.latest_chunks[-1:], (t, rows)]
+            self.latest_chunks.append((t, rows))
+            while sum(len(times) for times, _ in self.latest_chunks[1:]) >= N_LAST_STATES:
+                self.latest_chunks.pop(0)
 
     def _store_step_fields(self) -> None:
         """Add the fields with one row per step to the store, for steps that are not stored yet."""
@@ -380,13 +386,15 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _last_states(self) -> list[TimedState]:
-        """Return the last MAX_BASE_CANDIDATES states (time, row), oldest first; [] if not all states are recorded."""
+        """Return states (time, row) from which the base of a crossing step is chosen; [] if not all are recorded."""
         if not self.request.every_step:
             return []
-        states = [(self.run.t0, self.start)] if len(self.latest_chunks) < 2 else []
+        states: list[TimedState] = [(self.run.t0, self.start)]
         for t, rows in self.latest_chunks:
-            states += zip(t[-MAX_BASE_CANDIDATES:].tolist(), rows[-MAX_BASE_CANDIDATES:], strict=True)
-        return states[-MAX_BASE_CANDIDATES:]
+            states += zip(t[-N_LAST_STATES:].tolist(), rows[-N_LAST_STATES:], strict=True)
+        long = COLLAPSED_STEP * float(self.run.clock[self.run.a.H_LONG])
+        ends = [state for before, state in pairwise(states[-N_LAST_STATES:-N_RECENT]) if state[0] - before[0] >= long]
+        return ends[-N_RECENT:] + states[-N_RECENT:]
 
     def _correct_last_state(self) -> None:
         """Replace [q, v, a] of the last recorded state by the run's state, which is on the crossing's polynomial."""
