@@ -16,7 +16,7 @@ from twoloop.generate.traced_values import accept_traces
 from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
 from twoloop.kernels.data.indices import DONE
 from twoloop.kernels.evaluation.constraints import constraint_rows
-from twoloop.kernels.evaluation.inner_loop import acceleration_constraint
+from twoloop.kernels.evaluation.inner_loop import compute_gamma
 from twoloop.run.workspace import make_kit, workspace
 
 WEIGHT = np.array([0.0, -9.81])
@@ -234,7 +234,7 @@ def constant_pendulum(**more):
 def rows_and_gamma(f, w, t, q, v):
     w.G[:, :] = 0.0
     constraint_rows(f, w, t, q, w.G)
-    return acceleration_constraint(f, w, t, q, v)
+    return compute_gamma(f, w, t, q, v)
 
 
 def in_kernels(system, t, q, v):

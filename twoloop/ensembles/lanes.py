@@ -20,7 +20,7 @@ from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.generate.program import ArrayAlgebra, Program
 from twoloop.generate.series import series_for
-from twoloop.generate.time_dependence import TIME_CALLBACKS, TIME_MASK, may_be_short, may_be_steep
+from twoloop.generate.time_dependence import TIME_CALLBACKS, TIME_MASK, find_short_forces, forces_may_be_steep
 from twoloop.generate.trace import Equations
 from twoloop.kernels.control.discontinuities import LEAST_RANGE, LEAST_VALUE, MIN_STEEPNESS_RATIO, SUDDEN_RATIO
 from twoloop.kernels.control.discontinuities import N_SAMPLES as N_PLACES
@@ -127,7 +127,7 @@ def is_series_costly(system: ConstrainedSystem) -> bool:
     Return False if a force may be steep, because DOP853 would then need short steps, while series only check the defect
     more often.
     """
-    if may_be_steep(system, force_was_traced=True):
+    if forces_may_be_steep(system, force_was_traced=True):
         return False
     try:
         return series_for(system).n_operations > COSTLY_SERIES * system.n_q
@@ -231,8 +231,8 @@ class LaneRuns:
         self.system, self.starts, self.method, self.kit = system, starts, method, writable_kit(system)
         generic, varying = generic_parameters(starts.parameters)
         generic_copy = generic_system(system, starts)
-        short_forces = may_be_short(generic_copy, force_was_traced=True)
-        gap = 1.0 if may_be_steep(generic_copy, force_was_traced=True) else method.max_gap
+        short_forces = find_short_forces(generic_copy, force_was_traced=True)
+        gap = 1.0 if forces_may_be_steep(generic_copy, force_was_traced=True) else method.max_gap
         self.n_gaps = N_SHORT if any(short_forces) else N_SAMPLES * gap  # smallest number of steps in a run
         self.sampling = ForceSampling(system, generic, varying) if short_forces.by_time else None
         choice = PivotChoice.choose(system_of(system, starts, 0), starts.t0, starts.q[0])

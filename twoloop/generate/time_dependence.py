@@ -49,7 +49,7 @@ class Dependence(NamedTuple):
     """Result of the analysis of the callbacks of systems; all systems of a trace cache share it."""
 
     short_forces: ShortForces
-    is_steep: bool  # whether forces or drives may be steep, see `may_be_steep`
+    is_steep: bool  # whether forces or drives may be steep, see `forces_may_be_steep`
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
@@ -57,10 +57,11 @@ class Dependence(NamedTuple):
         return self
 
 
-def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
-    """Return whether forces, C_t or b may have short pulses in time, and in q and v; true if they cannot be traced.
+def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
+    """Return whether forces, C_t or b may have short pulses in time, and whether forces may have them in q or v.
 
-    Functions called in Python may store their arguments. So they are traced only if the force was traced already.
+    If they cannot be traced, both are true; for systems with more than MAX_COORDINATES coordinates, which are not
+    traced, only the first is. Functions called in Python may store arguments: they are traced only if the force was.
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -68,13 +69,13 @@ def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForc
     return ShortForces(True, True) if dependence is None else dependence.short_forces
 
 
-def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
+def forces_may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
     """Return whether forces may act for a short time, or vary much over a distance shorter than a step.
 
     Quotients and roots may vary in this way: the stages of a long step may evaluate 1 / (1 + (x / w)**2) on its flanks,
     but not at its peak. Stages may also evaluate a fast vibration at nearly equal phases.
     """
-    if any(may_be_short(system, force_was_traced)):
+    if any(find_short_forces(system, force_was_traced)):
         return True
     dependence = _dependence(system, force_was_traced)
     return dependence is None or dependence.is_steep
@@ -100,11 +101,9 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
             return equations.graph.quantities_for(exprs)
 
         graph = equations.graph
-        by_state = needed(STATE_CALLBACKS)
-        short_forces = ShortForces(
-            _has_time_pulses(graph, needed(TIME_CALLBACKS)), _has_state_pulses(graph, by_state, system.n_q)
-        )
-        is_steep = _may_be_steep(graph, sorted({*by_state, *needed(TIME_CALLBACKS)}))
+        by_state, by_time = needed(STATE_CALLBACKS), needed(TIME_CALLBACKS)
+        short_forces = ShortForces(_has_time_pulses(graph, by_time), _has_state_pulses(graph, by_state, system.n_q))
+        is_steep = _quantities_may_be_steep(graph, sorted({*by_state, *by_time}))
         return Dependence(short_forces, is_steep, frozenset(graph.traced))
 
     return make
@@ -205,7 +204,7 @@ def _has_state_pulses(graph: Graph, quantities: list[int], n_q: int) -> bool:
     )
 
 
-def _may_be_steep(graph: Graph, quantities: list[int]) -> bool:
+def _quantities_may_be_steep(graph: Graph, quantities: list[int]) -> bool:
     """Return whether one of the `quantities` may vary much over a distance shorter than a step.
 
     It may if it uses any operation except sums, products, sines and cosines; or a sine or cosine of time, or of an

@@ -7,7 +7,7 @@ from twoloop.generate.collocation_code import compiles_quickly
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import is_quick_to_trace, series_for
-from twoloop.generate.time_dependence import may_be_steep
+from twoloop.generate.time_dependence import forces_may_be_steep
 from twoloop.generate.traced_values import Check, accept_traces
 from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method, Plan, cached_plan, least_tolerance
@@ -182,7 +182,7 @@ class Auto:
             series = self.series.for_system(system, code, check)
         except ValueError:
             return method
-        return replace(method, series=series, narrow=may_be_steep(system, force_was_traced=True))
+        return replace(method, series=series, narrow=forces_may_be_steep(system, force_was_traced=True))
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
         """Return whether a step of the series costs less than the steps of the explicit method that it replaces."""

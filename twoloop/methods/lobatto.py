@@ -7,7 +7,7 @@ import numpy as np
 
 from twoloop.generate.collocation_code import compiled_collocation, compiles_quickly, tables
 from twoloop.generate.compile_equations import GeneratedCode
-from twoloop.generate.time_dependence import may_be_steep
+from twoloop.generate.time_dependence import forces_may_be_steep
 from twoloop.generate.traced_values import Check, accept_traces
 from twoloop.kernels.data.collocation import ORDER
 from twoloop.methods.dop853 import DOP853
@@ -67,7 +67,7 @@ class Lobatto16:
                 f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. "
                 "Take method='auto'"
             )
-        return replace(self, code=code, narrow=may_be_steep(system, force_was_traced=True))
+        return replace(self, code=code, narrow=forces_may_be_steep(system, force_was_traced=True))
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the Plan of a run of n_q coordinates: step, options, memory and step-size control."""

@@ -92,8 +92,8 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
 
 
-# step sizes to try across a singular position, relative to the first, in this order: larger ones if too few nodes of a
-# step are beyond the position, smaller ones if the error of a step is too large or a node is at the position
+# step sizes to try in turn across a singular position, relative to the first size. Larger sizes help if a step ends
+# before the position or too near it; smaller sizes, if the error is too large or a node is at the position
 SIZE_RATIOS = (1.0, *(1.2**k for k in range(1, 12)), *(0.85**k for k in range(1, 28)))
 LARGEST_RATIO = max(SIZE_RATIOS)
 # "distance" of a state from a singular position: smallest pivot of C_q, relative to the largest such pivot of the run.
@@ -183,7 +183,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
     run.piece_ends = []  # not empty if the last run of a cached integrator ended within a polynomial
     if control[a.FIXED_STEP] == 0.0:
-        control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
+        control[a.MAX_EVALUATION_GAP] = 1.0 if run.forces_may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0
     _prepare_next_origin(run, plan, control)
     return plan, control
@@ -193,7 +193,7 @@ def _limits(run: Run) -> tuple[int, ...]:
     """Return the limits of steps across a singular position to try, in this order."""
     if run.control[run.a.FIXED_STEP] > 0.0:
         return (STRICT,)
-    return LIMITS if any(run.short_forces) or run.may_be_steep else LIMITS[WIDER:]
+    return LIMITS if any(run.short_forces) or run.forces_may_be_steep else LIMITS[WIDER:]
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:

@@ -17,7 +17,7 @@ from twoloop.checks.structure import (
     mass_and_rows,
     pattern_of,
 )
-from twoloop.generate.time_dependence import ShortForces, may_be_short, may_be_steep
+from twoloop.generate.time_dependence import ShortForces, find_short_forces, forces_may_be_steep
 from twoloop.generate.traced_values import CheckedRegion
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
@@ -105,12 +105,13 @@ class Run:
         self.near_threshold = singular_threshold(rtol)  # a singular position is near if the ratio of pivots is smaller
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
-            ("changes", force_traced), lambda: (may_be_short(system, force_traced), may_be_steep(system, force_traced))
+            ("changes", force_traced),
+            lambda: (find_short_forces(system, force_traced), forces_may_be_steep(system, force_traced)),
         )
         short_forces, steep = (ShortForces(False, False), True) if step_size is not None else short_and_steep
         self.short_forces: ShortForces = short_forces
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
-        self.may_be_steep = steep or plan.max_gap == 1.0
+        self.forces_may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # steps across a singular position, see fallbacks.py
         self.mirrored_size = 0.0  # size (s) of a step that begins and ends equally far from the position
@@ -399,7 +400,7 @@ class Run:
 
         If forces may be steep, a step is at most a hundredth of the run: one stage may not reveal a steep force.
         """
-        gap = 1.0 if self.may_be_steep else self.plan.max_gap
+        gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 

@@ -50,7 +50,7 @@ from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm,
 
 
 @merged
-def acceleration_constraint(f, w, t, q, v):
+def compute_gamma(f, w, t, q, v):
     """Store Gamma, the right-hand side of G a = Gamma, in w.Gamma; return DONE or the code of a failure."""
     n_c, n_rows = w.C.size, w.Rate.size
     if w.has_gamma == 1.0 and n_rows == n_c:
@@ -106,7 +106,7 @@ def compute_accelerations(f, w, t, q, v, a):
     w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:
-        code = acceleration_constraint(f, w, t, q, v)
+        code = compute_gamma(f, w, t, q, v)
     if code != DONE:
         return code
     w.Q[:] = 0.0

@@ -56,7 +56,7 @@ from twoloop.kernels.evaluation.partition import (
     ROUNDING_OF_ROWS,
 )
 from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
-from twoloop.kernels.linalg.sparse_ldl import factor, load_matrix, solve, solve_refined
+from twoloop.kernels.linalg.sparse_ldl import factor, fill_saddle_matrix, solve, solve_refined
 from twoloop.kernels.linalg.symbolic_factorization import (
     N_OFF_DIAGONAL,
     N_PIVOTS,
@@ -110,7 +110,7 @@ def _factor_entries(f, w, min_sine_square):
     """Factor [M G^T; G 0] from the entries in w; return the smallest squared sine, see `factor` of sparse_ldl.py."""
     w.n_factorizations += 1
     stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
-    load_matrix(f.ldl_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
+    fill_saddle_matrix(f.ldl_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
     smallest = factor(f.ldl_program, w.is_independent, w.factors, w.pivot_sizes, min_sine_square)
     w.smallest = smallest
     w.pivot = np.sqrt(max(smallest, 0.0))

@@ -54,8 +54,8 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 
 @merged
-def load_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store the entries of G and of the stiffened M in their slots in `values`; `scratch` has one number per pivot."""
+def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
+    """Store G and the stiffened M in `values`, weights s of s g g^T in `stiffness`; `scratch`: one number per pivot."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_entries_of(program)

@@ -91,8 +91,8 @@ def tangent_entries_of(program):
 
 
 @compiled
-def load_matrix(program, mass, jacobian, K, D, z, stiffness, values):
-    """Store Newton's matrix for z (real or complex) in its slots in `values`, from the entries of M, G, K and D."""
+def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
+    """Store Newton's matrix for real or complex z in `values`; `stiffness`: s of s g g^T, for rows g that stiffen M."""
     for s in range(values.size):
         values[s] = 0.0
     n_off = program[N_OFF_DIAGONAL]

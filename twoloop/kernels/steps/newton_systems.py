@@ -49,7 +49,7 @@ from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solv
 from twoloop.kernels.linalg.markowitz_lu import columns_of
 from twoloop.kernels.linalg.sparse_ldl import add_terms_of_redundant_rows
 from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
-from twoloop.kernels.linalg.sparse_lu import load_matrix, tangent_entries_of
+from twoloop.kernels.linalg.sparse_lu import fill_newton_matrix, tangent_entries_of
 from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
 from twoloop.kernels.linalg.symbolic_factorization import (
     N_OF_MASS,
@@ -687,7 +687,7 @@ def _factor_sparse_matrix(f, w, z, factors):
     mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
     w.n_factorizations += 1
-    load_matrix(f.newton_program, mass, jacobian, K, D, z, stiffness, factors)
+    fill_newton_matrix(f.newton_program, mass, jacobian, K, D, z, stiffness, factors)
     return DONE if factor_lu(f.newton_program, is_independent, factors, pivot_sizes) else SINGULAR
 
 
