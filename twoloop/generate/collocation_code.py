@@ -135,7 +135,7 @@ EXTRA_SWEEPS = 7  # a step is rejected if it has not converged this number of sw
 MAX_CONTRACTION = 0.8  # a step is rejected in its fourth sweep or later if the contraction is at least this
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
 FAST_START, SLOW_START = 0.04, 0.3  # a contraction between these accepts the guess of the first step size
-STAGNATION_RATIO = 0.5  # from this contraction on, changes below MAX_ROUNDING times the values are rounding errors
+STAGNATION_RATIO = 0.5  # at larger contractions, changes below MAX_ROUNDING times the values are rounding errors
 # values that replace KAPPA, MAX_ROUNDING and the limit of sweeps in steps of fixed size
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to the ratio of the iteration error to KAPPA, because its logarithm is computed
@@ -201,7 +201,7 @@ class CollocationCode:
     # methods that write the functions
 
     def iterate_step(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
-        """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
+        """Iterate the stages of a step; return a status code for how the iteration ended, see data/collocation.py.
 
         The program with the fewest operations computes the accelerations. Its conditions are checked once, after the
         last sweep. If they fail, the iteration is repeated with the elimination that begins with M, as in the next
@@ -378,7 +378,7 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         fallback: Callable[[], Value],
     ) -> Value:
-        """Sweep over the stages until they converge, or the step is rejected; return the code of `iterate_step`.
+        """Sweep over the stages until they converge, or a step is rejected; return a status code, see `iterate_step`.
 
         `evaluate` stores the accelerations of the iterated coordinates at [t, q]; the function that it returns stores
         the other accelerations, and returns whether all accelerations are valid. If not, `fallback` returns the code.
@@ -477,7 +477,7 @@ class CollocationCode:
         """Store ERROR and CURVATURE, and the ratios FACTOR and FACTOR_OF_ERROR of the next step size to this one.
 
         The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the larger
-        coefficient of degrees 7 and 8, s the larger one of degrees 5 and 6, f the largest one from degree 3 on. The
+        coefficient of degrees 7 and 8, s the larger one of degrees 5 and 6, f the largest one of degree 3 or more. The
         estimate is the larger of t (t / s)^1.5 and t^2 / f. In 99 % of the steps over corners and peaks of forces,
         errors are at most 20 times the estimate. In smooth motion errors are smaller by decades, which costs few steps,
         because the estimate is of order 12.
@@ -721,11 +721,11 @@ class CollocationCode:
     def _weighted_accelerations(
         self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value | int
     ) -> Value:
-        """Return the sum of the rows of a table, multiplied by the accelerations of coordinate i at the nodes."""
+        """Return the sum of the rows of a table, each multiplied by the acceleration of coordinate i at its node."""
         return self._weighted_sum(emit, table, self._node_accelerations(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
-        """Return the sum of the rows of a table, multiplied by `terms`; two independent partial sums are faster."""
+        """Return the sum of the rows of a table, each multiplied by its term; two partial sums are faster than one."""
         sums = [emit.broadcast(x) * constants(row) for x, row in zip(terms[:2], table[:2], strict=True)]
         for k, (x, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fma(emit.broadcast(x), constants(row), sums[(k + 1) % 2])
@@ -773,7 +773,7 @@ def _compile(shared: SharedCode) -> Collocation:
         module = Module(splits_blocks=is_split)
         for name, emit in writers.items():
             llvm_code.write(module, name, KIT.llvm_signature(name), emit, partial(LaneEmitter, lanes=LANES))
-        # with coefficients that were added while writing, the functions would read beyond the end of the array
+        # if coefficients were added while writing, the functions would read beyond the end of the array
         assert len(code.numbers.values) == len(numbers)
         return list(writers), str(module)
 

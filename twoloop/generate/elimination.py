@@ -299,7 +299,7 @@ class Elimination:
         change "moved" (n_q,), a vector x with A x = 0.
     projection : program for "q" and "moved", for the projected velocity "v" (n_q,), and for the accelerations "a" and
         multipliers "lam" (n_c + n_a,) at this velocity. M, G and Q are evaluated at the position before the step.
-    basic_projection : as `projection`, but "lam" is 0 for dependent rows (in `projection`, "lam" has the least norm).
+    basic_projection : as `projection`, but "lam" is 0 for redundant rows (in `projection`, "lam" has the least norm).
     position_errors, velocity_errors : programs for the right-hand sides "c" (n_c + n_a,) of corrections of positions,
         and of velocities.
     redundant_rows : program without arrays; its conditions hold if the redundant constraints are satisfied.
@@ -434,7 +434,7 @@ class Elimination:
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
-        """Return a list with one value for each row of G: the values `independent`, and 0 for dependent rows."""
+        """Return a list with one value for each row of G: the values `independent`, and 0 for redundant rows."""
         values = [self.zero] * len(self.all_rows)
         for k, value in zip(self.choice.rows, independent, strict=True):
             values[k] = value
@@ -442,13 +442,13 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for the right-hand sides "c" = -C of position corrections; 0 in dependent rows and A."""
+        """Return the program for "c" = -C, the right side of position corrections; 0 in redundant rows and A."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for the right-hand sides "c" = -G v - G_t of velocity corrections; 0 in dependent rows."""
+        """Return the program for "c" = -G v - (C_t, b), the right side of velocity corrections; 0 in redundant rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -475,7 +475,7 @@ class Elimination:
 
     @cached_property
     def basic_projection(self) -> Program:
-        """Return the same program as `projection`, except that "lam" is 0 for dependent rows, not of least norm."""
+        """Return the same program as `projection`, except that "lam" is 0 for redundant rows, not of least norm."""
         n, position = self.system.n_q, self.position_projection.arrays
         v = [(u + change).as_term() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
         solution, conditions = self._accelerations(v)
@@ -502,7 +502,7 @@ def multipliers_of_least_norm(
     """Return the multipliers lam (one per row) of least norm with the same G^T lam as the `independent` multipliers.
 
     `all_rows`: G. `rows`, `independent`: indices and multipliers of the independent rows. `solve`: solves with the
-    factors of [M G^T; G 0]. A dependent row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of
+    factors of [M G^T; G 0]. A redundant row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of
     G^T is spanned by e_i - sum_k Z_ik e_k. The component of lam in this null space is subtracted.
     """
     zero = Affine(graph, 0.0, {})
@@ -534,7 +534,7 @@ class FactorAndSolvePrograms:
         in the array of stored quantities, which begins with the factors.
     factor_program : program that computes the stored quantities.
     graph : graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the stored factors.
-    solution_program : program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for dependent rows.
+    solution_program : program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for redundant rows.
     least_norm_program : program for "lam" (n_c + n_a,) of least norm; its input c is the "lam" of `solution_program`.
     """
 

@@ -334,12 +334,13 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield pairs of a pivot of the reduced mass matrix and its lower bound, a fraction of a diagonal entry."""
+    """Yield pairs of a pivot of the reduced mass matrix and its lower bound, a fraction of the diagonal entry."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None
         for i in row_indices:
             pivot = next(pivots)
+            # the pivot of the second row of a block is the determinant: its bound is multiplied by the first pivot
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:

@@ -63,7 +63,7 @@ class SeriesProgram:
 
     early : early operations; the last ones are the products in G v.
     late : late operations; the last ones are the products in G^T lam + M a.
-    rows, row_indices : nonzero rows of G v + G_t, and their indices; terms "constant times v_i" are left out.
+    rows, row_indices : nonzero rows of G v + (C_t, b), and their indices; terms "constant times v_i" are left out.
     balance, balance_indices : nonzero entries of Q - G^T lam - M a, and their indices; terms "constant times lam_i" and
         "constant times a_i" are left out.
     traced : traces of the callbacks.
@@ -195,7 +195,7 @@ def _sum_of_products(
     """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
 
     Terms are collected by factors, or by the quantities in the factors, whichever needs fewer products. In a tie,
-    they are collected by quantities if `of_rates` (the sum is the rate of a constraint, G v + G_t), else by factors.
+    they are collected by quantities if `of_rates` (the sum is a row of G v + (C_t, b)), else by factors.
     Quantities lead to products such as (cos x) x', whose sums are computed for sin x anyway, see lane_series.py.
     """
     total = rest

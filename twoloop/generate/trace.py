@@ -264,7 +264,7 @@ TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# keys: callbacks for gamma, the right-hand side of G a = gamma; values: callbacks for G and G_t, which yield gamma, too
+# keys: callbacks for right-hand sides gamma; values: callbacks for C_q and C_t, or for A and b, which also yield gamma
 GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
@@ -383,7 +383,7 @@ class Equations:
         return symbol_array(time_derivative.differentiate(expr) for expr in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return -(dG/dt v + dG_t/dt), total derivatives at constant v; `rows`, `rates`: callbacks for G and G_t."""
+        """Return -(dG/dt v + dr/dt) at constant v; `rows`, `rates`: callbacks for G and r (C_q and C_t, or A and b)."""
         direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
         gamma = self.expressions(rates)

@@ -155,7 +155,7 @@ def record_pivot_at_output(f, w, clock, state):
 def check_partition(f, w, control, clock, size, at_output, state):
     """Renew a poor partition, and check how near a singular position is; return CONTINUE or an end code.
 
-    `size` is the size of the last step, s; `at_output` is true if this step ended at an output time. `state` contains
+    `size` is the size (s) of the last step; `at_output` is true if this step ended at an output time. `state` contains
     all coordinates, so that it need not be converted for a new partition.
     """
     short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output

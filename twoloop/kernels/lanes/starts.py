@@ -101,9 +101,10 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
 
 @compiled
 def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Store in `factors` the scaled entries of G, 1 / norms of its rows, the Cholesky factor of G G^T, and Z.
+    """Store in `factors` G (scaled), 1 / norms of its rows, the Cholesky factor of G G^T + Z^T Z (shifted), and Z.
 
-    Columns of fixed coordinates (`moves` = 0) are set to zero; then the rows are scaled to norm 1.
+    Z contains the combinations of redundant rows, see module docstring. Columns of fixed coordinates (`moves` = 0)
+    are set to zero; then the rows of G are scaled to norm 1. DIAGONAL_SHIFT shifts the factored matrix.
     """
     n_entries = pattern[n_rows] - pattern[0]
     for i in range(n_rows):
@@ -227,8 +228,8 @@ def offsets_in_memory(memory, n, n_rows, n_entries, n_redundant):
     The memory begins with C and C_t (n_rows each), and the entries of G; the generated code writes these parts. The
     other parts are a right-hand side x (n_rows); a change of positions or velocities, the projected positions, the
     change from the guess to the projected positions, the weakest direction, the displacement of another guess, and a
-    row of G (n each); the results of `factor_gram` at the projected positions; and its results at NEW. The weakest
-    direction is the direction that the rows of G determine least.
+    row of G (n each); the results of `factor_gram` at the projected positions; and its results at NEW, the current
+    iterate (q, v), see layout.py. The weakest direction is the direction that the rows of G determine least.
     """
     G = memory + 2 * n_rows
     x = G + n_entries
@@ -459,11 +460,8 @@ def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states
     offset = n * n + n
     G = scratch[offset : offset + n_c * n].reshape((n_c, n))
     offset += n_c * n
-    C, rate, gamma = (
-        scratch[offset : offset + n_c],
-        scratch[offset + n_c : offset + 2 * n_c],
-        scratch[offset + 2 * n_c :][:n_c],
-    )
+    C, rate = scratch[offset : offset + n_c], scratch[offset + n_c : offset + 2 * n_c]
+    gamma = scratch[offset + 2 * n_c : offset + 3 * n_c]
     offset += 3 * n_c
     q, v, last = scratch[offset : offset + n], scratch[offset + n : offset + 2 * n], states_q.shape[2] - 1
     has_gamma = f.gamma_given == 1

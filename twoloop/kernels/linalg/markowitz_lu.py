@@ -446,7 +446,7 @@ def solve_rows(index, values, X, n):
 
 @merged
 def solve_transposed(index, values, x):
-    """Replace x, a right-hand side in the order of columns_of, by the solution for the transposed matrix."""
+    """Replace x, in the order of columns_of, by the solution for the transposed matrix, in the order of rows_of."""
     r = index[SIZE]
     if index[DENSE] == 1:
         A, pivots = values[: r * r].reshape((r, r)), row_exchanges_of(index)

@@ -147,9 +147,10 @@ def singular_values_exceed(rows, ratio, gram):
 BOUND_ROUNDING = 1e-12  # largest rounding error of a pivot, relative to the bound that the pivot is compared with
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
-# if the ratio of the smallest to the largest eigenvalue of M exceeds SIMILAR_EIGENVALUES, no row is added to M, and the
-# pivots of S = G M^-1 G^T decide which rows are independent. If a pivot exceeds INDEPENDENT, the part of its row that
-# is orthogonal to previous rows is at least 3e-9 of the row; for a dependent row, this part must be at most DEPENDENT
+# if the ratio of the smallest to the largest eigenvalue of M exceeds SIMILAR_EIGENVALUES, no term s g g^T is added to
+# M, and the pivots of S = G M^-1 G^T decide which rows are independent. If a pivot exceeds INDEPENDENT, the part of its
+# row that is orthogonal to previous rows is at least 3e-9 of the row's norm: sqrt(INDEPENDENT * SIMILAR_EIGENVALUES).
+# For a dependent row, this part must be at most DEPENDENT of the row's norm
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # a redundant row is a combination of independent rows; an independent row is exchanged with it if its coefficient (rows
 # scaled to norm 1) exceeds this limit. Where a coefficient passes through zero, the independent rows become dependent,
@@ -351,9 +352,8 @@ def _fill_scaled_products(mass, G, factors, solved, S, sizes):
 def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
     """Set `is_kept` to 0 for each row that depends on previous rows, else to 1; return the largest 1 / pivot.
 
-    Return 0 if it is uncertain whether a row is dependent or independent.
-    For S and `sizes` see `_fill_scaled_products`. C[i, k] receives the coefficient of row k in a dependent row i, both
-    scaled to norm 1. U and `remainder` are scratch.
+    Return 0 if it is uncertain whether a row is dependent. For S and `sizes` see `_fill_scaled_products`. C[i, k]
+    receives the coefficient of row k in a dependent row i, both scaled to norm 1. U and `remainder` are scratch.
     """
     n_rows, largest_inverse = len(S), 1.0
     copy_matrix(S, U)

@@ -90,7 +90,7 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, base=None):
 
 
 def piece_ends(memory, c, t):
-    """Return the times after t, s, at which the pieces of the polynomial in `memory` end.
+    """Return the times (s) after t at which the pieces of the polynomial in `memory` end.
 
     Pieces end at END, at evaluated nodes next to a node that is left out, and at evaluated nodes where the piece would
     otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
@@ -122,7 +122,7 @@ def _estimate_error(tolerances, h, state, legendre, a, n_kept):
     """Return the error of a step, in units of the tolerances, estimated from the last Legendre coefficients.
 
     They are coefficients of the accelerations a (S, n), and estimate the error as in collocation_code.py. `n_kept`:
-    number of nodes that are not left out; coefficients of degrees from `n_kept` on are rounding errors.
+    number of nodes that are not left out; coefficients of degree `n_kept` or higher are rounding errors.
     """
     n, largest = a.shape[1], 0.0
     for m in range(n):

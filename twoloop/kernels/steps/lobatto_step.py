@@ -68,7 +68,8 @@ MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accep
 LEAST_TREND = 0.4  # lower bound of the trend, the ratio of step sizes that the error allows in successive steps
 # ratio of the step sizes that the convergence allows with and without repeated evaluation at new velocities
 GAIN_BY_REPEATS = 1.5
-# the repetition ends if the convergence allows steps this many times as long as the error does: then it saves no time
+# sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
+# the error does: the second evaluation then saves no time
 MAX_REACH = 2.5
 MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
 _array_offsets = merged(array_offsets)

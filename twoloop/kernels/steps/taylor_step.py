@@ -1,7 +1,7 @@
 """Step by the Taylor series of the motion, computed from the index-3 equations themselves.
 
-With G = [C_q; A] the motion satisfies G v + G_t = 0 and M a + G^T lam = Q. The coefficients of order k of a and lam,
-and of order k + 1 of v, follow from all lower ones: they solve
+With G = [C_q; A] the motion satisfies G v + (C_t, b) = 0 and M a + G^T lam = Q. The coefficients of order k of a and
+lam, and of order k + 1 of v, follow from all lower ones: they solve
 
     M_0 a_k + G_0^T lam_k = r_k,    G_0 a_k = c_k,
 
