@@ -99,8 +99,8 @@ def test_fast_rotation_takes_few_sweeps():
     """Velocities limit the convergence, so that each sweep evaluates accelerations twice; else there are 446 sweeps."""
     system = free(lambda t, q, v: np.array([60.0 * v[1] - q[0], -60.0 * v[0] - q[1]]), 2)
     exact = end(system, 2.0, [1.0, 0.5], [0.0, 3.0], method="DOP853", rtol=1e-12, atol=1e-12)
-    found = end(system, 2.0, [1.0, 0.5], [0.0, 3.0], method="Lobatto16", rtol=1e-5, atol=1e-5)
-    assert found.stats.n_outer < 340 and np.abs(found.q[:, -1] - exact.q[:, -1]).max() < 1e-5
+    result = end(system, 2.0, [1.0, 0.5], [0.0, 3.0], method="Lobatto16", rtol=1e-5, atol=1e-5)
+    assert result.stats.n_outer < 340 and np.abs(result.q[:, -1] - exact.q[:, -1]).max() < 1e-5
 
 
 @pytest.mark.parametrize("step_size", [0.05, 0.5])

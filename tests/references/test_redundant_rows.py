@@ -22,7 +22,7 @@ def test_motion_and_multipliers_of_all_rows_are_those_of_the_reference(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["DOP853, projected", "IDA from C, stabilised"])  # IDA: numpy reuses arrays above 1 kB
+@pytest.mark.parametrize("name", ["DOP853, projected", "IDA from C, stabilised"])  # 238 unknowns: numpy frees arrays
 def test_rows_that_are_redundant_by_geometry_are_found_at_the_start(name):
     problem = bricard()
     assert len(independent_rows(problem.system.jacobian(0.0, problem.q0))) == 59

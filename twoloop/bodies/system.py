@@ -158,8 +158,9 @@ def system_of(
             in_python.loaded = LoadedFriction(callbacks, tables, in_python.redundant(*start))
         options |= {kind: in_python.callback(kind) for kind in kinds}
         return ConstrainedSystem.from_python(**options)
-    kinds += ["kinematics"] if tables.n_rows else []
-    if n_q >= LARGE and tables.n_rows:
+    if n_q < LARGE and tables.n_rows:
+        kinds.append("kinematics")  # fills a full matrix
+    elif tables.n_rows:
         entries = entries_of(dimension, tables)
         if any(force.kind in ROTORS for force in tables.forces):
             del entries["mass"]  # rotors couple bodies

@@ -182,7 +182,6 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
 NEAR = 1e-3  # displacement from the start, relative to the coordinates, at which no symmetry hides terms
 # allowed difference of the values of C from two callbacks, in rounding errors of its terms, in addition to SAME
 ROUNDED = 100.0
-MAX_FULL_ENTRIES = 10_000_000  # largest number of entries of a full C_q: systems with more run in the fixed-order form
 MAX_ENTRIES = 1_000_000  # largest number of entries of Jacobians that are evaluated together
 ROUNDING = 1e-12  # rounding error of a difference quotient, relative to (largest entry) / displacement
 
@@ -195,7 +194,7 @@ def run_inconsistency(
     The run begins at (t0, q0). Most values are equal bit for bit, which is fast to check.
     """
     before = _mass_at(system, t0, q0).tobytes() if system.constant_mass else b""
-    kit = system.kit if _is_kinematics_compared(system) else None
+    kit = system.kit if "kinematics" in system.given else None
     for t, q, v in states:
         if not system.constant_mass:
             wrong = unsymmetric_mass(system, t, q)
@@ -214,7 +213,7 @@ def run_inconsistency(
 
 def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     """Describe where `kinematics` differs from the separate callbacks, which other checks compare with differences."""
-    if not _is_kinematics_compared(system):
+    if "kinematics" not in system.given:
         return None
     _, rate, rows = _compared(system, system.kit, t, q, 0.0 * q)
     entries = system.sparse_rows(t, q)  # because for large systems units of full matrices take seconds
@@ -241,11 +240,6 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
                     f"{here} and {there} (near t = {t:.10g}). Correct it, or leave it out"
                 )
     return None
-
-
-def _is_kinematics_compared(system: ConstrainedSystem) -> bool:
-    """Return whether `kinematics` is given and may be called: it fills a full C_q, and not in the fixed-order form."""
-    return "kinematics" in system.given and system.n_c * system.n_q <= MAX_FULL_ENTRIES
 
 
 def _compared(system: ConstrainedSystem, kit: Kit, t: float, q: Array, v: Array) -> tuple[bool, Array, Array]:
