@@ -161,17 +161,6 @@ def put_row(q, v, p, w, results, k, C, Cq, Qd, first, c_i, c_j):
         Qd[row] = bend - total
 
 
-@merged
-def put_rate(q, p, w, results, k, Ct):
-    """Evaluate C_t of row k of the table of joints; it is nonzero only for drives."""
-    kind, row, i, at_i, j, at_j, _, first_result = joint_at(p, k)
-    if first_result >= 0 and kind == layout.ANGLE_DRIVE:
-        _, rate, _ = driven_direction(p, at_i, results, first_result)
-        Ct[row] = dot(vector(q, w, i, rate), vector(q, w, j, numbers(p, w, at_j)))
-    elif first_result >= 0 and kind != layout.RATE_FUNCTION:
-        Ct[row] = -results[first_result + 1]  # zero for ROW_FUNCTION rows
-
-
 @helper
 def fill_rows(q, v, p, results, C, Cq, Ct, Qd):
     """Evaluate C, C_q, C_t and gamma, except arrays that are None; `results`: results of the program of motions."""
@@ -188,10 +177,14 @@ def fill_rows(q, v, p, results, C, Cq, Ct, Qd):
             if Qd is not None:
                 Qd[body] = -speed
     for k in joint_places(p):
-        _, row, i, _, j, _, _, _ = joint_at(p, k)
+        kind, row, i, at_i, j, at_j, _, first_result = joint_at(p, k)
         put_row(q, v, p, w, results, k, C, Cq, Qd, row, w * i, w * j)
-        if Ct is not None:
-            put_rate(q, p, w, results, k, Ct)
+        if Ct is not None:  # nonzero only for drives
+            if first_result >= 0 and kind == layout.ANGLE_DRIVE:
+                _, rate, _ = driven_direction(p, at_i, results, first_result)
+                Ct[row] = dot(vector(q, w, i, rate), vector(q, w, j, numbers(p, w, at_j)))
+            elif first_result >= 0 and kind != layout.RATE_FUNCTION:
+                Ct[row] = -results[first_result + 1]  # zero for ROW_FUNCTION rows
 
 
 @helper

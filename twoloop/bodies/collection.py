@@ -98,7 +98,7 @@ class Collection:
         self.gravity = check_vector("gravity", gravity, self.dimension)
         self.name = check_text("name", name)
         zero = np.zeros(self.dimension)
-        self.ground = Body("ground", NONE, zero, self._no_rotation(), np.zeros(0))
+        self.ground = Body("ground", NONE, zero, 0.0 if self.dimension == 2 else np.eye(3), np.zeros(0))
         self.bodies: list[Body] = []
         self.joints: list[ModelJoint] = []
         self.forces: list[Force] = []
@@ -112,10 +112,6 @@ class Collection:
             f"{type(self).__name__}({self.name!r}: {len(self.bodies)} bodies, {len(self.joints)} joints and drives, "
             f"{len(self.forces)} forces)"
         )
-
-    def _no_rotation(self) -> Any:
-        """Return the angle or the rotation matrix of the ground."""
-        raise NotImplementedError
 
     def _new_name(self, what: str, name: str | None, *bodies: Body) -> str:
         """Return a unique name: the one given, or one made of the kind and the bodies."""

@@ -11,6 +11,7 @@ import numpy as np
 from twoloop.bodies.collection import Collection
 from twoloop.bodies.frames import angle_of, point_of, vector_of
 from twoloop.bodies.parts import ModelJoint, Numbers
+from twoloop.bodies.rotation import euler_parameters
 from twoloop.bodies.rotation_rates import Components, euler_product, parameters_of, rate_of_vector, spin_of
 from twoloop.checks.arguments import Array, shown
 
@@ -283,7 +284,8 @@ class Coordinates(Collection):
 
     def _start(self) -> Array:
         """Return the coordinates in the position given, (n_q,)."""
-        raise NotImplementedError
+        turned = np.atleast_1d if self.dimension == 2 else euler_parameters
+        return np.concatenate([[*body.position, *turned(body.rotation)] for body in self.bodies])
 
 
 def which_of(joint: ModelJoint, which: Any) -> str:

@@ -269,10 +269,6 @@ def _ellipsoid(size: Array) -> tuple[float, Array]:
     return 4.0 / 3.0 * np.pi * float(np.sqrt(squares.prod())), (squares.sum() - squares) / 5.0
 
 
-def _sphere(size: Array) -> tuple[float, Array]:
-    return _ellipsoid(np.full(3, size[0]))
-
-
 def _box(size: Array) -> tuple[float, Array]:
     squares = size[:3] ** 2
     return 8.0 * float(size[:3].prod()), (squares.sum() - squares) / 3.0
@@ -336,7 +332,13 @@ _SURFACES = {
     "cylinder": _cylinder_surface,
     "box": _box_surface,
 }
-_VOLUMES = {"sphere": _sphere, "capsule": _capsule, "cylinder": _cylinder, "box": _box, "ellipsoid": _ellipsoid}
+_VOLUMES = {
+    "sphere": lambda size: _ellipsoid(size[:1]),
+    "capsule": _capsule,
+    "cylinder": _cylinder,
+    "box": _box,
+    "ellipsoid": _ellipsoid,
+}
 
 
 SAME = 1e-9  # tolerance of directions, and of positions in m
@@ -447,38 +449,29 @@ def place(part: Part) -> None:
         part.velocity += part.parent.velocity + np.cross(part.parent.spin, start.x - part.parent.start.x)
 
 
-def add_part(model: Any, part: Part) -> ModelJoint | None:
-    """Add the body of a part and its joint to a model; return the joint, or None if the body is free."""
+def add_part(model: Any, part: Part) -> None:
+    """Add to a model the body of a part and the joint that is equivalent to its joints; a free body has none."""
     place(part)
     assert part.start is not None
-    lump = combined(part.lumps)
-    R = part.start.R
+    lump, R = combined(part.lumps), part.start.R
+    if not (part.massless or lump.mass > 0.0):
+        raise ValueError(f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume")
+    centre = part.freed[0].start_at if part.massless else start_point(part, lump.centre)
     motion: dict[str, Any] = {}
+    if part.moves:
+        motion = {"velocity": part.velocity + np.cross(part.spin, centre - part.start.x), "angular_velocity": part.spin}
     if part.massless:
-        centre = part.freed[0].start_at
-        if part.moves:
-            motion = {"velocity": part.velocity + np.cross(part.spin, centre - part.start.x)}
-            motion["angular_velocity"] = part.spin
         part.body = Body(part.name, len(model.bodies), centre, R, np.zeros(7), **motion)
         model.bodies.append(part.body)
     else:
-        if not lump.mass > 0.0:
-            raise ValueError(
-                f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume"
-            )
-        centre = start_point(part, lump.centre)
-        if part.moves:
-            motion = {"velocity": part.velocity + np.cross(part.spin, centre - part.start.x)}
-            motion["angular_velocity"] = part.spin
         J = part.pose.R.T @ lump.J @ part.pose.R
         part.body = model.body(part.name, mass=lump.mass, inertia=J, position=centre, rotation=R, **motion)
-    joint = add_joints(model, body_of(model, part.parent), part.body, part.freed)
+    joint = _add_joint(model, body_of(model, part.parent), part.body, part.freed)
     for freed in part.freed:
         freed.joint = joint
-    return joint
 
 
-def add_joints(model: Any, parent: Body, child: Body, freed: list[FileJoint]) -> ModelJoint | None:
+def _add_joint(model: Any, parent: Body, child: Body, freed: list[FileJoint]) -> ModelJoint | None:
     """Add the joint equivalent to several joints of a file; return it, or None if the body is free."""
     kind, name, first = counterpart(freed), freed[0].name, freed[0]
     if kind == "free":
@@ -503,7 +496,7 @@ def counterpart(freed: list[FileJoint]) -> str:
     if kinds == ["ball", "slide", "slide", "slide"]:
         return "free"
     hinges, slides = ([each for each in freed if each.kind == kind] for kind in ("hinge", "slide"))
-    if kinds == ["hinge", "slide"] and _parallel(hinges[0], slides[0]):
+    if kinds == ["hinge", "slide"] and np.abs(np.cross(hinges[0].axis, slides[0].axis)).max() < SAME:
         return "cylindrical"
     if kinds == ["hinge", "hinge"] and _across(*hinges) and np.abs(hinges[0].at - hinges[1].at).max() < SAME:
         return "universal"
@@ -517,10 +510,6 @@ def check_slides(body: str, freed: list[FileJoint]) -> None:
     slid = np.array([each.axis for each in freed if each.kind == "slide"])
     if len(slid) > 1 and (len(slid) > 3 or np.linalg.svd(slid, compute_uv=False)[-1] < SAME):
         raise ValueError(f"the slides of the body {body!r} must have axes that do not follow from one another")
-
-
-def _parallel(a: FileJoint, b: FileJoint) -> bool:
-    return float(np.abs(np.cross(a.axis, b.axis)).max()) < SAME
 
 
 def _across(a: FileJoint, b: FileJoint) -> bool:

@@ -34,11 +34,6 @@ def angle_of(q: Any, body: int) -> Any:
     return 0.0 if body == GROUND else q[3 * body + 2]
 
 
-def on_grid(q: Array, components: list[Any]) -> Array:
-    """Stack components to an array (2 or 3,), or (2 or 3, n_t) if q is (n_q, n_t)."""
-    return np.stack([np.broadcast_to(x, q.shape[1:]) for x in components])
-
-
 @dataclass(frozen=True, eq=False)
 class LinearPoints:
     """Evaluate points that are linear in the coordinates.
@@ -74,4 +69,5 @@ class BodyPoints:
 
     def __call__(self, q: Array) -> Any:
         """Return the points at q (n_q,) or (n_q, n_t)."""
-        return np.stack([on_grid(q, point_of(q, *each)) for each in zip(self.bodies, self.points, strict=True)])
+        points = [point_of(q, *each) for each in zip(self.bodies, self.points, strict=True)]
+        return np.array([[np.broadcast_to(x, q.shape[1:]) for x in point] for point in points])

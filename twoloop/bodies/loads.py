@@ -33,9 +33,59 @@ from twoloop.problem.description import Stop
 Row = Callable[[Any], Any]  # of the coordinates; zero where the constraint holds
 
 
+def _spring_function(name: str, f: Any, stiffness: Any, more: Any) -> SpringFunction | None:
+    """Return the force or torque of a spring as a function, or None if the spring has a stiffness."""
+    if (f is None) == (stiffness is None) or (f is not None and more):
+        raise TypeError(
+            f"give either stiffness, with damping and what is unstressed, or a function in the place of all of them: "
+            f"given {name} = {shown(f)}, stiffness={shown(stiffness)}"
+        )
+    return None if f is None else spring_function(name, f)
+
+
+def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
+    """Return stiffness, damping and unstressed length or angle of a spring in a joint, with their units."""
+    checks = check_not_negative, check_not_negative, check_finite
+    values = tuple(check(what, value) for check, (what, (value, _)) in zip(checks, given.items(), strict=True))
+    return Numbers(values, tuple(f"{what} of {name} ({unit})" for what, (_, unit) in given.items()))
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneGap:
+    """Measure the distance of a point of one body from a plane of another, or its displacement along it, m."""
+
+    body: Body
+    place: Array
+    other: Body
+    foot: Array
+    normal: Array
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """Return the distance, for numbers or symbols."""
+        plane = self.other.number
+        point, foot = point_of(q, self.body.number, self.place), point_of(q, plane, self.foot)
+        return sum(n * (x - y) for n, x, y in zip(vector_of(q, plane, self.normal), point, foot, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class CoordinateGap:
+    """Measure the angle or displacement between a joint and its limit, rad or m."""
+
+    coordinate: JointCoordinate
+    limit: float
+    sign: float
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """Return what remains, for numbers or symbols."""
+        return self.sign * (self.coordinate.position(q) - self.limit)
+
+
 @documented
 class Loads(Coordinates):
-    """Adds springs, forces, motors and drives to a model."""
+    """Adds springs, forces, motors, drives, stops, gears and racks to a model.
+
+    Constants of gears and racks are not parameters of the model.
+    """
 
     def _turn_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         """Return the row by which the angle of a hinge is a motion."""
@@ -409,58 +459,6 @@ class Loads(Coordinates):
         row = self._drive_row(slide, motion_function(f"motion of {name!r}", motion, rate, acceleration))
         return add(self.joints, ModelJoint(name, "drive", self.ground, on, (row,), slide.point_a, slide.point_b))
 
-
-def _spring_function(name: str, f: Any, stiffness: Any, more: Any) -> SpringFunction | None:
-    """Return the force or torque of a spring as a function, or None if the spring has a stiffness."""
-    if (f is None) == (stiffness is None) or (f is not None and more):
-        raise TypeError(
-            f"give either stiffness, with damping and what is unstressed, or a function in the place of all of them: "
-            f"given {name} = {shown(f)}, stiffness={shown(stiffness)}"
-        )
-    return None if f is None else spring_function(name, f)
-
-
-def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
-    """Return stiffness, damping and unstressed length or angle of a spring in a joint, with their units."""
-    checks = check_not_negative, check_not_negative, check_finite
-    values = tuple(check(what, value) for check, (what, (value, _)) in zip(checks, given.items(), strict=True))
-    return Numbers(values, tuple(f"{what} of {name} ({unit})" for what, (_, unit) in given.items()))
-
-
-@dataclass(frozen=True, eq=False)
-class PlaneGap:
-    """Measure the distance of a point of one body from a plane of another, or its displacement along it, m."""
-
-    body: Body
-    place: Array
-    other: Body
-    foot: Array
-    normal: Array
-
-    def __call__(self, t: Any, q: Any) -> Any:
-        """Return the distance, for numbers or symbols."""
-        plane = self.other.number
-        point, foot = point_of(q, self.body.number, self.place), point_of(q, plane, self.foot)
-        return sum(n * (x - y) for n, x, y in zip(vector_of(q, plane, self.normal), point, foot, strict=True))
-
-
-@dataclass(frozen=True, eq=False)
-class CoordinateGap:
-    """Measure the angle or displacement between a joint and its limit, rad or m."""
-
-    coordinate: JointCoordinate
-    limit: float
-    sign: float
-
-    def __call__(self, t: Any, q: Any) -> Any:
-        """Return what remains, for numbers or symbols."""
-        return self.sign * (self.coordinate.position(q) - self.limit)
-
-
-@documented
-class Stops(Loads):
-    """Adds stops to a model, for `twoloop.solve_with_stops`."""
-
     def stop(
         self,
         body: Body | str,
@@ -563,11 +561,6 @@ class Stops(Loads):
         axis = self._axis(joint)
         if axis is not None and axis.names:
             self.taken.append(axis)
-
-
-@documented
-class Gears(Stops):
-    """Adds gears and racks to a model. Their constants are not parameters of the model."""
 
     def gear(
         self, one: ModelJoint | str, other: ModelJoint | str, *, ratio: float, name: str | None = None

@@ -20,6 +20,7 @@ from twoloop.bodies.functions import motion_function
 from twoloop.bodies.joint_state import Request
 from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
 from twoloop.bodies.ropes import Ropes
+from twoloop.bodies.rotation import euler_rates
 from twoloop.bodies.spanning_tree import SpanningTree
 from twoloop.bodies.system import check_forces, check_loads, joints_of, system_of
 from twoloop.bodies.tables import Tables
@@ -428,7 +429,8 @@ class Model(Ropes):
 
     def _tables(self, joints: Sequence[ModelJoint], values: Mapping[str, float] | None) -> Tables:
         """Return the tables of the model restricted to some joints, with other parameter values."""
-        tables = Tables(self.gravity, self.bodies, joints, self.forces, self._first_row())
+        first_row = len(self.bodies) if self.dimension == 3 else 0  # in space, rows e.e = 1 of the bodies come first
+        tables = Tables(self.gravity, self.bodies, joints, self.forces, first_row)
         tables.replaced(values or {})
         return tables
 
@@ -452,10 +454,6 @@ class Model(Ropes):
         copied.limits = list(self.limits)
         return copied
 
-    def _first_row(self) -> int:
-        """Return the number of rows before the first row of a joint."""
-        return 0
-
     def _check_inertias(self, tables: Tables) -> None:
         for body in self.bodies:
             place = tables.places[f"mass of {body.name} (kg)"]
@@ -477,13 +475,10 @@ class Model(Ropes):
             if body.velocity is not None:
                 row[: self.dimension] = body.velocity
             if body.angular_velocity is not None:
-                row[self.dimension :] = self._turning_rates(state, body.angular_velocity)
+                spin = body.angular_velocity
+                row[self.dimension :] = spin if self.dimension == 2 else euler_rates(state[3:], spin)
         is_given = np.isfinite(given.ravel())
         return np.where(is_given, given.ravel(), 0.0), is_given
-
-    def _turning_rates(self, state: Array, spin: Array) -> Array:
-        """Return the rates of the rotational coordinates of a body with a given angular velocity."""
-        return spin
 
     def _tags(self, freedom: assembly.Freedom) -> tuple[str, ...]:
         closed = False

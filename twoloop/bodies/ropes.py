@@ -12,7 +12,7 @@ import numpy as np
 from twoloop.bodies.collection import add, documented
 from twoloop.bodies.frames import point_of
 from twoloop.bodies.functions import n_arguments
-from twoloop.bodies.loads import CoordinateGap, Gears, Row, function_rows
+from twoloop.bodies.loads import CoordinateGap, Loads, Row, function_rows
 from twoloop.bodies.parts import COINCIDE, Body, ModelJoint, Numbers
 from twoloop.bodies.rotation_rates import in_body_axes
 from twoloop.bodies.tendons import PrescribedTension, SpringTension, Tendon
@@ -21,7 +21,7 @@ from twoloop.problem.description import Stop
 
 
 @documented
-class Ropes(Gears):
+class Ropes(Loads):
     """Adds couplings of joints, curves and ropes to a model. Their constants are not parameters of the model."""
 
     def coupling(self, joints: Sequence[Any], function: Callable[..., Any], *, name: str | None = None) -> ModelJoint:

@@ -259,7 +259,9 @@ class SpanningTree:
         angle = 2.0 * float(np.arctan2(axis @ e, c)) if joint.kind != "prismatic" else 0.0
         slid = float(axis @ given.point)
         if joint.kind == "screw":  # the displacement gives the angle; the pose gives it only up to whole turns
-            start = float(self._screwed(joint))
+            # its displacement in the position given, where its angle is zero
+            a, b = joint.a.in_space(np.array(joint.point_a.values)), joint.b.in_space(np.array(joint.point_b.values))
+            start = float((joint.a.rotation @ axis) @ (b - a))
             angle += TURN * np.round(((slid - start) * TURN / joint.pitch - angle) / TURN)
             slid = start + angle * joint.pitch / TURN
         rotation = zero if joint.kind == "prismatic" else np.array(euler_product(_rotation(angle * axis), zero))
@@ -269,12 +271,6 @@ class SpanningTree:
             return np.array([angle, *slid_in_plane]), Pose(rotation, point)
         point = slid * axis if joint.kind != "revolute" else point
         return np.array([slid if each.which == "displacement" else angle for each in motions]), Pose(rotation, point)
-
-    def _screwed(self, joint: ModelJoint) -> float:
-        """Return the displacement of a screw in the position given, where its angle is zero."""
-        ends = (body.in_space(np.array(p.values)) for body, p in ((joint.a, joint.point_a), (joint.b, joint.point_b)))
-        a, b = ends
-        return float((joint.a.rotation @ joint.axes[0]) @ (b - a))
 
     def moved(self, state: TreeState, step: Array) -> TreeState:
         """Return the state after a change of the coordinates."""

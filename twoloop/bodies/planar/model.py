@@ -25,79 +25,7 @@ from twoloop.checks.arguments import Array, check_finite, check_positive, check_
 
 
 @documented
-class Couplings(Model):
-    """Adds couplings to a planar model. Their constants are not parameters of the model."""
-
-    def _gear_row(self, one: ModelJoint, other: ModelJoint, ratio: float) -> Row:
-        angles = self.joint_coordinate(other), self.joint_coordinate(one)
-        return lambda q: angles[0].position(q) - ratio * angles[1].position(q)
-
-    def _wound_row(self, pinion: ModelJoint, moved: Row, radius: float) -> Row:
-        angle = self.joint_coordinate(pinion)
-        return lambda q: moved(q) - radius * angle.position(q)
-
-    def rolling(
-        self, a: Body | str, wheel: Body | str, *, radius: float, axis: Any, name: str | None = None
-    ) -> ModelJoint:
-        """Let a wheel, whose centre of mass is its centre, roll without slipping on a line of a.
-
-        The reaction is that on a, or on the wheel if a is the ground.
-
-        Parameters
-        ----------
-        a, wheel : Body or str
-            In the position given, the line is `radius` to the right of the centre of the wheel, looking along the axis.
-        radius : float
-            m.
-        axis : array_like (2,) or BodyDirection
-            Direction of the line.
-        """
-        body_a, body_b, name, named = self._pair("rolling", a, wheel, name, None)
-        points = Numbers(named[0].values), Numbers(named[1].values)
-        if body_b is self.ground:
-            raise ValueError("wheel must be a body that moves; given the ground")
-        check_positive("radius", radius)
-        direction = self._direction("axis", axis, body_a)
-        head = name, "displacement", body_a.number, body_b.number
-        x, y = direction.tolist()
-        across, along = (Displacement(*head, axis, points[0].values, (0.0, 0.0)) for axis in ((-y, x), (x, y)))
-        turned = PlanarAngle(name, "angle", *head[2:], float(body_b.rotation - body_a.rotation))
-        rows = [across.position, lambda q: along.position(q) + radius * turned.position(q)]
-        joint = ModelJoint(name, "rolling", body_a, body_b, (), *points)
-        return self._coupled(name, "rolling", joint, rows, joint)
-
-    def skate(self, body: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
-        """Add a blade, or a thin wheel seen from above: its point moves only along an axis of the body (non-holonomic).
-
-        The reaction is the force on the body across the blade.
-
-        Parameters
-        ----------
-        body : Body or str
-        at : array_like (2,) or BodyPoint
-            The point, in space in the position given, m.
-        axis : array_like (2,) or BodyDirection
-            Direction of the blade, in space in the position given.
-        """
-        on = self._moving_body("body", body)
-        name = self._new_name("skate", name, on)
-        place, (x, y) = self._point("at", at, on), self._direction("axis", axis, on)
-
-        def across(q: Any, v: Any) -> Any:
-            (rx, ry), (nx, ny) = vector_of(q, on.number, place), vector_of(q, on.number, np.array([-y, x]))
-            u, w, spin = (v[j] for j in on.coordinates)
-            return nx * (u - spin * ry) + ny * (w + spin * rx)
-
-        columns = on.coordinates
-        places = listed(columns)
-        points = Numbers(tuple(on.in_space(place))), Numbers(tuple(place))
-        function = RateFunction(f"skate {name!r}", across, columns)
-        row = JointRow(RATE_FUNCTION, 1, self.ground, on, *points, places, function)
-        return add(self.joints, ModelJoint(name, "skate", self.ground, on, (row,), *points))
-
-
-@documented
-class PlanarModel(Couplings):
+class PlanarModel(Model):
     """A planar mechanism made of bodies, joints and forces.
 
     The coordinates are x, y of the centre of mass of each body and its angle, positive from x to y. Points and axes are
@@ -234,11 +162,75 @@ class PlanarModel(Couplings):
         )
         return add(self.joints, ModelJoint(name, "prismatic", body_a, body_b, rows, *points))
 
+    def rolling(
+        self, a: Body | str, wheel: Body | str, *, radius: float, axis: Any, name: str | None = None
+    ) -> ModelJoint:
+        """Let a wheel, whose centre of mass is its centre, roll without slipping on a line of a.
+
+        The reaction is that on a, or on the wheel if a is the ground.
+
+        Parameters
+        ----------
+        a, wheel : Body or str
+            In the position given, the line is `radius` to the right of the centre of the wheel, looking along the axis.
+        radius : float
+            m.
+        axis : array_like (2,) or BodyDirection
+            Direction of the line.
+        """
+        body_a, body_b, name, named = self._pair("rolling", a, wheel, name, None)
+        points = Numbers(named[0].values), Numbers(named[1].values)
+        if body_b is self.ground:
+            raise ValueError("wheel must be a body that moves; given the ground")
+        check_positive("radius", radius)
+        direction = self._direction("axis", axis, body_a)
+        head = name, "displacement", body_a.number, body_b.number
+        x, y = direction.tolist()
+        across, along = (Displacement(*head, axis, points[0].values, (0.0, 0.0)) for axis in ((-y, x), (x, y)))
+        turned = PlanarAngle(name, "angle", *head[2:], float(body_b.rotation - body_a.rotation))
+        rows = [across.position, lambda q: along.position(q) + radius * turned.position(q)]
+        joint = ModelJoint(name, "rolling", body_a, body_b, (), *points)
+        return self._coupled(name, "rolling", joint, rows, joint)
+
+    def skate(self, body: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """Add a blade, or a thin wheel seen from above: its point moves only along an axis of the body (non-holonomic).
+
+        The reaction is the force on the body across the blade.
+
+        Parameters
+        ----------
+        body : Body or str
+        at : array_like (2,) or BodyPoint
+            The point, in space in the position given, m.
+        axis : array_like (2,) or BodyDirection
+            Direction of the blade, in space in the position given.
+        """
+        on = self._moving_body("body", body)
+        name = self._new_name("skate", name, on)
+        place, (x, y) = self._point("at", at, on), self._direction("axis", axis, on)
+
+        def across(q: Any, v: Any) -> Any:
+            (rx, ry), (nx, ny) = vector_of(q, on.number, place), vector_of(q, on.number, np.array([-y, x]))
+            u, w, spin = (v[j] for j in on.coordinates)
+            return nx * (u - spin * ry) + ny * (w + spin * rx)
+
+        columns = on.coordinates
+        places = listed(columns)
+        points = Numbers(tuple(on.in_space(place))), Numbers(tuple(place))
+        function = RateFunction(f"skate {name!r}", across, columns)
+        row = JointRow(RATE_FUNCTION, 1, self.ground, on, *points, places, function)
+        return add(self.joints, ModelJoint(name, "skate", self.ground, on, (row,), *points))
+
+    def _gear_row(self, one: ModelJoint, other: ModelJoint, ratio: float) -> Row:
+        angles = self.joint_coordinate(other), self.joint_coordinate(one)
+        return lambda q: angles[0].position(q) - ratio * angles[1].position(q)
+
+    def _wound_row(self, pinion: ModelJoint, moved: Row, radius: float) -> Row:
+        angle = self.joint_coordinate(pinion)
+        return lambda q: moved(q) - radius * angle.position(q)
+
     def _weld(self, name: str, a: Body, b: Body, points: Points) -> tuple[JointRow, ...]:
         return _pin(a, b, *points), JointRow(ANGLE, 1, a, b, more=_turn(name, a, b, b.rotation - a.rotation))
-
-    def _no_rotation(self) -> float:
-        return 0.0
 
     def _turn_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         zero = Numbers((joint.b.rotation - joint.a.rotation,))
@@ -254,9 +246,6 @@ class PlanarModel(Couplings):
 
     def _check_moments(self, name: str, moments: Array) -> None:
         check_positive(f"moment of inertia of {name}", float(moments[0]))
-
-    def _start(self) -> Array:
-        return np.concatenate([np.append(body.position, body.rotation) for body in self.bodies])
 
 
 def _pin(a: Body, b: Body, on_a: Numbers, on_b: Numbers) -> JointRow:

@@ -20,7 +20,7 @@ from twoloop.bodies.parameter_layout import (
     TORSION_SPRING,
 )
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
-from twoloop.bodies.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
+from twoloop.bodies.rotation import euler_parameters, perpendiculars, rotation_matrix
 from twoloop.bodies.spatial.couplings import SpatialCouplings, relative
 from twoloop.bodies.tables import TENSOR
 from twoloop.checks.arguments import Array, check_finite, check_positive, check_real, check_vector, shown
@@ -353,9 +353,6 @@ class SpatialModel(SpatialCouplings):
         pairs = ((0, 1), (0, 2), (1, 2))
         return JointRow(POINT, 3, a, b, *points), *(across(a, np.eye(3)[i], b, axes_of_a[:, j]) for i, j in pairs)
 
-    def _no_rotation(self) -> Array:
-        return np.eye(3)
-
     def _turn_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         axis_a, axis_b = joint.axes
         first, second = perpendiculars(axis_a)
@@ -368,15 +365,6 @@ class SpatialModel(SpatialCouplings):
 
     def _check_moments(self, name: str, moments: Array) -> None:
         _moments(f"inertia of {name}", moments[TENSOR].reshape(3, 3))
-
-    def _first_row(self) -> int:
-        return len(self.bodies)
-
-    def _start(self) -> Array:
-        return np.concatenate([[*body.position, *euler_parameters(body.rotation)] for body in self.bodies])
-
-    def _turning_rates(self, state: Array, spin: Array) -> Array:
-        return euler_rates(state[3:], spin)
 
     def _check_branches(self, t: float, q: Array) -> None:
         super()._check_branches(t, q)
