@@ -184,8 +184,9 @@ class MujocoModel:
         for k, body in enumerate(self.bodies):
             q[k] = self._pose(data, k)
             self.mujoco.mj_jac(self.engine, data, translation, rotation, q[k, :3], body)
-            for dof in self._later_dofs(k):
-                translation[:, dof] = rotation[:, dof] = 0.0
+            if self.n_joints[k]:  # later joints of the body in MuJoCo do not move this massless body
+                later = (self.engine.dof_bodyid == body) & (self.engine.dof_jntid > self._joint(k))
+                translation[:, later] = rotation[:, later] = 0.0
             by_v[k, :3] = translation
             by_v[k, 3:] = np.array([euler_rates(q[k, 3:], column) for column in rotation.T]).T
         return q.reshape(-1), by_v.reshape(-1, nv)
@@ -210,12 +211,6 @@ class MujocoModel:
     def _joint(self, k: int) -> int:
         """Return the number in MuJoCo of the joint that a massless body has."""
         return int(self.engine.body_jntadr[self.bodies[k]]) + self.n_joints[k] - 1
-
-    def _later_dofs(self, k: int) -> list[int]:
-        """Return the velocities in MuJoCo of those joints of a body that do not move a massless body before it."""
-        engine = self.engine
-        own = engine.dof_bodyid == self.bodies[k]
-        return np.flatnonzero(own & (engine.dof_jntid > self._joint(k))).tolist() if self.n_joints[k] else []
 
     def compare(self, problem: ModelProblem, start: Array) -> None:
         """Raise ValueError if masses, forces, dampers or loops differ from the model of rigid joints.

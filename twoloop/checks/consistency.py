@@ -14,7 +14,7 @@ from twoloop.checks.arguments import Array
 from twoloop.checks.callbacks import UNSYMMETRIC, check_bounds, unsymmetric_mass
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.scales import EPS, NONE, Scales, defined, generic_factors, scales_of, signs
-from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
+from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.checks.structure import SINGULAR_MASS, mass_key, not_finite, pattern_of, shifts
 from twoloop.kernels.compile.linking import entry_point
 
@@ -256,7 +256,8 @@ def check_start(
         scales.keep(system, q0, full)
     if derivatives:
         check_derivatives(system, t0, q0, exact)
-    empty = np.flatnonzero(largest_in_rows(rows) == 0.0).tolist()
+    largest = rows.largest() if isinstance(rows, SparseRows) else np.abs(rows).max(axis=1, initial=0.0)
+    empty = np.flatnonzero(largest == 0.0).tolist()
     if empty:
         raise ValueError(
             f"row(s) {empty} of the constraint Jacobian of {system.name!r} are zero at t = {t0:g}: they hold nothing "

@@ -89,11 +89,6 @@ def is_finite(rows: Rows) -> bool:
     return bool(np.isfinite(rows.values if isinstance(rows, SparseRows) else rows).all())
 
 
-def largest_in_rows(rows: Rows) -> Array:
-    """Return the largest magnitude in each row."""
-    return rows.largest() if isinstance(rows, SparseRows) else np.abs(rows).max(axis=1, initial=0.0)
-
-
 def norms(rows: Rows) -> Array:
     """Return the norm of each row."""
     if isinstance(rows, SparseRows):

@@ -188,61 +188,39 @@ def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents, law: st
 
 
 class Modes:
-    """Provide the system of each contact mode; this base class has one system without friction, in a single mode."""
-
-    def __init__(self, system: ConstrainedSystem):
-        self.system, self.n_joints = system, 0
-        self.static_friction = self.kinetic_friction = np.zeros(0)
-        self.idle_friction: dict[int, float] = {}  # constant friction of IDLE joints
-
-    def gradients(self, q: Array, k: int | None = None) -> Array:
-        """Return the gradients of the joint displacements: none."""
-        return np.zeros((0, len(q)))
-
-    def sliding_system(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
-        """Return the system."""
-        return self.system
-
-    def joint_accelerations(self, signs: Signs, resting: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
-        """Return the accelerations of joints at rest: none."""
-        return np.zeros(0)
-
-    def mode_system(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
-        """Return the system; there are no rows of sticking joints."""
-        return self.system, {}
-
-    def row_sign(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
-        """Return 1 if the row of a sticking joint has the sense of its sliding direction, -1 if it is opposite."""
-        return float(np.sign(system.jacobian(t, q)[row] @ self.gradients(q, k)))
-
-
-class FrictionModes(Modes):
-    """Provide the systems of a model with dry friction in joints: each joint slides, with a sign, or sticks (0).
+    """Provide the system of each mode of a motion: each joint with dry friction slides, with a sign, or sticks (0).
 
     Parameters
     ----------
-    problem : ModelProblem
+    system : ConstrainedSystem
+    problem : ModelProblem, optional
+        Problem of the system, with dry friction in joints. None: there is none, and only one mode.
 
     Raises ValueError if a joint cannot slide independently of the other joints.
     """
 
-    def __init__(self, problem: ModelProblem):
-        assert problem.model is not None
-        super().__init__(problem.system)
-        self._problem, self._model, self._frictions = problem, problem.model, problem.model.dry
+    def __init__(self, system: ConstrainedSystem, problem: ModelProblem | None = None):
+        self.system, self._problem = system, problem
+        self._frictions = [] if problem is None or problem.model is None else problem.model.dry
         self._names = [friction.name for friction in self._frictions]
         self.n_joints = len(self._frictions)
         self.static_friction = np.array([friction.static for friction in self._frictions])
         self.kinetic_friction = np.array([friction.kinetic for friction in self._frictions])
-        self._forces = [self._model.pull(friction, problem.parameters) for friction in self._frictions]
+        self.idle_friction: dict[int, float] = {}  # constant friction of IDLE joints
         self._sliding_systems: dict[tuple[int | None, ...], ConstrainedSystem] = {}
-        self._check_independent(problem.t_span[0], problem.q0)
+        if problem is not None and problem.model is not None:
+            self._forces = [problem.model.pull(friction, problem.parameters) for friction in self._frictions]
+            self._check_independent(problem.t_span[0], problem.q0)
 
     def gradients(self, q: Array, k: int | None = None) -> Array:
         """Return the gradients of the joint displacements, (n, n_q); or of one joint, (n_q,)."""
         if k is None:
-            return np.array([self.gradients(q, joint) for joint in range(self.n_joints)])
+            return np.array([self.gradients(q, joint) for joint in range(self.n_joints)]).reshape(-1, len(q))
         return self._forces[k].force(0.0, q, np.zeros_like(q))
+
+    def row_sign(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
+        """Return 1 if the row of a sticking joint has the sense of its sliding direction, -1 if it is opposite."""
+        return float(np.sign(system.jacobian(t, q)[row] @ self.gradients(q, k)))
 
     def _check_independent(self, t: float, q: Array) -> None:
         """Raise unless each joint can slide while the others stick; otherwise their friction is not determined."""
@@ -262,9 +240,11 @@ class FrictionModes(Modes):
 
     def sliding_system(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
         """Return the system in which joints with a direction in `signs` slide, and the others have no friction."""
+        if not signs:
+            return self.system
         key = tuple(signs)
         if key not in self._sliding_systems:
-            self._sliding_systems[key] = self._build(self._problem.name, signs, {}, t, q)[0]
+            self._sliding_systems[key] = self._build("", signs, {}, t, q)[0]
         return self._sliding_systems[key]
 
     def joint_accelerations(self, signs: Signs, resting: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
@@ -281,25 +261,29 @@ class FrictionModes(Modes):
             return self.sliding_system(signs, t, q), {}
         names = [name for name, sign in zip(self._names, signs, strict=True) if sign == STICKS]
         # `gauge` has a row for each sticking joint, whose residual at t = 0 is the displacement of the joint
-        gauge, rows = self._build("gauge", signs, dict.fromkeys(names, np.nan), t, q)
+        gauge, rows = self._build(", gauge", signs, dict.fromkeys(names, np.nan), t, q)
         values, quarter = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi)) if names else ((), ())
         positions = {}
         for friction in self._frictions:
             if friction.name not in names:
                 continue
             (row,) = rows[friction.name]
-            is_revolute = self._model.dimension == 3 and friction.joint.kind == "revolute"  # row: A cos t + B sin t
+            is_revolute = (
+                len(friction.joint.a.position) == 3 and friction.joint.kind == "revolute"
+            )  # row: A cos t + B sin t
             positions[friction.name] = float(np.arctan2(-values[row], quarter[row]) if is_revolute else values[row])
         suffix = f", {', '.join(names)} sticks" if names else ""
-        system, rows = self._build(self._problem.name + suffix, signs, positions, t, q)
+        system, rows = self._build(suffix, signs, positions, t, q)
         return system, {k: rows[name][0] for k, name in enumerate(self._names) if name in names}
 
     def _build(
-        self, name: str, signs: Signs, positions: dict[str, float], t: float, q: Array
+        self, suffix: str, signs: Signs, positions: dict[str, float], t: float, q: Array
     ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
+        assert self._problem is not None and self._problem.model is not None
         forces = {name: -(signs[k] or 0) * self.kinetic_friction[k] for k, name in enumerate(self._names)}
         forces |= {self._names[k]: self.idle_friction[k] for k, sign in enumerate(signs) if sign is IDLE}
-        return self._model.mode(name, self._problem.parameters, forces, positions, t, q)
+        name = self._problem.name + suffix
+        return self._problem.model.mode(name, self._problem.parameters, forces, positions, t, q)
 
 
 class Mode(NamedTuple):

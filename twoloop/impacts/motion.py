@@ -28,7 +28,6 @@ from twoloop.impacts.friction import (
     NEGLIGIBLE_RATIO,
     REST_RATE,
     STICKS,
-    FrictionModes,
     Mode,
     Modes,
     Signs,
@@ -770,6 +769,6 @@ def solve_with_friction(
     options |= checked_options("solve_with_friction", options, method, rtol, atol, problem.system.n_q)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
     start = t0, problem.q0.copy(), problem.v0.copy()
-    return Motion(problem.stops, FrictionModes(problem), *start, options, check_law(law, problem.stops)).integrate(
-        t1, times
-    )
+    return Motion(
+        problem.stops, Modes(problem.system, problem), *start, options, check_law(law, problem.stops)
+    ).integrate(t1, times)

@@ -12,6 +12,7 @@ ground is body -1.
 
 import math
 from collections.abc import Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from twoloop.bodies.geometry import merged
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import LARGE, callbacks_in
-from twoloop.problem.description import Drawing, Joint, unused_name
+from twoloop.problem.description import Drawing, Joint
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
@@ -227,7 +228,8 @@ class PlanarBodies:
     ) -> int:
         first = 3 * body
         numbered = tuple(range(self.n_c, self.n_c + rows))
-        name = unused_name(name, self._named)
+        if name in self._named:
+            name = next(new for k in count(2) if (new := f"{name} {k}") not in self._named)
         self._named[name] = Joint(name, numbered, (first, first + 1), (first + 2,), point)
         self._joints.append([kind, float(self.n_c), *numbers])
         self.n_c += rows

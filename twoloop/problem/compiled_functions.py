@@ -83,12 +83,6 @@ class GeneratedEnergy:
         return self.code.value("energy")(t, np.asarray(q), np.asarray(v), self.parameters)
 
 
-def code_of(function: Any) -> GeneratedCode | None:
-    """Return the generated code from which a callback was compiled, or None."""
-    code = function.py_func.__globals__.get("GENERATED")
-    return code if isinstance(code, GeneratedCode) else None
-
-
 @cache
 def _functions(code: GeneratedCode) -> dict[str, Any]:
     path, text = _path(code.key), f"{_head(code.source)}\n{code.source}"
@@ -223,7 +217,7 @@ def by_name(module: str, name: str) -> Any:
 def portable(system_name: str, kind: str, function: Any) -> Any:
     """Return the object to pickle in place of a function; raise TypeError if pickle cannot find it by its name."""
     if isinstance(function, Dispatcher):
-        if (code := code_of(function)) is not None:
+        if isinstance(code := function.py_func.__globals__.get("GENERATED"), GeneratedCode):
             return PickledCall(GeneratedCode.callback, code, kind)
         path = function.py_func.__module__, function.py_func.__qualname__
         try:

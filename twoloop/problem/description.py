@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -216,11 +215,6 @@ class Joint:
             raise ValueError(f"in_space of the joint {self.name!r} needs a point, in the coordinates of space")
         if self.equations is not None:
             object.__setattr__(self, "equations", check_real(f"equations of {self.name!r}", self.equations))
-
-
-def unused_name(name: str, names: Container[str]) -> str:
-    """Return `name`, or if it is in `names`, the first new name with a number, such as "pin a-b 2"."""
-    return name if name not in names else next(new for k in count(2) if (new := f"{name} {k}") not in names)
 
 
 def check_joints(joints: object, n_q: int, n_rows: int) -> tuple[Joint, ...]:

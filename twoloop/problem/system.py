@@ -388,10 +388,6 @@ class ConstrainedSystem:
         """Return the plain Python functions by kind; empty if they are compiled."""
         return {} if self._python is None else self._python.functions
 
-    def parameters_for(self, kind: str) -> tuple[Array, ...]:
-        """Return the last arguments of a plain function, after its state: a copy of the parameters, or none."""
-        return (self.parameters.copy(),) if self.takes_parameters(kind) else ()
-
     def takes_parameters(self, kind: str) -> bool:
         """Return whether a plain function of a kind takes the parameters as its last argument."""
         return kind in self._taking
@@ -474,7 +470,8 @@ class ConstrainedSystem:
         for kind, function in self._returning.items():
             states = {"q": q, "v": v, "lam": np.ones(self.n_c)}
             arguments = [states[name].copy() for name in KINDS[kind].state]
-            store(kind, self.name, t, function(t, *arguments, *self.parameters_for(kind)), self.arrays_of(kind)[0])
+            arguments += [self.parameters.copy()] if self.takes_parameters(kind) else []
+            store(kind, self.name, t, function(t, *arguments), self.arrays_of(kind)[0])
 
     def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate C_q v + C_t and A v + b, (n_c + n_a,): zero for consistent velocities (eq. (4))."""

@@ -248,18 +248,14 @@ def read_rows(
     rows = {int(number): row for number, row in zip(table.index, table.to_dict("records"), strict=True)}
     for number, row in rows.items():
         run = parameters[number] if number < len(parameters) else None
-        if run is None or any(not _same(row.get(name), value) for name, value in run.items()):
+        pairs = [] if run is None else [(row.get(name), value) for name, value in run.items()]
+        if run is None or any(a != b and not (_is_nan(a) and _is_nan(b)) for a, b in pairs):
             in_file = {name: row.get(name) for name in parameters[0]}
             raise ValueError(
                 f"out, {str(path)!r}, holds other runs: {number} has {in_file}, "
                 f"{'not asked for' if run is None else run}. {advice}"
             )
     return rows
-
-
-def _same(saved: Any, value: Any) -> bool:
-    """Return True if a cell holds a value; NaN equals NaN here."""
-    return bool(saved == value or (saved != saved and value != value))
 
 
 def _in_words(value: Any) -> str:

@@ -267,7 +267,8 @@ def measure_properties(observed: Observation, settings: Settings) -> Iterator[Fi
     for kind in kinds:
         yield from (tolerance_findings if settings.tolerances else step_findings)(observed, settings, kind)
     if settings.tolerances and settings.tolerances[-1] < float(np.finfo(np.float32).eps):
-        single = is_single_precision(finest)
+        states = [array[1:] for array in (finest.q, finest.v) if array is not None]  # the start may be exact
+        single = all(np.array_equal(array, array.astype(np.float32)) for array in states)
         yield Finding(observed.problem.name, "precision", "single" if single else "double", "double", not single)
     yield from constraint_findings(observed, settings)
     if finest.v is not None:
@@ -300,12 +301,6 @@ def tolerance_findings(observed: Observation, settings: Settings, kind: str) -> 
 def ignores_last_setting(observed: Observation) -> bool:
     """Return True if the last two settings give the same numbers."""
     return len(observed.runs) > 1 and np.array_equal(observed.runs[-2].q, observed.runs[-1].q)
-
-
-def is_single_precision(run: SimulatorRun) -> bool:
-    """Return True if all states after the start are numbers of single precision."""
-    arrays = [array[1:] for array in (run.q, run.v) if array is not None]
-    return all(np.array_equal(array, array.astype(np.float32)) for array in arrays)
 
 
 def step_findings(observed: Observation, settings: Settings, kind: str) -> Iterator[Finding]:
