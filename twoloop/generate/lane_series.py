@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from twoloop.generate.elimination import FactorAndSolvePrograms
 from twoloop.generate.llvm_code import FUNCTIONS, INTRINSICS, Emitter, Quantities, lower_program, sine_and_cosine
-from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Builder, Value, integer, undefined, vector_of
+from twoloop.generate.llvm_text import INTEGER, Builder, Value, integer, undefined
 from twoloop.generate.program import Coefficient, Coefficients, Terms
 from twoloop.generate.series import OperationGroups, SeriesProgram, Sums
 from twoloop.kernels.data.collocation import LANES as STAGES
@@ -37,29 +37,12 @@ MAX_EXPONENT, MIN_ARGUMENT = 1000.0, 1e-300  # limits that prevent overflow: of 
 
 
 class LaneEmitter(Emitter):
-    """Emitter of operations on vectors with one number for each lane; array indices count vectors."""
+    """Emitter of operations on vectors with one number for each lane, with functions and coefficients of lanes."""
 
     constants: Value  # pointer to the coefficients that have the same value in all lanes
 
     def __init__(self, builder: Builder, lanes: int = LANES):
-        super().__init__(builder)
-        self.lanes, self.suffix = lanes, f"v{lanes}f64" if lanes > 1 else Emitter.suffix
-        self.double_type, self.integer_type, self.bit_type = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
-
-    def copy_for_builder(self, builder: Builder) -> "LaneEmitter":
-        """Return an emitter with the same number of lanes that writes to the function of `builder`."""
-        return LaneEmitter(builder, self.lanes)
-
-    def broadcast(self, value: Value) -> Value:
-        """Return a vector with the number `value` in all lanes."""
-        if self.lanes == 1:
-            return value
-        vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)
-        return self.builder.broadcast_first(vector)
-
-    def load_constant(self, value: float) -> Value:
-        """Return a vector with the number `value` in all lanes, loaded from memory just before its use."""
-        return self.broadcast(super().load_constant(value))
+        super().__init__(builder, lanes)
 
     def coefficient(self, number: float) -> Value:
         """Return a literal, or a Coefficient loaded from memory: one number for all lanes, unless it varies."""
@@ -67,26 +50,6 @@ class LaneEmitter(Emitter):
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
         return self.broadcast(self.builder.load(pointer, constant=True))
-
-    def to_double(self, whole: Value) -> Value:
-        """Return a vector with the integer `whole`, converted to double, in all lanes."""
-        return self.broadcast(super().to_double(whole))
-
-    def pointer(self, base: Value, *indices: Value | int) -> Value:
-        """Return the pointer `base` advanced by the sum of `indices`, counted in vectors."""
-        for index in indices:
-            offset = integer(index * self.lanes) if isinstance(index, int) else index * self.lanes
-            base = self.builder.advance(base, offset)
-        return base
-
-    def load(self, base: Value, index: int = 0, constant: bool = False) -> Value:
-        """Return the vector with the index `index` of the array at `base`, loaded from memory."""
-        pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{self.double_type}*")
-        return self.builder.load(pointer, constant=constant)
-
-    def store(self, value: Value, base: Value, index: int = 0) -> None:
-        """Store `value` as the vector with the index `index` of the array at `base`."""
-        self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, index), f"{self.double_type}*"))
 
     def function(self, name: str, x: Value) -> Value:
         """Return f(x) in each lane, by one LLVM intrinsic for all lanes, or by a function of libm lane by lane."""

@@ -10,7 +10,7 @@ The code reads coefficients from memory: it can be used for all mechanisms with 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 from twoloop.generate.graph import Affine, Graph
 from twoloop.generate.llvm_text import (
@@ -46,19 +46,26 @@ INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqr
 class Emitter:
     """Emitter that appends operations on doubles to an LLVM function, and returns the values of their results.
 
-    Array indices count doubles. `numbers` points to the coefficients that the code reads.
+    If `lanes` is more than 1, numbers are vectors with one number for each lane. Array indices count numbers, or these
+    vectors. `numbers` points to the coefficients that the code reads.
     """
 
-    double_type, integer_type, bit_type = DOUBLE, INTEGER, BIT
-    suffix = "f64"  # last part of the names of LLVM intrinsics: the type of their arguments
-
-    def __init__(self, builder: Builder):
-        self.builder = builder
+    def __init__(self, builder: Builder, lanes: int = 1):
+        self.builder, self.lanes = builder, lanes
         self.numbers: Any = None
+        self.double_type, self.integer_type, self.bit_type = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
+        # last part of the names of LLVM intrinsics: the type of their arguments
+        self.suffix = f"v{lanes}f64" if lanes > 1 else "f64"
 
-    def copy_for_builder(self, builder: Builder) -> "Emitter":
-        """Return an emitter of the same class that writes to the function of `builder`."""
-        return type(self)(builder)
+    def copy_for_builder(self, builder: Builder) -> Self:
+        """Return an emitter of the same class, for as many lanes, that writes to the function of `builder`."""
+        return type(self)(builder, self.lanes)
+
+    def broadcast(self, value: Value) -> Value:
+        """Return a vector with the number `value` in all lanes; for a single lane, return the number."""
+        if self.lanes == 1:
+            return value
+        return self.builder.broadcast_first(self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0))
 
     def constant(self, value: float) -> Value:
         """Return a literal number."""
@@ -66,7 +73,7 @@ class Emitter:
 
     def load_constant(self, value: float) -> Value:
         """Return a number that is loaded from memory just before its use, see `Builder.load_constant`."""
-        return self.builder.load_constant(value)
+        return self.broadcast(self.builder.load_constant(value))
 
     def integer_constant(self, value: int) -> Value:
         """Return a literal integer of 64 bits; in lanes, a vector of equal integers."""
@@ -111,8 +118,8 @@ class Emitter:
         return self.coefficient(factor) * a
 
     def to_double(self, whole: Value) -> Value:
-        """Return the integer `whole` converted to a double."""
-        return self.builder.convert("sitofp", whole, DOUBLE)
+        """Return the integer `whole` converted to a double, in all lanes."""
+        return self.broadcast(self.builder.convert("sitofp", whole, DOUBLE))
 
     def function(self, name: str, x: Value) -> Value:
         """Return the value at x of the function `name`, computed by its LLVM intrinsic if it has one, else by libm."""
@@ -120,18 +127,26 @@ class Emitter:
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
     def pointer(self, base: Value, *indices: Value | int) -> Value:
-        """Return the pointer `base` advanced by the sum of `indices`, counted in doubles."""
+        """Return the pointer `base` advanced by the sum of `indices`."""
         for index in indices:
-            base = self.builder.advance(base, integer(index) if isinstance(index, int) else index)
+            if isinstance(index, int):
+                index = integer(index * self.lanes)
+            elif self.lanes > 1:
+                index = index * self.lanes
+            base = self.builder.advance(base, index)
         return base
+
+    def _entry_pointer(self, base: Value, index: int) -> Value:
+        pointer = self.pointer(base, index)
+        return pointer if self.lanes == 1 else self.builder.convert("bitcast", pointer, f"{self.double_type}*")
 
     def load(self, base: Value, index: int = 0, constant: bool = False) -> Value:
         """Return base[index], loaded from memory; `constant`: this number does not change during a call."""
-        return self.builder.load(self.pointer(base, index), constant=constant)
+        return self.builder.load(self._entry_pointer(base, index), constant=constant)
 
     def store(self, value: Value, base: Value, index: int = 0) -> None:
         """Store a number in base[index]."""
-        self.builder.store(value, self.pointer(base, index))
+        self.builder.store(value, self._entry_pointer(base, index))
 
     def load_vector(self, base: Value, index: int, width: int) -> Value:
         """Return the vector that begins at base[index]; this address must be aligned to the size of the vector.
