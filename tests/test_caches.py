@@ -335,7 +335,7 @@ def test_generated_source_that_others_can_write_is_not_run(tmp_path, monkeypatch
     generated = pytest.importorskip("twoloop.problem.compiled_functions")
     monkeypatch.setattr(generated, "sources_folder", lambda: tmp_path)
     code = generated.GeneratedCode("key", "def energy(t, q, v, p):\n    return 0.0\n")
-    generated._write(tmp_path / "equations_key.py", f"{generated._head(code.source)}\n{code.source}")
+    generated.replace_trusted(tmp_path / "equations_key.py", f"{generated._head(code.source)}\n{code.source}".encode())
     assert generated.GeneratedCode.stored("key") == code
     (tmp_path / "equations_key.py").chmod(0o646)
     assert generated.GeneratedCode.stored("key") is None

@@ -61,10 +61,16 @@ def read_trusted(path: Path) -> bytes:
         return file.read()
 
 
-def write_trusted(path: Path, content: bytes) -> None:
-    """Write `content` to a new file; no other user can write this file, whatever the umask."""
-    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as file:
-        file.write(content)
+def replace_trusted(path: Path, content: bytes) -> None:
+    """Write `content` to a file, which replaces an old one at once; no other user can write it, whatever the umask."""
+    make_trusted_folder(path.parent)
+    unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
+    try:
+        with open(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as file:
+            file.write(content)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def make_trusted_folder(folder: Path) -> None:
@@ -87,7 +93,7 @@ def trusted_folder(folder: Path) -> Path:
     subfolder = f"{folder.name}_{hashlib.sha256(str(folder).encode()).hexdigest()[:16]}"
     replacement = Path(AppDirs(appname="twoloop", appauthor=False).user_cache_dir) / "code" / subfolder
     if reason_to_distrust(replacement):
-        replacement = Path(_temporary_folder()) / subfolder
+        replacement = Path(_temporary_folder().name) / subfolder
     _warn_first(f"twoloop: no code is loaded from {folder}: {reason}. It is kept in {replacement} instead. {ADVICE}")
     return replacement
 
@@ -144,14 +150,10 @@ def _is_private_group(gid: int) -> bool:
     return is_own and set(group.gr_mem) <= {"root", user.pw_name}
 
 
-_temporary_folders: list[tempfile.TemporaryDirectory[str]] = []  # empty, or the temporary folder of this process
-
-
-def _temporary_folder() -> str:
+@cache
+def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
     """Return the temporary folder of this process, which is created at the first call."""
-    if not _temporary_folders:
-        _temporary_folders.append(tempfile.TemporaryDirectory(prefix="twoloop-"))
-    return _temporary_folders[0].name
+    return tempfile.TemporaryDirectory(prefix="twoloop-")
 
 
 _warnings: list[str] = []  # the warning that `_warn_first` has printed; empty: none yet
@@ -183,14 +185,7 @@ class CodeFiles:
     def save(self, key: Any, data: Any) -> None:
         """Write the data for a key to its file, which replaces the previous file for this key."""
         content = pickle.dumps((repr((*self.origin, key)), dumps(data)))
-        path = self._path_for_key(key)
-        temporary_path = path.with_suffix(f".{uuid.uuid4().hex}")
-        make_trusted_folder(self.folder)
-        try:
-            write_trusted(temporary_path, hashlib.sha256(content).digest() + content)
-            temporary_path.replace(path)
-        finally:
-            temporary_path.unlink(missing_ok=True)
+        replace_trusted(self._path_for_key(key), hashlib.sha256(content).digest() + content)
         if self.is_limited:
             for old in sorted(self._paths_of_files(), key=_time_written)[:-MAX_ON_DISK]:
                 old.unlink(missing_ok=True)
