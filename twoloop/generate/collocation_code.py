@@ -120,27 +120,27 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
-MAX_OPERATIONS = 5000  # longer equations get no collocation code: code of this length takes 2 s to compile
+MAX_OPERATIONS = 5000  # equations with more operations get no collocation code: this length takes 2 s to compile
 MIN_DIVISOR = 1e-300  # smallest divisor, and smallest allowed error, which replaces 0
 INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
-# number of steps whose elimination begins with M, after the program with fixed pivots (null_space.py) was not valid
+# after the program with fixed pivots (null_space.py) was not valid in a step, this number of steps eliminate M first
 STEPS_BY_MASS_FIRST = 8.0
-FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
+FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step
 
 # constants of the iteration, whose contraction rho is the ratio of the changes of velocities in two successive sweeps
-KAPPA = 0.02  # iteration error, in tolerances, that ends the sweeps: total errors are then at most those of DOP853
+KAPPA = 0.02  # sweeps end at this iteration error, in tolerances: total errors are then at most as large as DOP853's
 TARGET_SWEEPS = 6.0  # number of sweeps for which the step size is chosen; larger with predictions of degree 6 and more
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged this number of sweeps after the target
 MAX_CONTRACTION = 0.8  # a step is rejected in its fourth sweep or later if the contraction is at least this
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
-FAST_START, SLOW_START = 0.04, 0.3  # a contraction between these accepts the guess of the first step size
-STAGNATION_RATIO = 0.5  # at larger contractions, changes below MAX_ROUNDING times the values are rounding errors
+FAST_START, SLOW_START = 0.04, 0.3  # the guess of the first step size is accepted if the contraction is between these
+STAGNATION_RATIO = 0.5  # if the contraction is larger, changes below MAX_ROUNDING times the values are rounding errors
 # values that replace KAPPA, MAX_ROUNDING and the limit of sweeps in steps of fixed size
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to the ratio of the iteration error to KAPPA, because its logarithm is computed
 ERROR_WEIGHT = 0.5  # factor by which the error estimate is multiplied
-# allowed defect at the midpoints between nodes, relative to the tolerances: most of its effect averages out in a step
+# allowed defect at midpoints between nodes, in tolerances; above 1, because most of its effect averages out in a step
 ALLOWED_DEFECT = 16.0
 
 
@@ -152,8 +152,8 @@ def compiles_quickly(shared: SharedCode) -> bool:
 class CollocationCode:
     """Generator of the functions for the collocation steps of one mechanism.
 
-    In the methods, `emit` writes operations on vectors of LANES numbers, `num` on single numbers, `vec2` on vectors of
-    two numbers, and `wide` on vectors of coordinates.
+    The emitters in the methods differ in their numbers: `emit` writes operations on vectors of LANES numbers, `num` on
+    single numbers, `vec2` on vectors of two numbers, and `wide` on vectors with one number for each coordinate.
 
     shared : code of the equations, whose coefficients the functions use, too.
 
@@ -204,8 +204,7 @@ class CollocationCode:
         """Iterate the stages of a step; return a status code for how the iteration ended, see data/collocation.py.
 
         The program with the fewest operations computes the accelerations. Its conditions are checked once, after the
-        last sweep. If they fail, the iteration is repeated with the elimination that begins with M, as in the next
-        STEPS_BY_MASS_FIRST steps.
+        last sweep. If they fail, the iteration is repeated with the elimination that begins with M; so do later steps.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
@@ -283,7 +282,7 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, work: Value) -> list[Value]:
-        """Return the accelerations at the nodes, loaded again from `work`: values in registers would be spilled."""
+        """Return the accelerations at the nodes, loaded from `work`; the compiler could not keep all in registers."""
         return [load_lanes(emit, work, self.a_offset + LANES * i) for i in range(self.n)]
 
     @contextmanager
@@ -380,8 +379,9 @@ class CollocationCode:
     ) -> Value:
         """Sweep over the stages until they converge, or a step is rejected; return a status code, see `iterate_step`.
 
-        `evaluate` stores the accelerations of the iterated coordinates at [t, q]; the function that it returns stores
-        the other accelerations, and returns whether all accelerations are valid. If not, `fallback` returns the code.
+        `evaluate` writes code that stores the accelerations of the iterated coordinates at [t, q]. It returns a
+        function that writes code for the other accelerations, and returns whether all are valid. If they are not, the
+        code that `fallback` writes decides the status.
         """
         builder, num = emit.builder, Emitter(emit.builder)
 
@@ -644,7 +644,7 @@ class CollocationCode:
         else:
             self._project_in_parts(emit, work, numbers, self.split_functions.project, ("a", "moved", "q", "v", "lam"))
 
-    # methods that write parts of the functions
+    # methods that write parts of functions
 
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, program: Program) -> None:
         """Project states at the ends of eight steps by a program that gives "moved", the change, and new values."""

@@ -38,7 +38,7 @@ from twoloop.problem.system import ConstrainedSystem
 DOUBLE_POINTER = f"{DOUBLE}*"
 # generated code is used if accelerations at the start have at most this relative error; in runs it grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions where this error is measured, and distance between them
+MAX_POSITIONS, DISTANCE = 4, 0.02  # largest number of positions where this error is measured, and their distance
 
 
 def write_accelerations(
@@ -161,7 +161,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return the pointer to the coefficients; in SIMD lanes, pointers to varying and to shared coefficients."""
+    """Return the pointer to the coefficients; in SIMD lanes, two: to those that differ between lanes, and to others."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -171,8 +171,7 @@ def _stack_array(emit: Emitter, size: int) -> Value:
 
 
 # equations with more operations than SPLIT_PROJECTIONS have their projections split into functions, which halves the
-# time to compile. Without a `reduced_program` (elimination.py), accelerations are split, too, and take 50 % longer to
-# run; so the threshold is then SPLIT_ALL
+# compile time; without a `reduced_program`, SPLIT_ALL applies: accelerations are split, too, and get 50 % slower
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
@@ -343,7 +342,7 @@ class SplitFunctions:
 
 
 def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
-    """Except in SIMD lanes, emit code that returns false if results are invalid, before it writes output arrays."""
+    """Emit code that returns false if results are invalid, before any output is written; in lanes, emit nothing."""
     if is_valid.type == BIT:
         emit.builder.return_false_unless(is_valid)
 
@@ -485,7 +484,7 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 
 
 def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
-    """Return the largest relative error of accelerations by generated code, for zero velocities at and near a start.
+    """Return the largest relative error of accelerations by generated code, at rest, at positions at and near a start.
 
     Accelerations are computed with and without a projection, by two functions whose pivots may differ. The error is
     infinite if pivots are too small at all positions.

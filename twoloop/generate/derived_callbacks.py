@@ -102,8 +102,7 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 Array = NDArray[np.float64]
 
 MAX_ENTRIES = 50_000  # callbacks are compared with exact derivatives if C_q and A have at most this many entries
-# derivatives are compared at these displacements from the start: of q, relative to the sizes of the coordinates, and of
-# t, relative to FIRST_TIME_SCALE
+# displacements from the start at which derivatives are compared: of q, relative to its size; of t, to FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 

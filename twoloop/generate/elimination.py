@@ -46,23 +46,25 @@ Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # rows of G are added to M if M has a smaller ratio of the smallest to the largest eigenvalue
 RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is below this fraction of the row
-PIVOT_FRACTION = 0.01  # the pivot of a row of G must be at least this fraction of the smallest pivot at the start
-# possible values of `PivotChoice.min_pivot`, the smallest allowed pivot of a row of G, relative to the pivot that this
-# row has without the other rows. With pivots below the last value, rounding errors would dominate
+# pivots of rows of G are measured relative to the pivot that the row has without the other rows. During a run, the code
+# accepts pivots down to about this fraction of the smallest pivot at the start
+PIVOT_FRACTION = 0.01
+# possible values of `PivotChoice.min_pivot`, the smallest accepted pivot; below the last, rounding errors dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
 # MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] <= smallest pivot at the start, else MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-N_FEW_COORDINATES = 24  # with more coordinates, MIN_INDEX_MANY replaces MIN_INDEX_FEW
-# all rows of G may be added to M if pivots are so small that the index of their limit in MIN_PIVOTS is at least:
-# MIN_INDEX_FEW, for up to N_FEW_COORDINATES coordinates; MIN_INDEX_FEW_SINGULAR, if M is also singular, because Euler
-# parameters lose two digits even in sound models; MIN_INDEX_MANY, for more coordinates, because code gets longer
+# all rows of G are added to M, on trial, if pivots are so small that the index of the chosen MIN_PIVOTS is at least
+# - MIN_INDEX_FEW, for at most N_FEW_COORDINATES coordinates
+# - MIN_INDEX_FEW_SINGULAR, if M is also singular: Euler parameters lose two digits even in sound models
+# - MIN_INDEX_MANY (plus one if M is singular), for more coordinates, because the code gets longer
+N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # if s G^T G is added to M, approximate ratio of its largest entry to the largest entry of M
-MAX_PIVOT_RATIO = 1e5  # solutions need refinement if an entry of M with added rows exceeds this multiple of its pivot
-SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large step, so that they rarely depend on the start
+MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows exceeds its pivot by this factor
+SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large number, so that most starts yield the same
 DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
 MIN_GAIN = 2  # rows are added to M only if min_pivot becomes larger, by at least this number of steps in MIN_PIVOTS
-# dependent coordinates are eliminated if G has at least this number of rows per coordinate; with fewer rows, the linear
+# dependent coordinates are eliminated only if G has at least this number of rows per coordinate: otherwise the linear
 # system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
 
@@ -71,14 +73,15 @@ PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 @dataclass(frozen=True)
 class PivotChoice:
-    """Decisions of the elimination that depend on the numbers of M and G at a position.
+    """Choice of rows and pivots for the elimination, made by the numbers of M and G at one position.
 
-    rows : indices of the independent rows of G.
-    added_rows, scales : indices of rows g of G, and scales (powers of two), such that M plus the sum of scale g^T g is
-        definite, and the added terms are about as large as M.
-    min_pivot : smallest allowed pivot of a row of G, relative to its pivot without the other rows; a power of ten.
-    blocks : pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which
-        these rows are solved. Empty if elimination of dependent coordinates would not pay, or no pivots are suitable.
+    rows : indices of the independent rows of G; the other rows are redundant.
+    added_rows, scales : M may be singular; then M + sum_k scales[k] g^T g, where g is row added_rows[k] of G, replaces
+        M. This sum is definite. Scales are powers of two, with which the added terms are about as large as M.
+    min_pivot : smallest pivot of a row of G with which results count as valid, relative to the pivot that the row has
+        without the other rows; a power of ten.
+    blocks : pivot blocks in the order of elimination. A block has one or two indices in `rows`, and as many dependent
+        coordinates, for which these rows are solved. Empty if this would not pay, or if no pivots are suitable.
     is_refined : whether solutions are improved by one step of refinement, because small pivots may cost digits.
     """
 
@@ -97,7 +100,7 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # refine solutions in these two cases: otherwise, solutions of random models had 8 digits without refinement
+        # refine solutions in these two cases only: in all others, random models had 8 correct digits without refinement
         is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _hides_little_inertia(choice, mass, G)
         choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
@@ -136,7 +139,7 @@ class DependentColumns:
 
 def _entry_kinds(system: ConstrainedSystem) -> Any:
     """Return the kinds of the entries of G (0: always zero, 1: constant, 2: varies), or None if they are unknown."""
-    if system.called_in_python:  # such functions may store their arguments, and are traced as late as possible
+    if system.called_in_python:  # Python functions may store their arguments: do not call them with symbols yet
         return None
 
     def make(equations: Callable[[], Equations]) -> Any:
@@ -154,7 +157,7 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
 
 
 class PivotChooser:
-    """Kernel with scratch arrays that finds the PivotChoice for values of M and G at any position of a system."""
+    """Compiled search, with its scratch arrays, for the PivotChoice at any position of a system, given M and G."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, workspace_size
@@ -170,8 +173,7 @@ class PivotChooser:
     def choose(self, mass: Array, G: Array, nearby: Callable[[], tuple[Array, Array]]) -> PivotChoice:
         """Return the PivotChoice, without blocks, for M (n_q, n_q) and G (n_c + n_a, n_q).
 
-        `nearby` returns M and G at another position, at which no entry is zero by chance. Raise the same exceptions as
-        `PivotChoice.choose`.
+        `nearby` returns M and G at another position, where no entry is zero by chance. Raise like `PivotChoice.choose`.
         """
         system, scratch, chosen = self.system, self._scratch, self._row_indices
         is_definite = system.constant_mass and system.derived.get("no weak mass", False)
@@ -195,7 +197,7 @@ class PivotChooser:
         return choice
 
     def _index_with(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
-        """Return the index in MIN_PIVOTS of the smallest allowed pivot if `choice.added_rows` are added with `scales`.
+        """Return the index in MIN_PIVOTS that results if the rows `choice.added_rows` are added to M with `scales`.
 
         Return -1 if M with added rows is not positive definite, or if the independent rows differ from `choice.rows`.
         """
@@ -223,7 +225,7 @@ class PivotChooser:
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _decode(self, index: int) -> PivotChoice:
-        """Return the choice that `self._row_indices` contains; raise Untraceable if `index` is an error code."""
+        """Return the choice that the compiled search has stored; raise Untraceable if its result `index` is a code."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -267,7 +269,7 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
 
 
 def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return whether rows that `choice` adds to M have several scales, or M + s G^T G has relatively small pivots."""
+    """Return whether bodies of little inertia may lose digits: added rows have several scales, or pivots are small."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)
@@ -291,19 +293,16 @@ class Elimination:
     Fields:
     graph : graph of the operations; its first inputs are t, q and v.
     mass_first_program : program for the accelerations "a" (n_q,) at a state, by an elimination that begins with M.
-    reduced_program : program for "a" that eliminates dependent coordinates, if it takes fewer operations; valid at
-        fewer positions.
-    right_sides : program for the forces "r" (n_q,) and the right-hand sides "c" (n_c + n_a,) of the rows of G; 0 for
-        unused rows.
+    reduced_program : shorter program for "a" that eliminates dependent coordinates; it is valid at fewer positions.
+    right_sides : program for the forces "r" (n_q,) and the right-hand sides "c" (n_c + n_a,) of the rows of G.
     position_projection : program for the position "q" (n_q,) after one Newton step towards the constraints, and for its
         change "moved" (n_q,), a vector x with A x = 0.
     projection : program for "q" and "moved", for the projected velocity "v" (n_q,), and for the accelerations "a" and
         multipliers "lam" (n_c + n_a,) at this velocity. M, G and Q are evaluated at the position before the step.
     basic_projection : as `projection`, but "lam" is 0 for redundant rows (in `projection`, "lam" has the least norm).
-    position_errors, velocity_errors : programs for the right-hand sides "c" (n_c + n_a,) of corrections of positions,
-        and of velocities.
+    position_errors, velocity_errors : programs for the right-hand sides "c" of corrections of positions, of velocities.
     redundant_rows : program without arrays; its conditions hold if the redundant constraints are satisfied.
-    split_functions : generator that splits long equations into several functions, set by compile_equations.py.
+    split_functions : generator that splits long equations into several functions; compile_equations.py sets it.
     n_operations : number of operations of callbacks and factorization, but not of the solution with the factors.
     traced : traces of the callbacks.
 
@@ -424,7 +423,7 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for "r" (the forces Q) and "c" (right-hand sides of the rows of G; 0 for unused rows)."""
+        """Return the program for "r", the forces Q, and "c", the right-hand sides of G a = c (0 for redundant rows)."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
@@ -527,7 +526,8 @@ def multipliers_of_least_norm(
 class FactorAndSolvePrograms:
     """Programs that solve M a + G^T lam = r, G a = c in two steps: first the factors, then the solution with them.
 
-    other_programs : other programs at the same state; quantities that they share with the factors are stored, too.
+    other_programs : programs that run after the first step, at the same state; quantities that they share with it are
+        stored, too.
 
     Fields:
     stored_indices : quantities that the first step stores. Keys: indices in the graph of `equations`; values: indices

@@ -25,8 +25,8 @@ from twoloop.kernels.evaluation import operations as op
 # largest number of operations of a derived program or a series: tracing more would take longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
 # A product is recorded once for all its multiples: the constant factors of both arguments are taken out, unless this
-# might underflow or overflow. They are not taken out if the magnitude of their product is not between MIN_FACTOR and
-# 1 / MIN_FACTOR, nor from the squares that make up a power with an exponent above HIGH_EXPONENT.
+# might underflow or overflow, in two cases: the magnitude of their product is not between MIN_FACTOR and 1 /
+# MIN_FACTOR; or the product is one of the squares that make up a power with an exponent above HIGH_EXPONENT.
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 # reason in messages about a callback that compares an expression, or converts it to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
@@ -58,7 +58,7 @@ class Graph(SymbolicObject):
         self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs that it depends on
         self.traced: dict[str, Any] = {}
         self._recorded_quantities: dict[tuple[int, int, int], int] = {}
-        # keys: identifiers of factors; values: ranks in the order of first use, which no parameter value changes
+        # keys: identifiers of factors; values: ranks in the order of first use, which is the same for all parameters
         self._factor_order: dict[int, int] = {}
         self._identifiers: dict[Any, int] = {}  # integers that stand for keys of expressions: keys take long to compare
         self._quantities: dict[int, Affine] = {}

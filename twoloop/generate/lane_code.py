@@ -48,10 +48,10 @@ from twoloop.kernels.lanes import layout as lanes
 from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
-# constants of a step by series, as in kernels/steps/taylor_step.py
-# if a step is rejected because PREDICTION_ERROR > 1, the next step size is chosen for this value of PREDICTION_ERROR
+# constants of Taylor steps, as in kernels/steps/taylor_step.py
+# if a step is rejected because PREDICTION_ERROR > 1, the next step size is chosen so that it would have this value
 TARGET_ERROR = 0.3
-MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of step sizes: smallest value, safety factor, largest value
+MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of successive step sizes: its minimum, safety factor, maximum
 MAX_REJECTIONS = 10  # a run leaves its lane after more successive rejected steps than this
 FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
 # a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION max|q|
@@ -183,7 +183,7 @@ class LaneSteps:
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)
-        # if h is 0, per_duration is infinite, so that positions set no limit
+        # if h is 0, per_duration is infinite: positions then allow any defect
         duration, per_duration = h / order, order / h
         largest = max_defect = emit.constant(0.0)
         for each in a:
@@ -197,7 +197,7 @@ class LaneSteps:
         return duration * max_defect
 
     def compute_prediction_error(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store PREDICTION_ERROR, |predicted - projected positions| over its limit, see control/step_size.py."""
+        """Store PREDICTION_ERROR: |predicted - projected positions| relative to its limit, see control/step_size.py."""
         n, memory, (rtol, atol) = self.n, self.memory(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -255,7 +255,7 @@ class LaneSteps:
         store_mask(emit, work, lanes.ACCEPTED, is_accepted)
         n_refused = emit.load(work, lanes.N_REJECTED)
         n_refused = select(is_running & is_refused, n_refused + one, n_refused)
-        # if a value is not finite, end the run: shorter steps could pass the point where the equations are undefined
+        # if a value is not finite, end the run: shorter steps might jump over a point where the equations are undefined
         n_refused = select(is_valid, n_refused, emit.constant(math.inf))
         emit.store(n_refused, work, lanes.N_REJECTED)
         h_longest = emit.load(work, lanes.H) * select(is_refused, factor, emit.constant(MAX_FACTOR))
@@ -336,7 +336,7 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
     one, zero, select, compare = emit.constant(1.0), emit.constant(0.0), emit.builder.select, emit.builder.compare
     remaining, sign = set(range(len(matrix))), one
     while remaining:
-        # pivot of minimum degree: its row has the fewest entries (rows and columns have the same pattern)
+        # choose the pivot whose row has the fewest entries (minimum degree; rows and columns have the same pattern)
         i = min(remaining, key=lambda each: (len(matrix[each]), each))
         remaining.remove(i)
         pivot = matrix[i].pop(i)
@@ -355,7 +355,7 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
 
 Array = NDArray[np.float64]
 
-WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero: in products such as A A, they are rounding errors
+WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero, because they are rounding errors of products like A A
 
 
 # A, b, c of an explicit Runge-Kutta method (its first stage is the state itself), and weights of two error estimates
@@ -498,7 +498,7 @@ class LaneCode(LaneSteps):
         self._row_program = Program(equations.graph, {"G": [rows[k, j] for k, j in self._row_entries]})
         programs = [*equations.accelerations, equations.position_projection, equations.basic_projection]
         programs += [equations.redundant_rows, *([self.solution.factor_program] if series else [])]
-        # coefficients of the program for G must get their indices even if the code is read from the disk
+        # `_structure` gives indices to the coefficients of the program for G, also if the code is read from the disk
         self.structure = self._structure(programs if series else [*programs, self._row_program])
         self.n_numbers = self.numbers.n_varying
         programs += [self.solution.solution_program] if series else []

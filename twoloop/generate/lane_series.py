@@ -1,7 +1,8 @@
 """Write code for SIMD lanes, where every number is a vector, and for the recurrences of a Taylor series in lanes.
 
-The recurrences compute the coefficients of one order from coefficients of lower orders. The Taylor coefficients of the
-factors of products are stored in rows, one row for each order; a factor that several products share is stored once.
+The recurrences compute the coefficients of one order from coefficients of lower orders: coefficient k of a product of
+two series X and Y is the sum of X[j] Y[k - j] over 0 <= j <= k. The coefficients of such factors X, Y are stored in
+rows, one row for each order; a factor that several products share is stored once.
 
 Usually each lane has its own run. In collocation steps, each lane has a stage of one run; for such vectors, the indices
 of `load_lanes` and `store_lanes` count numbers, not vectors.
@@ -100,12 +101,12 @@ class LaneEmitter(Emitter):
 
 
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
-    """Return the vector of STAGES numbers that begins at `base`[index], where `index` counts numbers."""
+    """Return the vector of STAGES numbers, one for each stage, that begins at base[index] (`index` counts numbers)."""
     return Emitter(emit.builder).load_vector(base, index, STAGES)
 
 
 def store_lanes(emit: LaneEmitter, value: Value, base: Value, index: int = 0) -> None:
-    """Store a vector of STAGES numbers that begins at `base`[index], where `index` counts numbers."""
+    """Store a vector of STAGES numbers, one for each stage, that begins at base[index] (`index` counts numbers)."""
     Emitter(emit.builder).store_vector(value, base, index)
 
 
@@ -160,9 +161,9 @@ class Operation(NamedTuple):
 class LaneSeries:
     """Generator of the code for the recurrences of a SeriesProgram.
 
-    `scratch` contains, in this order, as vectors: the factors of the linear equations; their right-hand side r; the
-    reciprocal divisors in recurrences of roots, logarithms and arctangents; sums that are carried over to the next
-    order; a row of zeros; and one row of factors for each order, beginning with 0.
+    `scratch` contains, as vectors: the factors and the right-hand side r of the linear equations; the reciprocal
+    divisors in recurrences of roots, logarithms and arctangents; sums that were computed for the next order (see
+    `_shared_sums`); a row of zeros; and rows with the coefficients of all factors of products, one for each order.
     """
 
     def __init__(
@@ -176,7 +177,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # for each product, factors of the sum that is carried over; `_factors`, called in `_shared_sums`, reads this
+        # result of `_shared_sums`; first an empty dict, because `_shared_sums` calls `_factors`, which reads it
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -229,18 +230,18 @@ class LaneSeries:
         return operations
 
     def _factor_index(self, *key: Any) -> int:
-        """Return the index of a factor in a row.
+        """Return the index of a factor in the rows; a new factor gets the next index.
 
         `key`: (terms, constant), or ("scaled", terms, constant) for the same factor multiplied by the order.
         """
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Return the factors of the sums that products (cos x) x' and (sin x) x' share with recurrences of sin and cos.
+        """Find products that need no sum of their own, because the recurrence of a sine or cosine computes it.
 
-        Keys: quantities that are such products. Values: pairs of factors, see `_factors`. (cos x) x' is the derivative
-        of sin x. So a part of its coefficient k is a sum in the recurrence of sin x for order k + 1, divided by the
-        unit of time. This part is known before order k is solved. The same holds for (sin x) x' and cos x.
+        (cos x) x' is the derivative of sin x. So a part of its coefficient k is a sum in the recurrence of sin x for
+        order k + 1, divided by the unit of time; this part is known before order k is solved. The same holds for (sin
+        x) x' and cos x. Return, for each such product (a quantity), the pair of factors of this sum, see `_factors`.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -254,7 +255,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return pairs of factors X and Y, as indices in a row, for the recurrence of each result of an operation."""
+        """Return, for each result of an operation, the indices of the factors X, Y of the sum in its recurrence."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -312,7 +313,7 @@ class LaneSeries:
         solution = self.solution
         _, (a, lam) = lower_program(emit, solution.solution_program, [*r, *c, *stored], self.numbers)
         per_v, per_q = unit * per_order, unit / emit.to_double(next_order)
-        previous = Quantities(emit, lambda i: zero)  # values at order k - 1: a and lam; 0 for other quantities
+        previous = Quantities(emit, lambda i: zero)  # coefficients of order k - 1 of a and lam; other quantities: 0
         for j in range(n):
             v = per_v * a[j]
             quantities.define(1 + n + j, v)
@@ -370,11 +371,11 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _write_sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Return a dict of sums over 1 < j < k. Keys: (indices of the factors X and Y, whether it is for order k + 1).
+        """Write loops for the sums of products over 1 < j < k; return the sums by key (pair, whether for order k + 1).
 
-        The value for (pair, False) is the sum of X[j] Y[k - j]; for (pair, True), the sum of X[j] Y[k + 1 - j]. First
-        and last terms become known later, and `_PartialSums` adds them. So one loop computes several sums, does not
-        wait for the previous order, and loads each row once.
+        For the pair (X, Y), given by indices, the sum is X[j] Y[k - j] for order k, and X[j] Y[k + 1 - j] for order
+        k + 1. `_PartialSums` later adds the first and last terms, which are not known yet. So one loop computes several
+        sums, does not wait for the previous order, and loads each row once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
@@ -455,26 +456,26 @@ class LaneSeries:
 
 
 class _Row:
-    """Row of the factors of one order in memory; values that were stored through this object are not loaded again."""
+    """Row of one order in memory: a coefficient of each factor; values stored by this object are not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store the value of the factor `key` at its index; with `when` = "if used", skip a factor without an index."""
+        """Store the coefficient `value` of the factor `key`; if `when` is "if used", skip factors that no sum uses."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value
             self.emit.store(value, self.base, index)
 
     def load(self, index: int) -> Value:
-        """Return the value of the factor with index `index`."""
+        """Return the coefficient of factor number `index`."""
         return self._stored[index] if index in self._stored else self.emit.load(self.base, index)
 
 
 class _PartialSums(NamedTuple):
-    """Sums over 1 < j < k for the orders k and k + 1, and rows with the factors of the terms j = 1 and j = k."""
+    """Sums over 1 < j < k by `_write_sums`, and the rows from which the missing terms j = 1 and j = k are added."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._write_sums`
     first_row: Value  # pointer to the row of order 1, or to a row of zeros if k is 1

@@ -241,7 +241,7 @@ class Quantities:
         """Return `constant` plus the sum of coefficient * quantity over the terms."""
         key = terms, constant
         if self._emit.builder.module.splits_blocks and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # to multiply again takes no longer than to load the product
+            ((quantity, coefficient),) = terms  # not cached: to multiply again takes no longer than to load the product
             return self._emit.scale(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)

@@ -37,8 +37,8 @@ class Factors:
     """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; the pivots are the blocks of D.
 
     blocks : blocks in the order of elimination.
-    conditions : for rows of G (index `n` and later), pairs: a pivot, and this pivot without the other rows of G. The
-        first expression must be larger than a fraction of the second.
+    conditions : pairs, for rows of G (index `n` and later): the pivot of the row, and the pivot that it would have
+        without the other rows of G. The first expression must be larger than a fraction of the second.
     mass_pivots : pivots of M (index below `n`), which are positive if M is definite.
     """
 
@@ -69,7 +69,7 @@ class Factors:
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a block of pivots; add conditions. `own_pivots`: pivots of rows of G on their own."""
+        """Return the inverse of a block of pivots; add conditions. `own_pivots`: pivots without other rows of G."""
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -117,7 +117,7 @@ def solve(blocks: Sequence[Block], rhs: Sequence[Affine]) -> list[Affine]:
 
 
 def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products; if first factors are all multiples of one expression, add up the second factors."""
+    """Return the sum of products; if all first factors are multiples of one expression, multiply only once by it."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -185,9 +185,9 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
 PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
 Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
-# lower limit of the squares of three numbers: pivot over norm of the entries that it divides; pivot over norm of its
-# column; sine of the angle between the two columns of a block. A number of 10^-k costs up to 3 k digits of
-# accelerations. The choice at a start has stricter limits, see linalg/dependent_columns.py
+# limit below which the accelerations count as invalid, for the squares of three numbers: pivot / norm of the entries
+# that it divides; pivot / norm of its column; sine of the angle between the two columns of a block. A number of 10^-k
+# costs up to 3 k digits of accelerations. The choice at a start has stricter limits, see linalg/dependent_columns.py
 MIN_PIVOT_SQUARE = 0.03**2
 
 
@@ -334,7 +334,7 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield pairs of a pivot of the reduced mass matrix and its lower bound, a fraction of the diagonal entry."""
+    """Yield each pivot of the reduced mass matrix T^T M T with its lower bound, a fraction of the diagonal entry."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None
@@ -348,7 +348,6 @@ def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -
 
 
 def _add_products(total: Affine, pairs: Any) -> Affine:
-    """Return `total` plus the sum of the products of `pairs`."""
     for x, y in pairs:
         if not is_zero(x) and not is_zero(y):
             total = total + x * y
@@ -369,8 +368,8 @@ def solve_refined(
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
     """Return a and lam (independent rows) with M a + G^T lam = r, G a = c; refine them if `choice.is_refined`.
 
-    Also return conditions: pairs of expressions; unless the solution has lost too many digits, the first one is larger.
-    Near equilibrium, where a is small, the acceleration of all masses by r alone counts instead of a.
+    Also return conditions (pairs of expressions, the first of which is larger unless the solution has lost too many
+    digits): refinement must change a little, relative to a or, near equilibrium, to the accelerations by r alone.
 
     `solve`: function that solves a linear system by the factors of [M + s g^T g, G^T; G 0], where rows g were added to
     M as in PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.

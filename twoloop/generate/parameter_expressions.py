@@ -21,7 +21,7 @@ Powers = tuple[tuple[int, float], ...]
 
 MAX_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; the function float() would be refused
-# the sum of two terms counts as zero, because it is a rounding error, up to this fraction of a term
+# if the sum of two terms is at most this fraction of a term, it is a rounding error, and counts as zero
 CANCELLATION_LIMIT = 8.0 * 2.0**-52
 NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
@@ -100,7 +100,7 @@ class ParameterTape(SymbolicObject):
             self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return the atom with a definition (a sum or a function) as Powers; if there is no such atom, add it."""
+        """Return, as Powers, the atom with a definition (a sum or a function); a new definition adds an atom."""
         if definition not in self._atom_indices:
             self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)

@@ -167,7 +167,7 @@ class OperationTable(NamedTuple):
 
     `rows` has a row for each operation, with its kind, its node, and the ranges of its arguments' terms. `columns` and
     `coefficients` are the nodes and coefficients of all terms. `constants` has the constants of both arguments of each
-    operation. A node is the index of a value: inputs come first, then computed quantities.
+    operation. Values are numbered: the number of a value is its "node"; inputs come first, then computed quantities.
     """
 
     rows: Any
@@ -226,7 +226,7 @@ class OperationTable(NamedTuple):
 
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
-LITERALS = (0.0, 1.0, -1.0)  # these coefficients are literals in the code, because they need no multiplication
+LITERALS = (0.0, 1.0, -1.0)  # coefficients that are written into the code, because they need no multiplication
 LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient and the literal 1 or -1 that replaces it
 
 

@@ -45,9 +45,9 @@ class Sums(NamedTuple):
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    groups : one row for each group of independent operations of one kind: the kind, then the first and end index of
-        three ranges: the operations, and their further terms in `first` and in `second` (see `Sums`). A group of sines
-        includes the cosines of the same angles. The last group contains the products with a second factor that depends
+    groups : one row for each group of independent operations of one kind: the kind, then first and end index of three
+        ranges: of the operations, of their further terms in `first`, and of those in `second` (see `Sums`). A group of
+        sines includes the cosines of the same angles. The last group contains the products whose second factor depends
         on the solution of the linear system.
     first, second : arguments of the operations.
     """
@@ -63,9 +63,8 @@ class SeriesProgram:
 
     early : early operations; the last ones are the products in G v.
     late : late operations; the last ones are the products in G^T lam + M a.
-    rows, row_indices : nonzero rows of G v + (C_t, b), and their indices; terms "constant times v_i" are left out.
-    balance, balance_indices : nonzero entries of Q - G^T lam - M a, and their indices; terms "constant times lam_i" and
-        "constant times a_i" are left out.
+    rows, row_indices : nonzero rows of G v + (C_t, b), and their indices; without the terms "constant times v_i".
+    balance, balance_indices : the same of Q - G^T lam - M a, without terms "constant times lam_i" or "times a_i".
     traced : traces of the callbacks.
     """
 

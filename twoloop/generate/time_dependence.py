@@ -31,9 +31,8 @@ MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, have no short pu
 MAX_DEGREE_OF_STATE = 32  # polynomials in q and v, and their roots, have no short pulses up to this degree
 MAX_DEGREE_OF_DIVISOR = 4  # up to this total degree of its divisors, in q and v, a quotient has no short pulses
 FASTEST_DECAY = -2.0  # quotients that decay as x^p with smaller p may have short pulses; 1 / (1 + (x / w)**2) has none
-MAX_RATE = 4.0  # long steps resolve a sine if its argument changes by at most this per unit of a coordinate or velocity
-# callbacks are traced for this analysis only up to this number of coordinates; for larger systems, tracing may take
-# seconds, ten times as long as sampling the forces during a run
+MAX_RATE = 4.0  # a sine is not steep if its argument changes by at most this per unit of a coordinate or velocity
+# systems with more coordinates are not traced for this analysis: that may take ten times as long as sampling the forces
 MAX_COORDINATES = 300
 TIME_MASK = 1  # bit mask of t, the first input of a graph
 
@@ -60,8 +59,8 @@ class Dependence(NamedTuple):
 def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
     """Return whether forces, C_t or b may have short pulses in time, and whether forces may have them in q or v.
 
-    If they cannot be traced, both are true; for systems with more than MAX_COORDINATES coordinates, which are not
-    traced, only the first is. Functions called in Python may store arguments: they are traced only if the force was.
+    If callbacks cannot be traced, both are true. Systems with more than MAX_COORDINATES coordinates are not traced, and
+    only the first is true. Python functions may store their arguments: they are traced only if the force was.
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -207,8 +206,8 @@ def _has_state_pulses(graph: Graph, quantities: list[int], n_q: int) -> bool:
 def _quantities_may_be_steep(graph: Graph, quantities: list[int]) -> bool:
     """Return whether one of the `quantities` may vary much over a distance shorter than a step.
 
-    It may if it uses any operation except sums, products, sines and cosines; or a sine or cosine of time, or of an
-    argument whose derivative by a coordinate or velocity exceeds MAX_RATE.
+    Such a quantity uses an operation other than sums, products, sines and cosines; or a sine or cosine of time; or a
+    sine or cosine of an argument whose derivative by a coordinate or velocity exceeds MAX_RATE.
     """
     if any(graph.kind(i) not in SMOOTH_OPERATIONS for i in quantities):
         return True

@@ -368,7 +368,6 @@ class Equations:
         return out
 
     def _jacobian(self) -> Any:
-        """Return C_q (n_c, n_q), the derivatives of C with respect to q."""
         constraint, unit = self.expressions("constraint"), Affine(self.graph, 1.0, {})
         jacobian = np.empty((self.system.n_c, self.system.n_q), dtype=object)
         for j, coordinate in enumerate(self.q):
@@ -377,7 +376,6 @@ class Equations:
         return jacobian
 
     def _constraint_rate(self) -> Any:
-        """Return C_t (n_c,), the derivatives of C with respect to t."""
         constraint, unit = self.expressions("constraint"), Affine(self.graph, 1.0, {})
         time_derivative = Derivative(self.graph, {only_quantity(self.t): unit})
         return symbol_array(time_derivative.differentiate(expr) for expr in constraint)
@@ -438,7 +436,7 @@ class TraceCache:
 
     Fields:
     parameters : parameters with which callbacks are traced.
-    traced_kinds : kinds of callbacks that were traced. They do not branch, and so write to the same entries always.
+    traced_kinds : kinds of callbacks that were traced. They do not branch, and so always write to the same entries.
     within_bounds : kinds of traced callbacks for which `check_bounds` succeeded in one of the systems.
     """
 
@@ -462,7 +460,7 @@ class TraceCache:
 
     def equations(self, system: ConstrainedSystem) -> Equations:
         """Return the traced callbacks of a system, with their own copy of the graph, which the caller may extend."""
-        if system.called_in_python:  # such functions may store their arguments, and are traced as late as possible
+        if system.called_in_python:  # Python functions may store their arguments: call them with symbols late
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
@@ -525,7 +523,7 @@ def derive_cached(
     Raise Untraceable if the result cannot be derived from either cache, or if `check` raises for it.
     """
     for find_cache in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
-        cache = system.remembered(("family", find_cache), partial(find_cache, system))
+        cache = system.remembered(("trace cache", find_cache), partial(find_cache, system))
         derived = system.remembered((key, find_cache), partial(_derive_shared, system, cache, key, make))
         try:
             if isinstance(derived, Untraceable):
@@ -566,7 +564,7 @@ def share_checked_bounds(system: ConstrainedSystem) -> None:
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
     """Return the trace cache of a system, see `trace_cache_of`; the system stores it at the first call."""
-    return system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
+    return system.remembered(("trace cache", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:

@@ -32,15 +32,15 @@ KINDS = (
 N_NEARBY = 8  # number of random states near the start at which calls and traces are compared, besides the start
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
-# approximate largest number of compared states: of a chunk of steps, of a run, of a run with callbacks called in Python
+# largest number of compared states, approximately: in a chunk of steps; in a run; in a run with Python callbacks
 MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run: for large systems, fewer states suffice
-# differences between call and trace count as rounding errors up to this fraction of the largest term of any entry
+# a difference of call and trace counts as a rounding error up to this fraction of the largest term of any entry
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 # a trace is wrong if it differs from a call by more than this fraction; see also `_is_systematic`
 CLEAR_DIFFERENCE = 1e-6
-PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # neighbours in `_is_systematic`: largest relative distance, number
-MARGIN = 0.01  # margin of a CheckedRegion, relative to its ranges; small compared with the steps of a run
+PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # `_is_systematic` uses N_NEIGHBOURS states at relative distances up to the first
+MARGIN = 0.01  # margin of the bounds of a CheckedRegion, relative to its ranges; less than most steps of a run move
 MARGIN_AT_REST = 1e-9  # margin added for coordinates at rest, whose range is 0, relative to the largest range
 
 
@@ -220,7 +220,7 @@ def accept_traces(traced: CallbackTraces) -> None:
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
-    """Return rows [t, q, v]: the start, and N_NEARBY random states near it, at times spread over the run."""
+    """Return rows [t, q, v]: the start, and N_NEARBY random states near it, with times spread over the whole run."""
     scales = sizes(q)
     speed = np.maximum(scales, np.abs(v))
     n, directions = len(q), _random_directions(len(q))

@@ -77,14 +77,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.gamma_given == 0:  # again: the first evaluation has set the scale of Gamma's errors
+    if code == DONE and f.gamma_given == 0:  # again: errors of Gamma are relative to a scale that is known only now
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return JUMP, RAMP or SMOOTH for C_t and b in a step, and the times (s) between which the jump or ramp lies."""
+    """Return whether C_t and b have a JUMP or a RAMP in a step, or are SMOOTH; and the times (s) at its ends."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -98,9 +98,9 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return a code, the error in tolerances, and the ratio of the next step size to `size`.
+    """Attempt a step; return a code, the error in tolerances, and the proposed ratio of the next size to `size`.
 
-    If the step crosses a jump of C_t or b (`crosses_jump`), the caller has already computed `new_state`.
+    If the step crosses a jump of C_t or b (`crosses_jump`), the caller has already computed `new_state`. Ratio 0: none.
     """
     w.orientation_new = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -125,7 +125,7 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
     """Return whether a step must be repeated because C_t or b jumps, or has a ramp, within the step.
 
-    Store in `clock`, for a jump: JUMP_FROM, where the repeated step has to end, and JUMP_TO; for a ramp: H_NEXT.
+    Store in `clock`: for a jump, its first and last time JUMP_FROM and JUMP_TO; for a ramp, the next step size H_NEXT.
     """
     kind, low, high = _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
@@ -143,8 +143,8 @@ def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, st
 def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
     """Prepare the repetition of a failed step and return CONTINUE, or return an end code.
 
-    A step is repeated with a smaller size, a new partition, or both; a step of fixed size, with a new partition and
-    only once. `t_repeated`: time (s) at which the last repeated step of fixed size began.
+    A step is repeated with a smaller size, a new partition, or both. A step of fixed size is repeated only once, with a
+    new partition. `t_repeated`: time (s) at which the last repeated step of fixed size began.
     """
     n = w.Q.size
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
@@ -325,7 +325,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the method's `factor` lacks the effect of `error_factor`
+        elif error_factor > 1.0 and error > 0.0:  # the method has computed `factor` without regard to `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:

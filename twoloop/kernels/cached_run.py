@@ -3,11 +3,10 @@
 `start_and_advance` checks the start, keeps the independent rows and dependent coordinates of the previous run, takes
 steps, and fills one array (`f` is the kit, `w` the workspace; `b` has the other arrays, see RUN_ARRAYS):
 
-    ... | report: N_REPORT numbers, counters | times | steps | states ...
-                                                             ^ a fixed index
-`advance` writes states, beginning at the fixed index. The other parts, whose length depends on the number of steps,
-are then copied so that they end where the states begin. So the used part is contiguous: Python copies it as one slice,
-and splits the copy when a field of the result is read.
+    unused | report: N_REPORT numbers, counters | times | steps | states | unused
+                                                                ^ a fixed index
+`advance` writes the states from the fixed index on. The other parts, whose length depends on the number of steps, are
+copied to the places before it. Python copies the used part as one slice, and splits it when a field is read.
 """
 
 import math
@@ -36,7 +35,7 @@ from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNT
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 from twoloop.kernels.linalg.dense import copy
 
-ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate; smaller corrections are omitted
+ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate: no smaller corrections are made
 
 
 @merged
@@ -44,7 +43,7 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     """Reset the workspace `w` in place before a run that starts at the position q (n_q).
 
     `numbers`, `integers`: the parts of `w` that keep data from step to step; `pattern`: copied to w.pattern;
-    `accuracy`: value for GAMMA_REQUIRED; `reuse`: lower limit of the value for REUSE (see data/indices.py).
+    `accuracy`: the new w.gamma_required; `reuse`: lower limit of the new w.reuse (see data/indices.py).
     """
     for k in range(numbers.size):
         numbers[k] = 0.0
@@ -66,14 +65,14 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
 def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Reset the workspace `w` in place by `prepare_work`, which Python cannot call itself."""
+    """Call `prepare_work`; Python can call this function, but not `prepare_work`, which is merged into its callers."""
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
 FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-GAP_RATIO = 10  # ratio of GAP to DEFECT_GAP in `tolerances` if forces may change suddenly with position or velocity
+GAP_RATIO = 10  # GAP / DEFECT_GAP (see `tolerances`) if forces may change suddenly with position or velocity
 
 
 @exact
@@ -102,8 +101,8 @@ def _first_step_size(state, n, t, span, smallest):
 def _set_step_limits(control, tolerances, span, longest, within):
     """Store GAP and DEFECT_GAP in `tolerances`, and MAX_STEP, TIME_SPACING and SPACING in `control`.
 
-    They keep the time between two evaluations of the equations below MAX_GAP_RATIO times the duration `span` (s) of the
-    run. For methods that evaluate the equations within steps (`within`), only `longest` (s) limits the step size.
+    These limits keep the time between two evaluations of the equations below MAX_GAP_RATIO times the duration `span`
+    (s) of the run. If a method evaluates the equations within steps (`within`), only `longest` (s) limits step sizes.
     """
     max_gap = MAX_GAP_RATIO * span
     tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
@@ -122,7 +121,7 @@ def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longes
 
 @merged
 def _is_within_bounds(t, rows, bounds):
-    """Return whether, for all k, the leading numbers of [t[k], rows[k]] are between bounds[0] and bounds[1]."""
+    """Return whether all states [t[k], rows[k]] are between the states bounds[0] and bounds[1], number by number."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -134,9 +133,10 @@ def _is_within_bounds(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Split rows of out_steps into step sizes `h` (s), `changes` of the counts in each step, and flags `used_newton`.
+    """Store step sizes (s) in `h`, increases of `counts` in each step in `changes`, and whether a step used Newton.
 
-    `counts`: numbers of rejections and partitions, on entry before the first step, on return after the last.
+    `steps`: rows of out_steps, see loop_state.py. `counts`: numbers of rejections by the error test, failures and
+    partitions since the start of the run; on entry before the first of these steps, on return after the last.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -145,14 +145,16 @@ def split_steps(steps, counts, h, changes, used_newton):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-# codes that `start_and_advance` returns instead of a number of steps. REFUSED: the rows or coordinates that the
-# previous run chose do not suit this start. IN_DOUBT: the start may violate the constraints, and needs a closer check.
-# UNUSUAL: Python must read the report, and may have to continue the run. UNCHOSEN: Python must choose the rows
+# codes that `start_and_advance` returns in place of a number of steps
+# - REFUSED: the independent rows or dependent coordinates of the previous run do not suit this start
+# - IN_DOUBT: the start may violate the constraints; Python must check it
+# - UNUSUAL: steps were taken, but Python must read the report, and may have to continue the run
+# - UNCHOSEN: Python must check whether code was generated for the rows that are chosen at this start
 REFUSED, IN_DOUBT, UNUSUAL, UNCHOSEN = -1, -2, -3, -4
-# which checks of a start Python has made: none; that it is consistent; also, that rows and coordinates are the same
+# what Python has checked of a start: nothing; that it satisfies the constraints; also that the code suits it
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
-# arrays that runs from different starts share: for checks of a start, the choice of rows, and the steps. Among them are
+# arrays for the checks of a start, the choice of rows, and the steps, which successive runs reuse. Among them are
 # - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
 # - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
 # - `last_start`: the last start, see START; `start_rows`: indices of the independent rows at the last start
@@ -179,34 +181,40 @@ RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR,
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
 # indices in `constants`
-# - ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w; EQUATION_FORM: value of FORM
-# - RANK, WEAK: thresholds for `choose`; SCALE: factor s in M + s G^T G; MASS_FLAG: DEFINITE, INDEFINITE or 0 (constant)
-# - HAS_ALL_ENTRIES: 1 if `kinds` shows all entries of `rows`; CONTRADICTS: relative tolerance of redundant rows
-# - LEAST_PIVOT: smallest pivot of an accepted start; NEAR: pivot below which Python checks the run
-# - FIRST: first step size (s) that the user has chosen, or 0; LEAST: argument `smallest` of _first_step_size
+# - ACCURACY, REUSE, NEARLY_SINGULAR, EQUATION_FORM: initial w.gamma_required, w.reuse, w.nearly_singular and f.form
+# - HAS_ALL_ENTRIES: 1 if `kinds` shows all nonzero entries of the constraint rows
+# - RANK_LIMIT, WEAK_LIMIT: arguments of `choose`: below these relative sizes, pivots and eigenvalues of M count as zero
+# - ADDED_SCALE: factor s with which the code adds rows G to a singular M, as M + s G^T G
+# - CONTRADICTS: a redundant row contradicts the others if its residual, relative to its terms, exceeds this
+# - MASS_FLAG: DEFINITE or INDEFINITE, as M has to be at the start; 0: M is constant
+# - LEAST_PIVOT: smallest pivot of a start that is accepted without checks in Python
+# - NEAR_PIVOT: Python must check a run whose smallest pivot at an output time is below this
+# - FIRST_SIZE: first step size (s) that the user has chosen, or 0; LEAST_DISTANCE: `smallest` of _first_step_size
 # - LONGEST, EVALUATES_WITHIN: arguments of _set_step_limits
-# - MAX_CHANGE_RATIO: largest change of velocities in the last step, relative to the change that accelerations explain
-# - MIN_SAMPLES: shortest time between two sudden changes, in spacings of samples
-ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
-EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
-# indices in `expected`: the choice of rows for which code was generated (empty without generated code). BOUND: result
-# of choose_rows, or OF_PYTHON if only Python can make the choice. N_ROWS, N_ADDED: number of independent rows, and of
-# rows added to M. FIRST_ROW: index at which the list of these rows begins
+# - MAX_CHANGE_RATIO: velocities jumped if they change by more than this multiple of what accelerations explain
+# - MIN_SAMPLES: Python must check a run with two sudden changes closer than this number of spacings of samples
+ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK_LIMIT, WEAK_LIMIT, ADDED_SCALE, CONTRADICTS = range(8)
+MASS_FLAG, LEAST_PIVOT, EQUATION_FORM, FIRST_SIZE, LEAST_DISTANCE, LONGEST, EVALUATES_WITHIN = range(8, 15)
+NEAR_PIVOT, MAX_CHANGE_RATIO, MIN_SAMPLES = range(15, 18)
+# indices in `expected`, the choice of rows for which code was generated (empty without generated code). BOUND: the
+# result that `choose` has to return, or OF_PYTHON if only Python can make this choice. N_ROWS, N_ADDED: number of
+# independent rows, and of rows added to M. FIRST_ROW: where the list of the independent rows, then of the added, begins
 BOUND, N_ROWS, N_ADDED, FIRST_ROW = range(4)
 OF_PYTHON = 100
 
 
 @merged
 def _has_choices_of_code(b):
-    """Choose rows and dependent coordinates at a start; return whether code was generated for the same choices."""
+    """Choose rows and dependent coordinates at a start; return whether the code was generated for these choices."""
     b.scratch[0] = 0.0
-    first_bound = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
+    limits = b.constants[RANK_LIMIT], b.constants[WEAK_LIMIT]
+    first_bound = b.choose(b.mass, b.rows, *limits, b.bounds, b.scratch, b.chosen)
     n_rows, n_added = b.expected[N_ROWS], b.expected[N_ADDED]
     if b.chosen[0] != n_rows:
         return False
     if n_rows == 0:
         return True
-    if first_bound != b.expected[BOUND] or b.chosen[1] != n_added or b.scratch[0] != b.constants[SCALE]:
+    if first_bound != b.expected[BOUND] or b.chosen[1] != n_added or b.scratch[0] != b.constants[ADDED_SCALE]:
         return False
     is_same = True
     for k in range(n_rows):
@@ -223,7 +231,7 @@ def _has_choices_of_code(b):
 
 @merged
 def _has_consistent_rows(w, b, n):
-    """Return whether the accelerations a in b.state satisfy all rows of G a = Gamma within CONTRADICTS."""
+    """Return whether the accelerations a in b.state satisfy all rows of G a = Gamma, also the redundant ones."""
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
@@ -248,7 +256,7 @@ def _evaluate_start(checked_kit, b, t, q, v, records, shifts):
 
 @merged
 def _add_known_entries(b):
-    """Set b.pattern to 1 at entries of the constraint rows that are nonzero according to b.kinds."""
+    """Set b.pattern to 1 at entries of the constraint rows that, according to b.kinds, are not always zero."""
     pattern = b.pattern.reshape(b.pattern.size)
     for k in range(b.kinds.size):
         pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
@@ -289,9 +297,10 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
         return REFUSED
     w.next_jump = t1
     if b.control[at.FIXED_STEP] == 0.0:
-        span, h, within = t1 - t, b.constants[FIRST], b.constants[EVALUATES_WITHIN] > 0.0
+        span, h, within = t1 - t, b.constants[FIRST_SIZE], b.constants[EVALUATES_WITHIN] > 0.0
         _set_step_limits(b.control, b.tolerances, span, b.constants[LONGEST], within)
-        b.clock[at.H_NEXT] = min(h if h > 0.0 else _first_step_size(b.state, n, t, span, b.constants[LEAST]), span)
+        first_size = h if h > 0.0 else _first_step_size(b.state, n, t, span, b.constants[LEAST_DISTANCE])
+        b.clock[at.H_NEXT] = min(first_size, span)
         b.control[at.SHORTEST] = SHORTEST_STEP * b.clock[at.H_NEXT]
     copy(w.rows_v, b.start_rows)
     return 0
@@ -317,7 +326,7 @@ def _restore_start(b):
 
 # indices in `last_start`. N_EQUAL: number of successive runs from this start, at most 2. START: index of [t, t1, q, v]
 N_EQUAL, START = 0, 1
-NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has started yet; a second run has saved the data of the start
+NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has succeeded in starting; a second run has saved its data
 
 
 @exact
@@ -332,11 +341,13 @@ def _equals_last_start(last_start, t, t1, q, v):
     return is_same
 
 
-# indices in the report. N_STATES: number of states, including the first. N_STEPS: number of steps. NOTHING_TO_CHECK: 1
-# if Python need not check the run. JUMPED: 1 if velocities changed suddenly in the last step. IN_CHECKED_REGION: 1 if
-# all states are in the region in which callbacks were compared with their traces. DEFECT_KNOWN: 1 if the defect was
-# evaluated in every step. DEFECT: largest defect. LONGEST_GAP: longest time (s) between two evaluations. END_CODE: code
-# that `advance` returned. IS_NEW: 1 if the start differs from the previous start. N_REPORT: first counter
+# indices in the report; N_REPORT: index of the first counter
+# - N_STATES, N_STEPS: number of states, including the first, and of steps
+# - NOTHING_TO_CHECK: 1 if Python need not check the run; IS_NEW: 1 if the start differs from the previous start
+# - JUMPED: 1 if velocities changed suddenly in the last step; END_CODE: code that `advance` returned
+# - IN_CHECKED_REGION: 1 if all states are in the region in which callbacks were compared with their traces
+# - DEFECT_KNOWN: 1 if the defect was evaluated in every step; DEFECT: largest defect
+# - LONGEST_GAP: longest time (s) between two evaluations
 N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
 N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
@@ -344,7 +355,7 @@ N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
 
 @merged
 def _has_velocity_jump(b, k, n):
-    """Return whether a velocity jumps between states k - 1 and k, see MAX_CHANGE_RATIO; n: number of coordinates."""
+    """Return whether velocities jump between states k - 1 and k, see MAX_CHANGE_RATIO; n: number of coordinates."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
         change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
@@ -360,7 +371,7 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     """
     has_jumped = n_rows > 0 and _has_velocity_jump(b, n_rows, w.Q.size)
     is_inside = region.shape[1] > 0 and _is_within_bounds(b.t[: 1 + n_rows], b.states, region)
-    is_near_singular = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
+    is_near_singular = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR_PIVOT]
     is_undersampled = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
     nothing_to_check, width = not (has_jumped or is_near_singular or is_undersampled), b.steps.shape[1]
     begin = b.report.size - N_HEAD - 1 - n_rows - width * n_steps
@@ -384,7 +395,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, records, region, checks
     """Start a run from t to t1, and take the first steps; return the number of steps, or a code such as REFUSED.
 
     If a start is repeated bit for bit, the second run checks it again, and saves the data that a start computes. Later
-    runs restore these data, without a check. For the arguments see _start_run and _write_report.
+    runs from it restore these data, without a check. For the arguments see _start_run and _write_report.
     """
     f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
     is_repeated, n_equal = _equals_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]

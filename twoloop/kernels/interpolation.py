@@ -157,7 +157,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
     n = w.Q.size
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], coefficients[:half], coefficients[half:]
-    q_0, v_0 = coefficients[2 * half - 2], coefficients[2 * half - 1]  # the last two rows, which c_v does not use
+    q_0, v_0 = coefficients[2 * half - 2], coefficients[2 * half - 1]  # two rows at the end, which are free for this
     has_D = f.form == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
     failures = 0
     for g in range(groups.shape[0]):
@@ -204,7 +204,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest entry of scale_q |q - q_other| and scale_v |v - v_other|, over its tolerance at state i."""
+    """Return the largest entry of scale_q |q - q_other| and scale_v |v - v_other|, in tolerances of state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -318,7 +318,7 @@ def fill_accelerations(f, w, times, states, out):
                 code = find_tangents(f, w, times[p], q)
         if code == DONE:
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
-        if code == GAMMA_INACCURATE:  # accepted here, because no step depends on these accelerations
+        if code == GAMMA_INACCURATE:  # accept these accelerations: no step depends on them
             required = w.gamma_required
             w.gamma_required = np.inf
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])

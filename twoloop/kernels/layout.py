@@ -38,7 +38,7 @@ ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: nam
 class Layout(NamedTuple):
     """Offsets of the arrays of a workspace, which consists of a block of floats and a block of integers.
 
-    The table of addresses and shapes in a workspace is `table` + `of_numbers` * (address of the floats) + `of_integers`
+    The table of addresses and shapes of a workspace is `table` + `of_numbers` * (address of the floats) + `of_integers`
     * (address of the integers). The first `n_lasting` floats and `n_lasting_integers` integers keep data from one step
     to the next; a step fills all other numbers before it reads them.
     """
@@ -156,7 +156,7 @@ def _fixed_order_shapes(n_q: int, n_c: int, rank: int, form: FixedOrderSizes) ->
         "solutions": (3 * n + n_c,),
     }
     integers: dict[str, tuple[int, ...]] = {
-        "places": (n_c + 1,),
+        "row_entries": (n_c + 1,),
         **{"rows": (rank,), "dependent": (n_q,), "independent": (n_q,), "index": (index_size(0),)},
         **dict.fromkeys(("rows_v", "dependent_v", "independent_v"), (0,)),  # velocities use the arrays of positions
         **dict.fromkeys(("index_v", "index_a"), (index_size(0),)),
@@ -177,7 +177,7 @@ def _create_layout(
     fixed_order: FixedOrderSizes | None,
     n_matrices: int,
 ) -> Layout:
-    """Return the Layout for `Sizes`, whose numbers are the arguments."""
+    """Return the `Layout` of a workspace; the arguments are the numbers of `Sizes`."""
     n_rows = n_c + n_a
     n_redundant = n_rows - r_v
     n_dof = n_q - r_v if reduced else 0
@@ -215,7 +215,7 @@ def _create_layout(
         "matrices": (n_matrices,),  # must be the last array, because it keeps no data from one step to the next
     }
     integers: dict[str, tuple[int, ...]] = {
-        "places": (n_rows + 1 + n_rows * n_q,),
+        "row_entries": (n_rows + 1 + n_rows * n_q,),
         **{"rows": (r,), "dependent": (r,), "independent": (n_q - r,)},
         **{"rows_v": (r_v,), "dependent_v": (r_v,), "independent_v": (n_q - r_v,), "index_v": (index_size(r_v),)},
         "index_a": (index_size(n_augmented),),

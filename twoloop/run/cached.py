@@ -73,15 +73,15 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
 Array = NDArray[np.float64]
 
-MAX_IDLE = 4  # largest number of idle integrators with equal options: one for each thread that integrates
+MAX_IDLE = 4  # largest number of unused integrators kept for the same options: as many threads can integrate at once
 # the first call of compiled code takes this number of chunks, unless `StiffnessMonitor` needs states after each chunk.
 # With more chunks, the answer to Ctrl-C could take more than 0.1 s
 N_FIRST_CHUNKS = 4
-N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
+N_SKIPPED_CALLS = 16  # number of calls, after an exception in a callback, that do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
 SHORT_RUN = 1e-3  # CPU time (s); after a shorter run, elapsed time replaces CPU time, which takes longer to read
-HARMLESS = 0.01  # a correction of v0 is always accepted if it is at most this fraction of the tolerances
+HARMLESS = 0.01  # a v0 is accepted if its projection onto the constraints changes it by at most HARMLESS tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
 
@@ -126,7 +126,7 @@ class CachedIntegrator:
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # indices in `arrays.block`: where the states begin; where the report begins if the run has one state only
+        # first indices in `arrays.block`: of the states, and of a shorter block for results that have one state only
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
@@ -160,8 +160,9 @@ class CachedIntegrator:
     ) -> dict[str, Any] | RepeatRequest | None:
         """Integrate a system from a start; return the fields of the result, or a request to repeat the run.
 
-        Return None if the start needs more checks, or if a callback raised: `set_up` then describes the problem. If
-        nothing unusual happens, the fields are `status` and `later`, a function that computes the others when read.
+        If nothing unusual happens, the fields are `status` and `later`, a function that computes any other field when
+        it is read. Return None if the start needs more checks, or if a callback raised an exception: the caller then
+        calls `set_up`, which does these checks and describes the problem.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
         is_due = region.is_comparison_due()
@@ -217,7 +218,7 @@ class CachedIntegrator:
         return fields
 
     def _pivots_suit_start(self, t0: float, q0: Array) -> bool:
-        """Return whether the pivots chosen for the code are large enough at (t0, q0); M and G are in the arrays."""
+        """Return whether the pivots of the generated code are large enough at (t0, q0); the arrays contain M and G."""
         system, arrays = self.evaluation.system, self.arrays
         system.remember_at("mass and rows", (t0, q0.tobytes()), (arrays.mass.copy(), arrays.rows.copy()))
         return self.code is not None and self.code.is_valid_from(system, t0, q0)
@@ -237,8 +238,8 @@ class CachedIntegrator:
         """Check the first chunk of a run, and integrate to the end if this chunk does not reach it or is unusual.
 
         If the run is unusual, return what `integrate` has to return: fields, a request, or None (the start needs more
-        checks). Otherwise store a requested `sol` in `fields`, and return a tuple with one element: the pair (output
-        times, states), or None if all steps are output. `is_due`: see `check_callbacks_along_run`.
+        checks). Otherwise store `sol` in `fields` if it is requested, and return a tuple with one element: the pair
+        (output times, states), or None if all steps are output. `is_due`: see `check_callbacks_along_run`.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -282,7 +283,7 @@ class CachedIntegrator:
     def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
         """Update the redundant rows of the run at a new start; return False if start or parameters need more checks."""
         run = self.run
-        if run.rows_warning:  # rounding may decide which of several dependent rows counts as redundant
+        if run.rows_warning:  # if rows depend on one another, rounding may decide which of them counts as redundant
             independent = self.arrays.start_rows.tobytes()
             if independent not in self.redundancy:
                 new_run = run.copy_to_start(run.t0, q0, v0)
@@ -294,7 +295,7 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Store which rows are redundant, and the warning about them, given the independent rows as bytes."""
+        """Store which rows of [C_q; A] are redundant, and the warning; `rows`: indices of the other rows, as bytes."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows
@@ -303,7 +304,7 @@ class CachedIntegrator:
         """Restore the attributes of the run, other than arrays, that `IntegrationLoop` may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            # the plan is still the first one, but a new kit may contain a step that was loaded later: keep this kit
+            # the plan has not changed, but `IntegrationLoop` may have added a loaded step to the kit: keep this kit
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
@@ -314,7 +315,7 @@ class CachedIntegrator:
         def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            # once these extreme states are checked, the checked region contains all states of an equal run
+            # also check extreme states: the region of checked states then contains all states if the run is repeated
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
         checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
@@ -343,7 +344,7 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Compute the deferred field `name` of a result; return a dict with this field and others computed with it."""
+    """Compute the field `name` of a result when it is read; return a dict of this field and of all computed with it."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -360,8 +361,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-# `set_up` need not check a start whose smallest pivot is at least this fraction of the one at the first start
-RECHECK_PIVOT = 0.1
+RECHECK_PIVOT = 0.1  # `set_up` need not check a start with at least this fraction of the first start's smallest pivot
 
 
 def arrays_of(
@@ -432,17 +432,17 @@ def arrays_of(
 
 
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
-    """Return a choice of pivots as an array of integers for kernels, and the factor of the rows added to M."""
+    """Return an array of integers that describes a choice of pivots to kernels, and the factor of rows added to M."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # a refined choice compares rows that may be added to M, which only Python can do
+    # a refined choice compares which rows to add to M: there is no compiled code for this comparison
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
 
 
-# largest numbers in a system's cache. MAX_OPTIONS: sets of options. MAX_WORKSPACE: floats in the workspace of a run.
-# MAX_ENTRIES: entries with equal options but different starts, which may need different code
+# limits of a system's cache, as largest numbers of: sets of options (MAX_OPTIONS); floats in the workspace of a cached
+# run (MAX_WORKSPACE); entries with equal options whose different starts need different code (MAX_ENTRIES)
 MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
@@ -557,14 +557,14 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
         run.fixed_order is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
     )
     start = t0, q0.tobytes(), v0.tobytes()
-    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # by compiled code alone
+    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # without checks in Python
     idle: list[CachedIntegrator] | None = [] if can_start else None
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of a system: the first call gets it from `trace_cache_of`, later calls from the system."""
-    cache: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
+    """Return the TraceCache of a system, from `trace_cache_of` or, if this is not the first call, from the system."""
+    cache: TraceCache = system.remembered(("trace cache", trace_cache_of), lambda: trace_cache_of(system))
     return cache
 
 

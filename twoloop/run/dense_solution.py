@@ -1,4 +1,8 @@
-"""Dense output: interpolate the stored states of a run by polynomials, projected onto the constraints."""
+"""Dense output: interpolate the stored states of a run by polynomials, and project the result onto the constraints.
+
+An interval is the time between two accepted states. Interior states are states within an interval, which are computed
+when needed: an interval too long for one accurate polynomial is divided into shorter steps that end at such states.
+"""
 
 from __future__ import annotations
 
@@ -29,16 +33,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-MAX_DIVIDED_INTERVALS = 512  # largest number of intervals with cached interior states
-MAX_ACCURATE_INTERVALS = 65536  # largest number of cached intervals that need no interior states
-# a polynomial is accurate if its residual in constraints and equations of motion, relative to the tolerances, is at
-# most MAX_ERROR. Across singular positions, where velocity errors were ten times the residual, use MAX_ERROR_ACROSS
+MAX_DIVIDED_INTERVALS = 512  # largest number of divided intervals whose interior states are cached
+MAX_ACCURATE_INTERVALS = 65536  # largest number of intervals remembered as accurate without interior states
+# a polynomial counts as accurate if its residual in constraints and equations of motion, relative to the tolerances, is
+# at most MAX_ERROR (across singular positions MAX_ERROR_ACROSS: there, velocity errors are ten times the residual)
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
 N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
 
 
 class StateTable(NamedTuple):
-    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), and kinds of the n - 1 intervals."""
+    """States at the ends of accepted steps: n times, n rows [q, v, a], and the kinds of the n - 1 intervals."""
 
     t: Array
     states: Array
@@ -60,8 +64,8 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 class Interpolator:
     """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
-    `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: ranks of C_q and [C_q; A]. `plans`: for each kind of
-    interval that is divided, the plan that divides it into `plan.parts` equal steps.
+    `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: ranks of C_q and [C_q; A]. `plans`: keys are the
+    kinds of interval that are divided; the value is the plan whose method takes `plan.parts` equal steps in it.
     """
 
     def __init__(
@@ -89,10 +93,10 @@ class Interpolator:
         self.failures, self.warns = 0, True  # number of failures in the last call; whether to warn of failures
         # keys of these dicts: times at which intervals begin. Interior states: (times, states), both ends included
         self.interior_states: dict[float, tuple[Array, Array]] = {}
-        # memories of crossing steps, which contain the polynomials in these intervals
+        # arrays `memory` of crossing steps (steps across a singular position), which contain the polynomials there
         self.crossing_memories: dict[float, Array] = {}
-        self.accurate_intervals: set[float] = set()  # beginnings of intervals that need no interior states
-        self.may_divide = True  # whether interior states may be computed; false if they were read from a file
+        self.accurate_intervals: set[float] = set()  # times at which intervals that need no interior states begin
+        self.may_divide = True  # whether interior states may be computed; False if they were read from a file
         self._allocate_scratch()
 
     def _create_workspace(self) -> None:
@@ -100,7 +104,7 @@ class Interpolator:
         system, t0, row = self.arguments[:3]
         q0, form = row[: system.n_q], self.fixed_order
         for plan in self.plans.values():
-            load_step(plan.second)  # loaded here, because `result.sol` may need the step at any time
+            load_step(plan.second)  # load the code now, because `result.sol` may take such a step at any time
         self.kits = {kind: make_kit(system, t0, q0, plan, form) for kind, plan in self.plans.items()}
         self.kit = make_kit(system, t0, q0, None, form)
         pattern = pattern_of(system, t0, q0) if form is None else np.zeros((0, 0))
@@ -112,7 +116,7 @@ class Interpolator:
         from twoloop.kernels import advance
 
         system, t0, row = self.arguments[:3]
-        self.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
+        self.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels keep the known ranks
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repair_plans: dict[bool, tuple[Plan, Any]] = {}
@@ -130,12 +134,12 @@ class Interpolator:
         self.nodes[:], self.scratch[:], self.rows[:] = 0.0, 0.0, 0.0
 
     def _switch_to_dense_form(self) -> None:
-        """Replace the fixed-order form of linear algebra, after a failure, by the dense form."""
+        """Replace sparse factors in a fixed order of elimination, which have failed, by dense ones."""
         self.fixed_order = None
         self._create_workspace()
 
     def _allocate_scratch(self) -> None:
-        """Allocate scratch arrays for the coefficients of two polynomials."""
+        """Allocate scratch arrays for the nodes and coefficients of two polynomials."""
         n_nodes = 3 * max(indices.WINDOW, self.parts + 1)
         n = self.system.n_q
         self.nodes, self.scratch, self.rows = np.zeros(2 * n_nodes), np.zeros((2 * n_nodes, n)), np.zeros((3, 2 * n))
@@ -173,7 +177,7 @@ class Interpolator:
         return out
 
     def row_function(self, table: StateTable, t: float) -> Callable[[float], Array]:
-        """Return a function that computes the row [q, v] at any time in the interval of `table` that contains t."""
+        """Return the function time -> row [q, v] that is valid in the interval of `table` that contains t."""
         intervals = _interval_rows(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         intervals[:, indices.END_TIME] = 1
         self._divide_inaccurate_intervals(table, intervals)
@@ -195,7 +199,7 @@ class Interpolator:
             _warn_of_lost_rank(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
     def _interpolate_intervals(self, table: StateTable, intervals: Integers, times: Array, out: Array) -> int:
-        """Store in `out` (n, 2 n_q) rows [q, v] at the times in these intervals; return the number of failures."""
+        """Store rows [q, v] at `times`, all within `intervals`, in `out`; return how many projections failed."""
         inputs = (self.tolerances, table.t, table.states, np.ascontiguousarray(intervals))
         rest = (times, self.nodes, self.scratch, out)
         failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *inputs, *rest))
@@ -205,7 +209,7 @@ class Interpolator:
         return failures
 
     def _divide_inaccurate_intervals(self, table: StateTable, intervals: Integers) -> None:
-        """Compute and cache interior states of each interval whose polynomial is not accurate without them."""
+        """Compute interior states of each interval that one polynomial does not interpolate accurately; cache them."""
         start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in start_times])
         if not self.may_divide or not is_new.any():
@@ -231,7 +235,7 @@ class Interpolator:
         errors = np.zeros(len(intervals))
         errors[is_divided] = self._estimate_residuals(divided, own_intervals)
         errors[~is_divided] = self._estimate_residuals(table, undivided)
-        # if the plan for its kind failed to divide an interval, the interval is too long for a polynomial
+        # an interval of a kind that has to be divided is too long for one polynomial, also if the division failed
         errors[~is_divided & np.isin(intervals[:, indices.KIND], list(self.plans))] = np.inf
         is_accurate = errors <= np.where(intervals[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
         self.accurate_intervals.update(table.t[intervals[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
@@ -246,9 +250,9 @@ class Interpolator:
         return out
 
     def _repair_interval(self, table: StateTable, interval: Integers, smallest: float) -> None:
-        """Try other nodes for the polynomial of an interval; cache them if they reduce its residual below `smallest`.
+        """Try other nodes for the polynomial of an interval; cache the best if its residual is below `smallest`.
 
-        Nodes to try: states in a step across a singular position, states of N_REPAIR_STEPS steps, and the two ends.
+        Nodes to try: states in a crossing step, ends of N_REPAIR_STEPS steps, and the two ends of the interval only.
         """
         i, kind = int(interval[indices.FIRST_OWN]), int(interval[indices.KIND])
         begin = float(table.t[i])
@@ -271,7 +275,7 @@ class Interpolator:
             self.accurate_intervals.add(begin)
 
     def _cross_interval(self, table: StateTable, i: int) -> tuple[Array, Array] | None:
-        """Return times and states in interval i, computed by a crossing step, see crossing_step.py; None on failure."""
+        """Take a crossing step (see crossing_step.py) through interval i; return times and states, None on failure."""
         from twoloop.kernels.steps import crossing_step as kernels
 
         if self.fixed_order is not None:
@@ -288,7 +292,7 @@ class Interpolator:
         return self._states_in_crossing_step(table, i, plan.memory) if succeeded else None
 
     def _states_in_crossing_step(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states in interval i from the polynomial in `memory`, which a crossing step has computed."""
+        """Return times and states in interval i: values of the polynomial that a crossing step stored in `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
@@ -319,7 +323,7 @@ class Interpolator:
         return self.repair_plans[is_stiff]
 
     def _split_intervals(self, table: StateTable, intervals: Integers) -> tuple[StateTable, Integers, Integers]:
-        """Return a StateTable of the cached interior states, the intervals that have such states, and the others."""
+        """Return a StateTable of cached interior states, the intervals (rows) that have such states, and the others."""
         start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_divided = np.array([t in self.interior_states for t in start_times], dtype=bool)
         pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
@@ -335,7 +339,7 @@ class Interpolator:
     def _divide_intervals(
         self, table: StateTable, plan: Plan, kit: Any, numbers: Integers
     ) -> dict[float, tuple[Array, Array]]:
-        """Divide intervals into `plan.parts` steps, or fewer if steps fail; return {first time: (times, states)}."""
+        """Divide intervals into `plan.parts` steps, or fewer if steps fail; return interior states by first time."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
@@ -405,12 +409,12 @@ def _blocks_of_intervals(rows: Integers) -> list[Integers]:
 
 
 def _interval_rows(table: StateTable, numbers: Integers) -> Integers:
-    """Return a row of indices (for kernels) for each interval number; the rows do not contain output times yet."""
+    """Return the table of intervals that kernels read (columns: see indices.py), still without output times."""
     rows = np.zeros((len(numbers), indices.N_COLUMNS), dtype=np.int64)
     rows[:, indices.FIRST_OWN], rows[:, indices.LAST_OWN] = numbers, numbers + 1
     rows[:, indices.KIND] = table.kinds[numbers]
     rows[:, indices.HIGH] = len(table.t) - 1
-    # polynomials across a singular position do not use states before the crossing, which may have rounding errors
+    # polynomials across a singular position use no states before the crossing steps: rounding errors may be large there
     is_crossing = np.append(False, table.kinds == indices.ACROSS)
     (crossing_starts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
     if crossing_starts.size:
@@ -431,7 +435,7 @@ def _warn_of_lost_rank(consequence: str, stacklevel: int = 4) -> None:
 
 
 class OutputInterpolation:
-    """Interpolation of states at output times, for successive runs that use the arrays of one Run."""
+    """Interpolation of states at output times, for successive runs that reuse the arrays of one `Run`."""
 
     def __init__(self, run: Run):
         self.run, self._rows = run, np.zeros((0, 0))
@@ -460,7 +464,7 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.fill_accelerations(times, rows, a_and_lam)
-        if interpolator.fixed_order is not None or interpolator.repair_plans:  # its workspace may not suit another run
+        if interpolator.fixed_order is not None or interpolator.repair_plans:  # another run may need another workspace
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 
@@ -532,10 +536,10 @@ class DenseSolution:
     Some steps are too long for such polynomials: steps of `RungeKutta` of order 6 and more (with Newton's method, of
     order 7 and more), of `Taylor` and of `Lobatto16`, also within `auto`. Each such step is divided into 2 to 6 equal
     steps of the method when a time within it is first evaluated; this costs about as much as the run. If the last node
-    of a polynomial changes it by more than the tolerances, the polynomial is compared with the constraints and the
-    equations at two times in the interval. Beside a singular position or a jump of a force, a polynomial may violate
-    them. Then the interval gets the interior states of a step across the position, or of four steps of `DOP853` (of a
-    Radau method where Newton's method was used), or none, whichever fits best. These evaluations are not counted.
+    of a polynomial changes it by more than the tolerances, the constraints and equations of motion are evaluated at two
+    times in the interval. Beside a singular position or a jump of a force, the polynomial may violate them. Then three
+    other polynomials are tried: through states of a step across the position, through ends of four steps of `DOP853`
+    (after Newton's method: of a Radau method), and through the ends of the interval. These evaluations are not counted.
 
     The solution takes 8 (2 + 3 n_q) bytes of memory per step.
 

@@ -1,7 +1,7 @@
 """Continue a run where its own steps cannot: with another method, across a singular position, or over a jump.
 
-If forces changed for a short time, the run is repeated with more evaluations, at most MAX_REPETITIONS times: in forces
-with noise, every repetition would find shorter changes. The last repetition warns.
+If forces changed for a short time, the run is repeated with more evaluations, at most MAX_REPETITIONS times: in noisy
+forces, every repetition would find shorter changes. If the last repetition finds shorter ones, too, the run warns.
 """
 
 from typing import NamedTuple
@@ -20,9 +20,9 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import TimedState
 from twoloop.run.workspace import kit_for_plan, make_kit
 
-# limits of the duration of the shortest change of forces or drives, divided by the longest time between evaluations.
-# Below REPEAT_BELOW, the run may have missed shorter changes, and is repeated. Below WARN_BELOW, the run may even have
-# missed other changes of this duration, and warns if it is not repeated
+# limits of the duration of the shortest change of forces or drives that a run has seen, divided by the longest time
+# between its evaluations. Below REPEAT_BELOW, it may have missed shorter changes: repeat the run. Below WARN_BELOW, it
+# may even have missed other changes of this duration: warn if the run is not repeated
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
 EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations that a repetition makes within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
@@ -59,7 +59,7 @@ Array = NDArray[np.float64]
 N_CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
 # singular values count as zero (because of a redundant row) up to this fraction of the largest singular value
 NEGLIGIBLE_RATIO = 1e-12
-MAX_RESIDUAL = 1e-8  # largest residual of the equations of a jump, relative to their right-hand side
+MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, relative to their right-hand side
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
@@ -99,15 +99,15 @@ LARGEST_RATIO = max(SIZE_RATIOS)
 # "distance" of a state from a singular position: smallest pivot of C_q, relative to the largest such pivot of the run.
 # The base, the state at which the polynomial across the position begins, should have at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
-# limits of steps across a singular position. STRICT: the limits of the run. WIDER: evaluations may be GAP_FACTOR times
-# as far apart (arbitrarily far if no force can be short). NEARER: also, steps may end before the position. LOOSER:
-# also, tolerances are multiplied by TOLERANCE_FACTOR
+# limits on steps across a singular position, each looser than the one before. STRICT: the limits of the run. WIDER:
+# evaluations may be GAP_FACTOR times as far apart (any distance if no force can be short). NEARER: steps may also end
+# before the position. LOOSER: tolerances are also multiplied by TOLERANCE_FACTOR
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 LIMITS = STRICT, WIDER, NEARER, LOOSER = tuple(range(4))
 
 
 class Origin(NamedTuple):
-    """Where a polynomial across a singular position begins, and its limits, for attempts with several step sizes."""
+    """Beginning and limits of a polynomial across a singular position; attempts with several step sizes share them."""
 
     earliest: float  # no node of the polynomial is before this time (s)
     base: TimedState | None  # earlier state at which the polynomial begins; None: it begins at the current state
@@ -115,7 +115,7 @@ class Origin(NamedTuple):
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# if the distance of an earlier state is below this fraction of the base's, another singular position is between them
+# if an earlier state has less than this fraction of the base's distance, another singular position lies between the two
 MIN_DISTANCE_RATIO = 0.5
 
 
@@ -131,7 +131,7 @@ def requires_crossing(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Replace a run's plan, whose steps fail or are unsuitable, by its substitute; try a failed size again."""
+    """Replace a run's plan, whose steps fail or are unsuitable, by its substitute, and try the same step size again."""
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` never changes, and needs no copy
@@ -165,15 +165,15 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     base, run.mirrored_size = None, 0.0
     if not has_fixed_step:
         base, run.mirrored_size = _find_base_state(run, [place for place in past if place[0] >= earliest])
-    # one origin may fail: nodes may lie before a jump of a force; near the start or the end of the run, there may be
-    # too few nodes; a polynomial from an old base may be too long. So several origins are tried
+    # try several origins, because one may fail: its nodes may lie before a jump of a force; near the start or the end
+    # of the run, there may be too few nodes; a polynomial from an old base may be too long
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and clock[a.T] - clock[a.T_START] < h_long
     near_end = compiled and clock[a.T] + LARGEST_RATIO * h_long > run.t1
     origins = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
     origins.append((np.inf, None))
     ends = [False, True] if near_end and not has_fixed_step else [False]
-    if run.mirrored_size > run.t1 - clock[a.T]:  # the run ends nearer to the position: try first to end beyond the run
+    if run.mirrored_size > run.t1 - clock[a.T]:  # the run ends close behind the position: try first to step beyond t1
         ends.reverse()
     run.origins = [Origin(*start, limits, beyond) for limits in _limits(run) for beyond in ends for start in origins]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
@@ -197,7 +197,7 @@ def _limits(run: Run) -> tuple[int, ...]:
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
-    """Move the first of `run.origins` to the plan's memory, and set the step sizes and limits to try with it."""
+    """Move the first of `run.origins` to the plan's memory, and set the step sizes and limits to try from there."""
     from twoloop.kernels.steps.crossing_step import begin_polynomial
 
     a, clock = run.a, run.clock
@@ -227,9 +227,9 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
     """Return the base (first state) of a polynomial across a singular position, and the mirrored step size (s).
 
-    The base is the latest state in `past` that is far from the position, because rounding changes velocities near it;
-    if none is far, the farthest state; None if the current state is farther. If the distance changes linearly, a step
-    of the mirrored size ends as far beyond the position as the base is before it; 0: the distance grows.
+    The base is the latest state in `past` that is far from the position, because rounding changes velocities near it.
+    If none is far, it is the farthest one; None if the current state is farther than all of them. If the distance
+    changes linearly, a step of the mirrored size ends as far beyond the position as the base is before it.
     """
     a, clock, t, n = run.a, run.clock, float(run.clock[run.a.T]), run.system.n_q
 
@@ -300,7 +300,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.piece_ends[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.piece_ends, stored[kernels.END] = [], -np.inf
-    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # no partition can be chosen there
+    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # there, no choice of dependent coordinates works
     if at_singular_start and code == a.RANK_LOST:
         code = a.PAUSED
     if n_accepted > 0:  # the whole polynomial counts as one step
@@ -336,7 +336,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
 
 
 def apply_jump(run: Run, t1: float) -> bool:
-    """Store the state after a jump of C_t or b in `run.new_state`, restart the method; return False if none exists."""
+    """Store the state after a jump of C_t or b in `run.new_state`, and restart the method; return False on failure."""
     a, clock, n = run.a, run.clock, run.system.n_q
     t_after = float(clock[a.JUMP_TO])
     state = state_after_jump(run.system, t_after, run.state[:n], run.state[n : 2 * n])

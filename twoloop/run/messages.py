@@ -39,8 +39,8 @@ Array = NDArray[np.float64]
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of the end of a run, in addition to those of `advance`
 STAGNATION_STEPS = 20_000  # smallest number of accepted steps over which the mean step size is computed
-# A run stalls if its mean step size is below STAGNATION_PACE times its largest step, and the rest of the run would take
-# more than STAGNATION_LEFT steps; or if the rest would take more than MAX_STEPS_LEFT steps, that is, days.
+# A run stalls if its mean step size is below STAGNATION_PACE times its largest step and the rest of the run would take
+# more than STAGNATION_LEFT steps, or if the rest would take more than MAX_STEPS_LEFT steps (days of computing)
 STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
 
 
@@ -77,12 +77,14 @@ class StallDetector:
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
 N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
-INITIAL_FACTOR = 0.1  # this multiple of `initial_direction` is added to the last eigenvectors: no component may stay 0
+# a power iteration starts with the eigenvectors of the last sample plus INITIAL_FACTOR times `initial_direction`,
+# because a component of the new eigenvector that is zero in the first vector would stay zero
+INITIAL_FACTOR = 0.1
 # the dominant eigenvalue is negative if the cosine of the angle from a direction to its image is below -MIN_ALIGNMENT
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# a problem counts as stiff if the median of h * rate / limit over the samples is at least this. `h`: step size; `rate`:
-# rate of the fastest vibration or decay; `limit`: largest stable h * rate. In smooth motion the median is 0.4
+# stability counts as the limit of the steps if the median of h * rate / limit over the samples is at least this (`h`:
+# step size; `rate`: of the fastest vibration or decay; `limit`: largest stable h * rate). In smooth motion it is 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -197,7 +199,9 @@ def _dominant_eigenvalue(
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not trusted if rounding errors of velocities (or accelerations) exceed this multiple of the tolerances
 MAX_LASTING_ERROR = 100.0
-MAX_RATIO_AT_END = 1e-6  # up to this ratio of singular values, constraints do not determine the velocities at the end
+# the run warns if the ratio of the smallest to the largest singular value of the constraint rows at its end is at most
+# this: then the constraints do not determine the velocities there
+MAX_RATIO_AT_END = 1e-6
 # advice if no step leads across a singular position; loose tolerances help, because rounding errors are large near it
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
@@ -218,8 +222,8 @@ _FAILURE_REASONS = {
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} with a function that computes the text when it is read.
 
-    A text that describes crossings is computed later, because this takes longer than many runs. Until then `system`
-    must not change, but the arrays of the run may.
+    A text that describes crossed singular positions is computed later, because this takes longer than many runs. Until
+    then `system` must not change, but the arrays of the run may.
     """
     if CROSSINGS_MARK not in text:
         return {"message": text}
@@ -252,7 +256,7 @@ def reject_velocity_jumps(
 
 
 def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
-    """Return a sentence about the first of `states` before `end` in which rounding changed v, else ""."""
+    """Return a sentence about the first of `states` before `end` in which rounding changed v; "" if there is none."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
@@ -340,7 +344,7 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
 
 
 def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
-    """Return sentences about how short the steps are, how many more would be needed, and the likely reason."""
+    """Describe a stalled run: how short its steps are, how many more it would need, and the likely reason."""
     n_left = (t1 - float(run.clock[run.a.T])) / stall.mean_step
     earlier_steps, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
     if stall.has_slowed:
@@ -356,7 +360,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 
 def _describe_contradiction(run: "Run") -> str:
-    """Return the message of a run that stopped: a redundant row is violated, or no branch leaves a singular start."""
+    """Return the message of a run that stopped because a redundant row is violated or no branch leaves the start."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     if run.starts_singular:
         return (
@@ -440,7 +444,7 @@ def _ratio_text(run: "Run", t: float, q: Array) -> str:
 
 
 def _describe_near_end(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped so near t1 that a crossing step would need nodes beyond t1, else ""."""
+    """If the run stopped so near t1 that a crossing step would evaluate beyond t1, return a sentence on it; else ""."""
     time_left = t1 - float(run.clock[run.a.T])
     if time_left > max(NEAR_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""
@@ -448,7 +452,7 @@ def _describe_near_end(run: "Run", t1: float) -> str:
 
 
 def _describe_near_singular(run: "Run", t1: float) -> str:
-    """Return sentences if C_q is close to losing rank at the last state, else ""."""
+    """If C_q is close to losing rank at the last state, return sentences on it; else ""."""
     ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
     if ratio > MAX_SINGULAR_RATIO:
         return ""

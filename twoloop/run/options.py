@@ -19,7 +19,7 @@ SMALLEST_TOLERANCE = 1e-15  # rtol and atol must not both be smaller: rounding w
 
 @lru_cache(maxsize=1024)
 def _unique_key(*_: Any) -> object:
-    """Return the same object for equal arguments; as a key of a dict, it is faster than a tuple of the arguments."""
+    """Return one object for equal arguments, the same at each call: a dict finds it faster than a tuple as its key."""
     return object()
 
 
@@ -46,23 +46,23 @@ class Options:
 
     @cached_property
     def own_tolerance(self) -> float | None:
-        """Tolerance that replaces rtol and atol in a method with its own error test (Newmark); None: other methods."""
+        """Tolerance that replaces rtol and atol in a method with its own error test (Newmark), else None."""
         return getattr(self.method, "error_tol", None)
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result, and `untested` = None if all steps have an error test."""
+        """Fields `method` and `rtol` of a result; also `untested` = None if the method tests the error of each step."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_step_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
-        run.work.notes[indices.NEXT_JUMP] = t1  # no jump of C_t is known before t1
+        run.work.notes[indices.NEXT_JUMP] = t1  # the time of the next known jump of C_t or b: none before t1
         if self.step_size is None:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # before the first call, it replaces the arguments and options of the last call
+NO_OPTIONS: Any = (None,) * 12, None  # stands for the arguments and options of the last call before there was a call
 
 
 def options_of(
@@ -86,7 +86,7 @@ def options_of(
     """
     last_arguments, options = system.shared.get("options", NO_OPTIONS)
     m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last_arguments
-    # no loop over the arguments, because that would take a tenth of the time of a short repeated call
+    # compare the arguments one by one: a loop over them would take a tenth of the time of a short repeated call
     same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
     same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
     if same and checks is check_derivatives and code is compiled:
@@ -120,7 +120,7 @@ def options_of(
         check_positive("time_limit", time_limit)
     step_options = first_step, float(max_step), max_steps, step_size
     options = Options(method_object, float(rtol), tolerances, *step_options, generates, bool(check_derivatives))
-    if type(atol) is float and is_preset(method):  # the caller may change objects of other types
+    if type(atol) is float and is_preset(method):  # the caller may change objects of other types between calls
         arguments = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress
         system.shared["options"] = (*arguments, time_limit, check_derivatives, compiled), options
     return options

@@ -1,8 +1,8 @@
 """Use one run for many systems that differ only in their parameters.
 
-Numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. New parameters replace
-them; then choices that depend on them are checked again, and callbacks are compared with their traces near the start.
-Along the run, this comparison is repeated if states or parameters are outside the region that was checked before.
+All numbers that depend on parameters are in arrays, which are filled anew for the next system. Then choices that depend
+on the numbers, such as pivots, are checked again, and callbacks are compared with their traces near the start. Along
+the run, they are compared where states or parameters are outside the region in which earlier runs compared them.
 """
 
 import copy
@@ -28,17 +28,17 @@ from twoloop.run.workspace import is_diagonal, kit_for_plan
 
 Array = NDArray[np.float64]
 
-NUMBER_FIELDS = ("options", "numbers", "own_numbers")  # fields of a plan: arrays that may depend on parameters
-PLAN_FIELDS = ("interior", "substitute", "within_newton")  # fields of a plan whose values are plans
+NUMBER_FIELDS = ("options", "numbers", "own_numbers")  # fields of a `Plan` whose arrays may depend on parameters
+PLAN_FIELDS = ("interior", "substitute", "within_newton")  # fields of a `Plan` whose values are plans, too
 
 
 class SharedSetup:
     """Setup shared by the runs of systems that differ only in their parameters.
 
     `run`: run of one of the systems, at its start; copies of this run are integrated. `code`: the generated code that
-    it calls, requested with `method`, `fixed` (whether the step size is constant) and `compiled`. Raise ValueError if
-    setup cannot be shared: the system is large, a callback may branch on its parameters, or numbers in the plan differ
-    from the values of their traced expressions.
+    the run calls; it was generated for `method`, `fixed` (whether the step size is constant) and `compiled`. Raise
+    ValueError if setup cannot be shared: the system is large, a callback may branch on its parameters, or numbers in
+    the plan differ from the values of their traced expressions.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -49,7 +49,7 @@ class SharedSetup:
             raise ValueError("for large systems, more choices depend on the numbers")
         symbolic = copy.copy(system)  # a system whose numbers are expressions in the parameters
         cache = self.trace_cache
-        symbolic.derived = {("family", trace_cache_of): cache, ("numbers", cache): lambda array: array}
+        symbolic.derived = {("trace cache", trace_cache_of): cache, ("numbers", cache): lambda array: array}
         symbolic_code = code_for(symbolic, method, fixed, compiled, t, q, accept_traces)
         self.plan, self.interior_plans = plans_for(
             symbolic, method, run.rtol, run.least_atol, fixed, symbolic_code, accept_traces
@@ -73,8 +73,8 @@ class SharedSetup:
 class ParametricRun:
     """Run that integrates one system after another: `use_parameters_of` writes a system's parameters to its arrays.
 
-    `run` is a copy of the run of `shared`, at its start. The arrays contain the parameters of `current_system`;
-    `system` is a copy of `current_system` with these arrays, and with a cache of its own.
+    `run`: a copy of the run in `shared`, at its start. `current_system`: the system whose parameters the arrays contain
+    now. `system`: a copy of it that uses these arrays, and has a cache of its own.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
@@ -85,7 +85,7 @@ class ParametricRun:
         run.interior_plans = {kind: self._replace_arrays(each) for kind, each in shared.interior_plans.items()}
         run.traced, run.varied_parameters = run.plan.traced, self._functions.p
         self._initial_cache: dict[Any, Any] = {
-            ("family", trace_cache_of): shared.trace_cache,
+            ("trace cache", trace_cache_of): shared.trace_cache,
             ("derivatives", trace_cache_of): None if exact is None else exact.replace_coefficients(array),
             ("kit", id(self._functions)): Kit(self._functions),
             "kits": {},
@@ -94,7 +94,7 @@ class ParametricRun:
         run.kit = kit_for_plan(self.system, run.kit.flags, run.plan)
 
     def use_parameters_of(self, system: ConstrainedSystem) -> bool:
-        """Fill the arrays with the parameters of a system; return False if the arrays contained them already."""
+        """Write the parameters of a system to the arrays; return False if the arrays contained them already."""
         if system is self.current_system:
             return False
         self._fill_arrays(system)
@@ -129,7 +129,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _replace_arrays(self, plan: Plan) -> Plan:
-        """Return a copy of a plan with arrays for `_fill_arrays` in place of arrays of expressions."""
+        """Return a copy of a plan in which arrays of numbers (see `_fill_arrays`) replace arrays of expressions."""
         array, values = self._expression_arrays.array, vars(plan)
         changes: dict[str, Any] = {name: array(values[name]) for name in NUMBER_FIELDS if values[name] is not None}
         changes |= {name: self._replace_arrays(values[name]) for name in PLAN_FIELDS if values[name] is not None}
@@ -149,5 +149,5 @@ def _values_of_plan(plan: Plan) -> Iterator[Any]:
             yield from _values_of_plan(value)
         elif name == "traced":
             yield [part.tobytes() for each in value for part in each.program[:-1]]
-        elif name != "stable_to":  # left out, because equal plans have different lambdas
+        elif name != "stable_to":  # a lambda, which differs even between equal plans
             yield value.tobytes() if isinstance(value, np.ndarray) else value

@@ -1,7 +1,7 @@
 """Project a guess onto the constraints (`consistent_state`); report how far the guess moved, and its assembly.
 
-Large systems are projected by sparse factors, except in three cases: rows are dependent at consistent positions, but
-only nearly dependent at the guess; a dead centre is near; the guess may lead to another assembly.
+Large systems are projected by sparse factors, except in three cases: rows of C_q are dependent at consistent positions,
+but only nearly dependent at the guess; a dead centre is near; the guess may lead to another assembly.
 """
 
 from __future__ import annotations  # so that help() shows the name ArrayLike
@@ -30,10 +30,9 @@ from twoloop.run.workspace import fixed_order_form, make_kit, workspace
 Array = NDArray[np.float64]
 
 MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle between a row of C_q and the other rows is below this
-# MAX_CORRECTIONS: largest number of Newton iterations; ROUNDING: correction that ends them, relative to max|q|
+# MAX_CORRECTIONS: largest number of Newton iterations; they end when a correction is at most ROUNDING times max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# on the same assembly, projected guesses are this close to their linear prediction, relative to their displacement
-MAX_NONLINEARITY = 0.5
+MAX_NONLINEARITY = 0.5  # largest error of a prediction by C_q, relative to the displacement, on the same assembly
 
 
 class _SparseProjection:
@@ -86,7 +85,7 @@ class _SparseProjection:
         if self.run_task(tasks.RESTORE, q, discarded) != indices.DONE:
             return None
         v = v.copy()  # until the positions are final, only a copy of the velocities is projected
-        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # the second RESTORE leaves rounding errors
+        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # a second RESTORE, down to rounding errors
             if self.run_task(task, q, v) != indices.DONE:
                 return None
         self.position = q
@@ -103,7 +102,7 @@ class Dependence(NamedTuple):
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
-    """Return how the rows of C_q of a large system depend on others at q; None if sparse factors are not reliable."""
+    """Find which rows of C_q of a large system depend on the others at q; None if sparse factors are not reliable."""
     form, all_rows = fixed_order_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
@@ -164,8 +163,8 @@ def project_sparsely(
 def _nearby_guesses_match(projection: _SparseProjection, position: Array, change: Array) -> bool:
     """Return whether the linearized constraints predict where three guesses near `position` are projected.
 
-    The guesses are displaced from `position` by -2 `change`, and by two random vectors of at most max|change|. If one
-    of them is projected to another place, another assembly may be as near to `position` as the user's guess.
+    The guesses are displaced from `position` by -2 `change`, and by two random vectors of at most max|change|. If the
+    prediction fails for one, there may be another assembly as near to `position` as the user's guess.
     """
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
@@ -181,13 +180,13 @@ def _nearby_guesses_match(projection: _SparseProjection, position: Array, change
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-CONVERGED_VIOLATION = 1e-2  # the iteration ends with this violation, relative to the violation allowed at a start
+CONVERGED_VIOLATION = 1e-2  # the iteration ends below this violation, relative to the violation allowed at a start
 # singular values count as zero if they are below this fraction of the largest one: RANK_CUTOFF for ranks, LSTSQ_CUTOFF
 # for least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 # a dead centre is near if the ratio of the smallest to the largest singular value is at most this
 DEAD_CENTRE_RATIO = 0.01
-# positions count as equal up to this distance, relative to the largest change by the projection
+# two positions count as equal if their distance is at most this fraction of the largest change by the projection
 MAX_EQUAL_DISTANCE = 0.1
 MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in units of `Scales.columns`
 
@@ -335,7 +334,7 @@ class _LargeState(ConsistentState):
 def _projected_position(
     system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int], check_assembly: bool
 ) -> Array:
-    """Return a guess projected by its `free` coordinates; raise if that fails, or if the assembly is in doubt."""
+    """Project a guess by changing its `free` coordinates; raise if that fails, or if the assembly is in doubt."""
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
@@ -359,7 +358,7 @@ def _projected_position(
             f"is nearer to an assembled position{_describe_rank_loss(scales, jacobian, free, kept)}"
         )
     shift = float((np.abs(position - guess) / scales.columns).max())
-    if check_assembly and (violation.excess > 1.0 or shift > CONSISTENT):  # small errors may move q far
+    if check_assembly and (violation.excess > 1.0 or shift > CONSISTENT):  # even a small violation may move q far
         ending = _describe_other_assembly(system, t, position, guess, free, scales, cutoff)
         if ending is not None:
             jacobian_there = system.jacobian(t, position)
@@ -376,10 +375,10 @@ def _projected_position(
 def _describe_other_assembly(
     system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Project other guesses, as far from `q1` as `guess`; return what happens to one that leaves the assembly, or None.
+    """Project other guesses, as far from `q1` as `guess`; if one leads to another assembly, describe it, else None.
 
-    On the same assembly, a guess is projected near the point that C_q predicts to first order, and the determinant
-    keeps its sign. Two assemblies may differ in the dependent coordinates alone.
+    A guess leads to the same assembly if its projection is near the point that C_q predicts to first order, and the
+    determinant of the dependent columns keeps its sign. Two assemblies may differ in the dependent coordinates alone.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -403,8 +402,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # perhaps curvature explains the distance. Then a guess with the dependent coordinates of `projected` and the
-        # other coordinates of q1 is projected back to q1
+        # perhaps the curvature of the constraints explains the distance. If so, a guess with the dependent coordinates
+        # of `projected` and the other coordinates of q1 is projected back to q1
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
@@ -426,12 +425,12 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = LSTSQ_CUTOFF
 ) -> tuple[Array | None, float, int]:
-    """Return the projected q (None: diverged), its violation relative to the allowed one, and the iteration count."""
+    """Return the projected q (None: diverged), violation / allowed violation at q, and the number of iterations."""
     least_excess, best_q, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
             jacobian, values = system.jacobian(t, q), system.constraint(t, q)
-        except (ArithmeticError, ValueError):  # an iterate outside the domain of the callbacks
+        except (ArithmeticError, ValueError):  # the iteration has left the domain of the callbacks
             return None, np.inf, iteration
         if not (np.isfinite(jacobian).all() and np.isfinite(values).all()):
             return None, np.inf, iteration
@@ -488,7 +487,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Return a sentence if C_q nearly loses rank, both unscaled and scaled, else ""."""
+    """If C_q nearly loses rank, with scaled rows and columns and without scaling, return a sentence on it; else ""."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]

@@ -34,7 +34,7 @@ STEP_ARRAYS = ("h", "rejected_error", "rejected_convergence", "partitioned", "un
 class MemoryStore:
     """Store of named arrays in memory; an array is a list of parts until it is read."""
 
-    append_only = False  # whether rows must be complete when they are added, because they cannot be changed later
+    append_only = False  # whether stored rows cannot be changed, and so must be complete when they are added
 
     def __init__(self) -> None:
         self._parts: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
@@ -116,14 +116,14 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING_STATES = 1024  # with more states since the last search for events and interpolation, both are done again
+MAX_PENDING_STATES = 1024  # largest number of new states before they are searched for events, and interpolated
 
 
 class OutputRequest(NamedTuple):
     """Requested output of a run."""
 
     times: Array | None = None  # output times; None: the ends of all accepted steps
-    ends_at_outputs: bool = False  # whether steps end at all output times, so that no states are interpolated
+    ends_at_outputs: bool = False  # whether steps end at all output times: then no states need be interpolated
     dense: bool = False  # whether dense output, `result.sol`, is requested
     events: list[Event] | None = None  # events to be searched for; None: no events were requested
     store: Any = None  # `MemoryStore` or `FileStore` to which the output is added; None: a new MemoryStore
@@ -238,7 +238,7 @@ class Recorder:
         return None if self.search is None else self.search.ended
 
     def search_intervals(self, end: int | None = None) -> None:
-        """Search intervals for events, and store states at output times in them; `end`: index of the last state."""
+        """Search the intervals before state number `end` for events, and store states at output times in them."""
         end = len(self._t) - 1 if end is None else end
         interpolator = self.interpolator
         if interpolator is None or self.end_event is not None or self.interrupted:
@@ -287,7 +287,7 @@ class Recorder:
         return t, self._complete_rows(t, store.array("states"))
 
     def _complete_rows(self, times: Array, rows: Array) -> Array:
-        """Return rows [q, v, a, lam] for states given by rows [q, v]; rows [q, v, a, lam] are returned unchanged."""
+        """Append [a, lam] to rows [q, v]; rows [q, v, a, lam] are returned unchanged."""
         if self.interpolator is None or rows.shape[1] == self._width:
             return rows
         a_and_lam = np.full((len(times), self._width - rows.shape[1]), np.nan)
@@ -295,7 +295,7 @@ class Recorder:
             self.interpolator.fill_accelerations(times, rows, a_and_lam)
         except KeyboardInterrupt:
             self.interrupted = True
-            a_and_lam[np.isnan(a_and_lam).any(axis=1)] = np.nan  # the last row may be incomplete
+            a_and_lam[np.isnan(a_and_lam).any(axis=1)] = np.nan  # the row at which Ctrl-C arrived may be half filled
         return np.concatenate([rows, a_and_lam], axis=1)
 
     def solution(self) -> DenseSolution | None:
@@ -514,7 +514,7 @@ class _Deferred:
     def __get__(self, record: Any, owner: Any = None) -> Any:
         values = {} if record is None else vars(record)
         if "later" not in values:
-            raise AttributeError(self.name)  # the class has no such attribute: dataclass fields have the defaults
+            raise AttributeError(self.name)  # read from the class, or no function computes missing fields
         values.update(values["later"](self.name) | values)
         return values[self.name]
 

@@ -27,16 +27,16 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-FIRST_FORCE = "first force"  # cache key under which the value of a compiled, untraced force at the start is stored
+FIRST_FORCE = "first force"  # key in the system's cache of the force at the start, if it is compiled and not traced
 N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
 
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
-    """Return the region of states where any run of the system has compared callbacks with the same traces."""
+    """Return the region of states where runs of the system have already compared its callbacks with the same traces."""
     if run.region is not None:
         return run.region
     key = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
-    return run.system.remembered(("territory", key), CheckedRegion)  # type: ignore[no-any-return]
+    return run.system.remembered(("checked region", key), CheckedRegion)  # type: ignore[no-any-return]
 
 
 def check_callbacks_along_run(
@@ -54,7 +54,8 @@ def check_callbacks_along_run(
     Return `status` and `message` unchanged if all callbacks are right; else the message begins with the difference. If
     `check_derivatives`, compare derivatives with exact ones, or with finite differences. Call Python forces twice: they
     must return the same value. `states(all_states)` returns states [t, q, v], latest first. States inside the region of
-    earlier comparisons (`CheckedRegion`) are skipped, unless `is_due`. `is_inside`: the whole run is in this region.
+    earlier comparisons (`CheckedRegion`) are skipped, unless `is_due`: some runs repeat all comparisons. `is_inside`:
+    the whole run is in this region.
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
@@ -87,8 +88,8 @@ def check_callbacks_along_run(
 def _check_derivatives(run: Run, states: Array, first_state: Array, status: Status, message: str) -> tuple[Status, str]:
     """Compare derivatives with exact ones, or finite differences, at states of a run; return a status and a message.
 
-    M, `kinematics` and values of entries are checked, too. `first_state`: the first state [t, q, v] of the run. If all
-    are right, return `status` and `message`; else WRONG_DERIVATIVE and a message that begins with the mistake.
+    M, `kinematics` and callbacks for entries of sparse matrices are checked, too. `first_state`: first [t, q, v] of the
+    run. If all are right, return `status` and `message`; else WRONG_DERIVATIVE and a message with the mistake.
     """
     n = run.system.n_q
     chosen_states = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
@@ -114,7 +115,7 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
         for t, *state in (*states, *states[::-1]):
             try:
                 forces.append(system.force(t, np.array(state[:n]), np.array(state[n:])))
-            except Exception:  # the state is outside the domain of the force
+            except Exception:  # the force is not defined at this state
                 forces.append(np.full(n, np.nan))
     first_forces, second_forces = np.array(forces[: len(states)]), np.array(forces[len(states) :][::-1])
     comparable = np.isfinite(first_forces) & np.isfinite(second_forces)
@@ -131,7 +132,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return (arguments, value) of a compiled force at the start; for Python functions, discard their samples."""
+    """Return (arguments, value) of a compiled force at the start; of Python functions, delete earlier samples."""
     if functions := python_functions(system):
         functions.restart()
         return None
@@ -177,7 +178,7 @@ def _change_text(name: str, t: float, entry: int, first_value: float, second_val
 
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
-FIRST_FRACTION = 0.1  # first step size in a piece, relative to the piece, unless the last piece proposed a step size
+FIRST_FRACTION = 0.1  # first step size in a piece, relative to its duration, unless the last piece proposed a step size
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
 
 
@@ -217,7 +218,7 @@ class IndependentRerun:
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.MAY_CROSS], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK_ATTEMPTS
-        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the original run has checked gamma by differences
+        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the checked run has tested gamma by differences already
         n_rows = max(2, min(CHUNK_ATTEMPTS, MAX_BUFFER_SIZE // len(self.run.state)))
         rows = (np.empty(n_rows), np.empty((n_rows, len(self.run.state))))
         self.buffers, self.n_filled = (*rows, np.empty((CHUNK_ATTEMPTS, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)

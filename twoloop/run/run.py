@@ -44,8 +44,8 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # the same number if callbacks are Python functions, which are slow
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
-TRIAL_STEPS = 10  # a method that needs long steps is replaced if one of its first TRIAL_STEPS steps is short
-NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the fixed-order form
+TRIAL_STEPS = 10  # a method that pays only with long steps is replaced if one of its first TRIAL_STEPS steps is short
+NO_PATTERN = np.zeros((0, 0))  # empty pattern of nonzero entries, for sparse factors in fixed order, which need none
 CONTRADICTION = 1e-6  # a row of C_q a = gamma contradicts other rows if its residual exceeds this fraction of its terms
 
 
@@ -81,7 +81,7 @@ class Run:
         self.kit = make_kit(system, t0, q0, plan, self.fixed_order)
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # a start may require a workspace for other ranks; usually, the ranks at the last start are the right ones
+        # the ranks at this start are not known yet: make the workspace for the ranks at the last start
         self.work = self._make_workspace(*(system.derived.get("ranks", ()) if self.fixed_order is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -102,7 +102,7 @@ class Run:
         self._reset_clock(t0)
         self.write_step_control(plan)
         self.substituted = False  # whether the substitute plan has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # a singular position is near if the ratio of pivots is smaller
+        self.near_threshold = singular_threshold(rtol)  # a smaller ratio of pivots means: a singular position is near
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced),
@@ -118,10 +118,10 @@ class Run:
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) that are still to be tried
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.piece_ends: list[float] = []  # ends (s) of the next pieces of the polynomial across a position
-        self.origins: list[Any] = []  # an `Origin` for each polynomial across the position that is still to be tried
+        self.piece_ends: list[float] = []  # times (s) at which the next steps along the polynomial across it end
+        self.origins: list[Any] = []  # the `Origin` of each polynomial across the position that is still to be tried
         self.t1 = np.inf  # end of the run (s)
-        self.starts_singular = False  # whether the start is a singular position, and the rank rises beside it
+        self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
         self.branch_known = False  # whether the branch of the motion that leaves such a start is known
         self.jumps: list[float] = []  # times at which C_t or b, and therefore the velocities, jumped
         self.compared_until = [-np.inf]  # callbacks were compared with traces up to this time; copies share the list
@@ -142,7 +142,7 @@ class Run:
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
         """Return a copy of this run at another start; None if ranks differ there, or accelerations cannot be computed.
 
-        The run must not use the fixed-order form of linear algebra.
+        The run must not use the fixed-order form (sparse factors in a fixed order of elimination).
         """
         new_run = self._copy_without_workspace()
         new_run.t0, new_run.compared_until, new_run.state[: len(q0)] = t0, [-np.inf], q0
@@ -163,7 +163,7 @@ class Run:
         return code
 
     def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, first_size: float) -> None:
-        """Move a run's start from beside a singular position to this position; `first_size`: first step size (s)."""
+        """Move a run's start from beside a singular position into it; `first_size`: size (s) of the first step."""
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
@@ -213,7 +213,8 @@ class Run:
             jumps=[],
         )
         new_run.crossing_tolerances = new_run.tolerances
-        if self.fixed_order is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # its flags may change
+        # a run in the augmented form needs its own kit, because it may change the flags of its kit
+        if self.fixed_order is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:
             new_run.kit = kit_for_plan(self.system, self.kit.flags, new_run.plan)
         return new_run
 
@@ -223,7 +224,7 @@ class Run:
         return self.plan.ends_at_outputs or self.control[self.a.FIXED_STEP] > 0.0
 
     def write_step_control(self, plan: Plan) -> None:
-        """Write a plan's numbers for step-size control to `control`, and its first limit of step sizes to `clock`."""
+        """Copy a plan's constants for step-size control to `control`, and its first limit of step sizes to `clock`."""
         a, control = self.a, self.control
         control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
@@ -235,7 +236,7 @@ class Run:
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _make_workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
-        """Return a new workspace for `rank`, the rank of C_q, and `rank_v`, the rank of [C_q; A]; None: full rank."""
+        """Return a new workspace for the ranks of C_q (`rank`) and [C_q; A] (`rank_v`); None: full rank."""
         q0 = self.state[: self.system.n_q]
         pattern = pattern_of(self.system, self.t0, q0) if self.fixed_order is None else NO_PATTERN
         ranks = rank, rank_v
@@ -246,7 +247,7 @@ class Run:
         return work
 
     def may_succeed_in_other_form(self, code: int) -> bool:
-        """Return whether steps failed in fixed-order algebra (sparse_inner_loop.py) but may succeed in another form."""
+        """Return whether steps failed with sparse factors in fixed order, but may succeed with dense ones."""
         failure_codes = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.fixed_order is not None
@@ -257,7 +258,7 @@ class Run:
     def change_form(self) -> None:
         """Change the form of linear algebra at the current state, and replace the run's kit and workspace.
 
-        If the fixed-order form lacks Newton's matrices, add them; else replace it by a form of saddle_point.py.
+        If the fixed-order form has no program for Newton's matrix yet, add it; else take a form of saddle_point.py.
         """
         n = self.system.n_q
         old_work, largest_pivot = self.work, float(self.clock[self.a.LARGEST_PIVOT])
@@ -283,7 +284,7 @@ class Run:
         if code == indices.RANK_DIFFERS:  # rows that were dependent at the start may be independent now
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # convert largest_pivot to the new form
+        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # the new form scales pivots in another way
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
@@ -296,7 +297,7 @@ class Run:
             self.work = self._make_workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
         if self.fixed_order is not None and code not in (indices.DONE, indices.NOT_FINITE):
-            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
+            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: later runs must not try this form again
                 self.system.derived["fixed-order form"] = None
             self.fixed_order = None
             self.kit = make_kit(self.system, self.t0, self.state[: self.system.n_q], self.plan)
@@ -332,7 +333,7 @@ class Run:
         )
 
     def find_redundant_rows(self) -> tuple[NDArray[np.int64], str]:
-        """Return the indices of dependent rows of [C_q; A] at the start, and a warning."""
+        """Return the indices of redundant rows of [C_q; A] at the start, and a warning; raise if rows are violated."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -359,7 +360,6 @@ class Run:
         return np.array(redundant), self.descriptions[redundant_rows]
 
     def _start_warning(self) -> str:
-        """Return the warning for a start at or near a singular position, else ""."""
         if self.work.notes[indices.PIVOT] > (PIVOT_FACTOR * WEAK_RATIO if self.fixed_order is None else SMALL_PIVOT):
             return ""
         atol, q = self.tolerances[indices.ATOL :], self.state[: self.system.n_q]
@@ -370,12 +370,12 @@ class Run:
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
-        if residual.max() <= CONTRADICTION:  # CONTRADICTION is the smallest tolerance of a row
+        if residual.max() <= CONTRADICTION:  # the tolerance of a row, below, is at least CONTRADICTION
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTION * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
     def _describe_rows(self, all_rows: Rows, rows: list[int]) -> str:
-        """Describe in words how the rows of `all_rows` with the indices `rows` depend on the other rows."""
+        """Describe how the rows with the indices `rows` depend on the other rows of `all_rows`."""
         if not isinstance(all_rows, SparseRows):
             return describe_dependence(all_rows, rows)
         q, independent_rows = self.state[: self.system.n_q], self.work.rows_v.tolist()
@@ -398,7 +398,7 @@ class Run:
     def limit_steps(self) -> None:
         """Set the largest step size so that the time between evaluations is at most a hundredth of the run.
 
-        If forces may be steep, a step is at most a hundredth of the run: one stage may not reveal a steep force.
+        If forces may be steep, the whole step is at most a hundredth of the run: one stage may not reveal such a force.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap

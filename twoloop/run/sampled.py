@@ -33,7 +33,7 @@ from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
-MAX_ATTEMPTS = 1024  # largest number of steps that `advance` attempts for a sample; IntegrationLoop takes more steps
+MAX_ATTEMPTS = 1024  # number of attempted steps to the next sample, after which `IntegrationLoop` continues
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # callbacks that may depend on parameters that change at samples
 CHANGED_PARAMETERS = "the parameters changed at samples"  # value of the field `changes` of the result
 
@@ -168,12 +168,12 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate from the last sample to `end`; if short changes may be missed, repeat with more evaluations."""
+        """Integrate from the last sample to `end`; repeat this with more evaluations if short changes may be missed."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # steps to earlier samples, which are not repeated, may have missed a change
+            if len(self.times) > 1:  # warn: steps to earlier samples are not repeated, and may have missed changes
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -184,7 +184,8 @@ class SampledRun:
         """Integrate from the last sample to the time `end`, without repetitions."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
-        if self._parameters_changed or self.system.called_in_python:  # global variables of Python functions may change
+        # Python functions may read global variables that have changed since the last sample
+        if self._parameters_changed or self.system.called_in_python:
             self._restart(t)
         run.choose_first_step(self.t0, end, run.state, run.max_step)
         run.control[a.TIME_SPACING] = min(self._max_gap, run.control[a.TIME_SPACING])
@@ -230,7 +231,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # a pair of methods: keep the numbers that tell which one is active
+        if run.plan.first is not None:  # a pair of methods: keep the part of `memory` that tells which one is active
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q
@@ -278,7 +279,7 @@ class SampledRun:
         self._parameters_changed = True
 
     def _check_enters_forces_only(self, index: int, value: float) -> None:
-        """Raise ValueError if callbacks other than forces depend on a parameter: positions or momenta would jump."""
+        """Raise ValueError if a parameter affects other callbacks than forces: the state would jump if it changed."""
         old_value, n = float(self.p[index]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         state = {"q": row[:n], "v": row[n : 2 * n]}

@@ -74,7 +74,7 @@ class SignalHandlers:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if error is not None and error is self._handler_error:
-            self._handler_error = None  # this exception propagates already: `restore` need not raise it
+            self._handler_error = None  # `error` is this exception or replaces it: `restore` must not raise it again
         self.restore()
 
 

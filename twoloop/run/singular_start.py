@@ -21,19 +21,20 @@ from twoloop.run.singular_positions import DISPLACEMENT, scaled_to_unit_masses
 
 Array = NDArray[np.float64]
 
-CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows between two samples, for derivatives along the motion
-# weights of five equally spaced samples of a function in its first and second derivative, for a spacing of 1
+CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows of C_q between two samples of a finite difference
+# finite differences: weights of five samples, at a spacing of 1, in the first and the second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# largest relative error of derivatives by finite differences; derivatives up to this relative size count as 0
+# assumed relative error of derivatives by finite differences; smaller derivatives, relative to the rows, count as 0
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises if the derivative of a zero singular value exceeds this, relative to the derivative of C_q
 MIN_RANK_DERIVATIVE = 1e-6
-# the derivative of a zero singular value counts as certain if it exceeds this multiple of its uncertainty, which is the
+# the derivative of a zero singular value counts as nonzero if it exceeds this multiple of its uncertainty, which is the
 # norm of the derivative of the rows along a velocity as large as the tolerances
 MIN_CLARITY = 10.0
-# relative change of the rows: from the start to a state beside the start, and in the first step that is tried
+# relative change of the rows of C_q from the start to a state beside it, and in the first step that is tried
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
-# number of states beside the start to try; their largest correction by a projection, relative to the displacement
+# N_BESIDE states beside the start are tried; one is accepted if projecting it onto the constraints moves it by at most
+# MAX_CORRECTION times its displacement from the start
 N_BESIDE, MAX_CORRECTION = 6, 0.2
 MAX_RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, relative to the right-hand side
 
@@ -54,8 +55,8 @@ class Branch(NamedTuple):
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
     """Find the branch of the motion through a state [q, v, a] at which C_q has the rank `rank`.
 
-    Return None if the rank does not rise along the motion: the position is not singular, or the motion stays in it.
-    Return False if the rank rises, but other branches have velocities within the tolerances `allowed` (n_q,) of v.
+    Return None if the rank does not rise along the motion: then the position is not singular, or the motion stays in
+    it. Return False if the rank rises, but another branch has velocities within the tolerances `allowed` (n_q,) of v.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None
@@ -73,7 +74,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
         return None
     mass, rows, divisors, units = scaled_to_unit_masses(system, t, q)
     left, _, right = np.linalg.svd(rows)
-    lost, free = left[:, rank:].T, right[rank:].T  # rows u^T with u^T C_q = 0; null space of C_q (columns)
+    lost, free = left[:, rank:].T, right[rank:].T  # rows u^T with u^T C_q = 0; columns: null space of C_q
 
     def derivative_of_rows(direction: Array, step: float) -> Array:
         samples = [system.rows(t, q + s * direction) * units for s in step * np.array([-2.0, -1.0, 1.0, 2.0])]
@@ -85,7 +86,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
     norm = float(np.linalg.norm(rows))
     step = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(direction).max()
-    speed = float(np.linalg.norm(derivative_of_rows(direction, step))) / norm  # relative change (1/s) of the rows
+    speed = float(np.linalg.norm(derivative_of_rows(direction, step))) / norm  # relative rate of change of C_q, 1/s
     if not step * speed > MAX_DIFFERENCE_ERROR * DISPLACEMENT:
         return None
     step = CHANGE_PER_SAMPLE / speed
@@ -108,7 +109,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
     force = null_space.T @ (units * system.force(t, q, v) - mass @ a)
     a += null_space @ np.linalg.solve(null_space.T @ mass @ null_space, force)
     a *= units
-    acceleration = 0.0  # second derivative of the rows, relative to their norm, 1/s^2
+    acceleration = 0.0  # second derivative of C_q along the motion, relative to its norm, 1/s^2
     if a.any():
         acceleration = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / norm
     for change in BESIDE_CHANGE * 0.5 ** np.arange(N_BESIDE):
@@ -124,5 +125,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time (s) in which rows change by `change`, given their first (1/s) and second (1/s^2) derivative."""
+    """Return the time (s) in which rows change by `change`, given their relative rates `speed` and `acceleration`."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 # to find which forces depend on a coordinate or velocity x, x is displaced by this fraction of max(1, |x|)
 DISPLACEMENT = 1e-3
-# largest share of entries and operations, relative to dense factors, for which Newton's matrix gets sparse factors
+# Newton's matrix gets sparse factors if its entries and operations are at most this fraction of those of dense factors
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -57,8 +57,8 @@ def newton_form(
 ) -> tuple[NDArray[np.int32], int] | None:
     """Return the program that factorizes Newton's matrix (see sparse_lu.py), and the number of groups of its columns.
 
-    One finite difference of forces yields all columns of a group. `mass`, `jacobian`: indices of nonzero entries.
-    `bodies`: coordinates of each body. `stiff`: indices of `_stiff_rows`. Return None if sparse factors do not pay.
+    One finite difference of forces yields all columns of a group, which have no common row. `mass`, `jacobian`: indices
+    of nonzero entries. `bodies`: coordinates of each body. `stiff`: see `_stiff_rows`. None: sparse factors do not pay.
     """
     entries: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
@@ -68,7 +68,7 @@ def newton_form(
         q = q0 + scale * magnitude * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
-        except Exception:  # q is outside the domain of the callbacks; entries missed here are found during the run
+        except Exception:  # callbacks are not defined at q; entries that are missed here are found during the run
             continue
         if len(entries) > max_entries:
             return None
@@ -111,10 +111,10 @@ def _derivative_entries(
 
 # a body has no mass along an eigenvector of its block of M if the eigenvalue is at most this fraction of the largest
 MASSLESS_RATIO = 1e-10
-# a row can give mass to the massless directions of a body if its part along them is at least this fraction of the row
+# a row g may be added (as g g^T) to a singular M if its component along massless directions is at least this fraction
 MIN_MASSLESS_FRACTION = 1e-3
 MIN_SIZE_NEWTON = 1.6  # Newton's matrix may get sparse factors if n_q is at least this multiple of LARGE
-MAX_SHARE = 0.05  # largest share of entries and operations, relative to dense matrices, for which sparse factors pay
+MAX_SHARE = 0.05  # sparse factors pay if their entries and operations are at most this fraction of those of dense ones
 
 
 class FixedOrderForm(NamedTuple):
@@ -132,7 +132,7 @@ class FixedOrderForm(NamedTuple):
     n_groups: int = 0  # number of groups of columns of Newton's matrix; one finite difference of forces yields a group
 
     def matrix_cost(self) -> float:
-        """Return the estimated cost of Newton's matrix and its factors, in evaluations of accelerations."""
+        """Return the estimated cost of Newton's matrix and its factors, in units of one evaluation of accelerations."""
         assert self.newton_program is not None
         return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
@@ -216,7 +216,7 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, bodies: list[tuple[int, ...]]
 ) -> list[int]:
-    """Return indices of rows g such that M + g g^T, for a singular M, gives mass to massless directions of a body.
+    """Return the indices of rows g of C_q to add to a singular M, as g g^T, so that no direction stays without mass.
 
     See sparse_ldl.py. Such a row belongs to one body (the norm of its Euler parameters, for example), and g g^T has
     entries only where M has. No more rows than necessary are returned; other rows are treated like rows of joints.
@@ -279,13 +279,13 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
             mass = system.mass(t0, q0 + scale * magnitudes * direction)
-        except Exception:  # q is outside the domain of the callbacks; the run will find entries missed here
+        except Exception:  # callbacks are not defined at q; entries that are missed here are found during the run
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return pattern
 
 
-GAMMA_ACCURACY = 1e-11  # no smaller relative error is required of a gamma computed by differences of C_q and C_t
+GAMMA_ACCURACY = 1e-11  # smallest relative error that can be required of a gamma by differences of C_q and C_t
 MAX_KITS = 16  # largest number of kits in the cache of a system
 
 
@@ -351,11 +351,11 @@ def is_diagonal(mass: Array) -> bool:
 
 
 def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> Kit:
-    """Return the kit with these flags and the steps of a plan, from the system's cache if possible; else cache it."""
+    """Return the kit with these flags and the steps of a plan from the system's cache, to which a new kit is added."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
-    # ids in the key stay unique, because the cached kits keep the objects with these ids alive
+    # ids are safe keys here: a cached kit keeps the objects alive, so that no other object gets their ids
     key: tuple[Any, ...] = id(system.functions), flags.tobytes()
     if plan is not None:
         key += (plan.inner, plan.step, plan.first, plan.second, len(LOADED_STEPS))
@@ -372,7 +372,8 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
         if len(kits) == MAX_KITS:
             del kits[next(iter(kits))]
         entry = kits[key] = Kit(functions, inner, *steps), system.functions
-    return _copy_with_flags(entry[0]) if flags[FORM] == AUGMENTED else entry[0]  # a run may change these flags
+    # a run in the augmented form may change its flags, and gets a copy of them
+    return _copy_with_flags(entry[0]) if flags[FORM] == AUGMENTED else entry[0]
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
@@ -430,7 +431,7 @@ def prepare_workspace(
     """Reset a workspace, which another run may have used, for a run from q0; return the workspace."""
     arrays = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting_arrays(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
-    if form is not None:  # arrays that are constant during a run
+    if form is not None:  # in the fixed-order form, these arrays stay constant during a run
         work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
         work.dependent[:] = work.independent[:] = np.arange(system.n_q)
         work.is_independent[:] = 1.0

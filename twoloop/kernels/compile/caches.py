@@ -84,8 +84,7 @@ def make_trusted_folder(folder: Path) -> None:
 def trusted_folder(folder: Path) -> Path:
     """Return `folder` if no other user can write this folder or a folder above it; otherwise, return a replacement.
 
-    The replacement is in the user's cache folder. If other users can write the cache folder, too, the replacement is in
-    a temporary folder of this process.
+    The replacement is in the user's cache folder or, if others can write this, too, in a temporary folder.
     """
     reason = reason_to_distrust(folder)
     if not reason:
@@ -174,8 +173,7 @@ class CodeFiles:
     """Store the machine code of a function on disk, in one file with a checksum for each key.
 
     Only the user can write these files. A file that is damaged or out of date counts as missing. Unlike numba's cache,
-    this class has no index of files: if two processes write an index at the same time, it may assign the machine code
-    of one function to another.
+    this class has no index of files, in which two processes that write it at the same time might confuse functions.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, is_limited: bool = False):
@@ -211,11 +209,9 @@ class CodeFiles:
             path.unlink(missing_ok=True)
 
     def _paths_of_files(self) -> list[Path]:
-        """Return the paths of the files of all keys."""
         return list(self.folder.glob(f"{glob.escape(self.name)}.*.nbc"))
 
     def _path_for_key(self, key: Any) -> Path:
-        """Return the path of the file for a key."""
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
 
 

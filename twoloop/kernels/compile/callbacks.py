@@ -376,8 +376,7 @@ def compile_callback(
 ) -> Dispatcher:
     """Compile, as a callback, a function that fills its arrays in place; raise TypeError if this is impossible.
 
-    `digests`: see `compile_cached`; `named_function`: the function that error messages name, by default `function`;
-    `allocates`: see `callback`.
+    `digests`: see `compile_cached`; `named_function`: function that error messages name; `allocates`: see `callback`.
     """
     compiled, more = add_bounds_checks(function)
     options = {**_NUMBA_OPTIONS, **more} if allocates else {**_NUMBA_OPTIONS, **more, "_nrt": False}
@@ -452,7 +451,6 @@ def _failure_message(kind: str, function: Callable[..., Any], error: Exception) 
 
 
 def _name_and_location(function: Callable[..., Any]) -> str:
-    """Return the name of a function with its file and line."""
     name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 

@@ -224,7 +224,6 @@ def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue
 
 
 def _array_bytes(value: Any) -> bytes | None:
-    """Return the bytes of an array, or None for any other value."""
     return value.tobytes() if isinstance(value, (np.ndarray, np.void)) else None
 
 

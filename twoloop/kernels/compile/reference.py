@@ -1,8 +1,7 @@
 """Types of structures that are passed to kernels by reference, as one pointer to a table of addresses and lengths.
 
-Numba passes a named tuple by value, member by member: a workspace of forty arrays becomes about three hundred
-arguments, which every call that LLVM does not inline writes to memory. A structure of type `Reference` has the members
-as attributes, but is a single argument.
+Numba passes a named tuple by value: a workspace of forty arrays becomes about three hundred arguments, which every call
+that LLVM does not inline writes to memory. A `Reference` has the members as attributes, but is a single argument.
 """
 
 import hashlib

@@ -5,14 +5,14 @@ b are sampled ahead of the step (`f`: kit, `w`: workspace), which costs less tha
 
 - A force, C_t or b is smooth if the second differences of its samples are small relative to the range of the samples
   (after the straight line from the first to the last sample is subtracted). A change within one or two samples makes
-  second differences as large as the range. The step then ends at the change, as it does where a value is not finite.
+  second differences as large as the range. The step then ends at the change; also where a value is not finite.
 - If forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples
   follow the motion, on a parabola with the present position, velocity and acceleration. One set of samples is taken for
   one long step, or for all short steps that end within MIN_TIME_AHEAD spacings.
 - All other samples are taken at a fixed state, the state where the step begins. Their spacing is also limited to a
   fraction of the step size.
 - The shortest time between two changes, and the shortest duration of a change within a short step, are recorded. If the
-  spacing of samples is not much smaller, other changes as short may have been missed: a message says so.
+  spacing of samples is not much smaller than this, other changes as short may have been missed: a message says so.
 
 A jump of C_t or b, for example at the end of a ramp in a drive, changes velocities as an impulse does. Methods that
 restore the dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So if
@@ -31,12 +31,12 @@ from twoloop.kernels.evaluation.constraints import constraint_rates, representab
 from twoloop.kernels.linalg.dense import largest_of
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
-N_PARTS = 12  # number of equal parts of an interval; C_t and b are sampled at the ends of the parts
+N_PARTS = 12  # number of equal parts into which an interval is divided; C_t and b are sampled at the ends of the parts
 # coefficients of the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
-TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, over np.spacing(t) |d/dt of the samples|
+TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, divided by np.spacing(t) and the mean slope
 STEEPNESS = 4.0  # a part of a step is a ramp if the slope of C_t or b there exceeds this multiple of the mean slope
 MAX_RAMP_SHARE = 0.125  # a step has to end at a ramp if the ramp takes at most this fraction of the step
 MIN_SPACINGS = 8.0  # bisection ends at an interval of this length, in spacings of floating-point numbers
@@ -45,13 +45,13 @@ SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b i
 
 @compiled
 def _sample_rates(f, w, t, q, velocity, begin, end):
-    """Store in rows of w.rates C_t and b at thirteen times from `begin` to `end`, and at q + velocity (time - t)."""
+    """Store C_t and b at thirteen times from `begin` to `end`, at the positions q + velocity (time - t), in w.rates."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * velocity[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
-        if not finite_vector(w.rates[k]):  # for example the derivative of |t| at 0: use the next floating-point time
+        if not finite_vector(w.rates[k]):  # such as the derivative of |t| at 0: sample at the next floating-point time
             constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
 
 
@@ -77,7 +77,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the error of (G x)[row] that the tolerances of x allow; x: n_q coordinates or velocities."""
+    """Return the error of (G x)[row] that the tolerances of x (n_q) allow: the largest |G[row, j]| tolerance[j]."""
     largest = 0.0
     if f.form == FIXED_ORDER:
         rows, columns, _ = jacobian_entries_of(f.ldl_program)
@@ -107,9 +107,9 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     """Return SMOOTH, RAMP or JUMP for the least smooth row of C_t and b from t to `end`, and two times (s).
 
-    The times are the beginning and the end of the jump or ramp, or t and `end` if the row is smooth. If a ramp fills
-    the step, they enclose its first half: accelerations may be zero at both ends of the ramp, and a method that
-    evaluates only there would miss the ramp. (q, v) is the state at t; positions are extrapolated along `velocity`.
+    The times are the ends of the jump or ramp, or t and `end` if the row is smooth. If a ramp fills the step, they are
+    the ends of its first half: accelerations may be zero at both ends of a ramp, so that a method that evaluates only
+    there would miss it. (q, v) is the state at t; positions are extrapolated by `velocity`.
     """
     begin = t
     h = end - t
@@ -152,34 +152,32 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
             return JUMP, begin, end
     if steepest > STEEPNESS * mean:
         return RAMP, low, high
-    if end - begin < h:  # a half of the step is not smooth either: a ramp fills the step, or the row has a kink
+    if end - begin < h:  # one half of the step is not smooth either: a ramp fills the step, or C_t or b has a kink
         return RAMP, t, t + 0.5 * h
     return SMOOTH, t, t + h
 
 
 N_SAMPLES = 20  # number of intervals between the samples of one set
-MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
+MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in units of the setting SPACING
 SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of samples
-LEAST_RANGE = 0.1  # samples are examined if their range exceeds this fraction of rtol times the largest value so far
-# samples are examined only if their range also exceeds this number, whatever their unit: squares of smaller values
-# underflow, and subnormal numbers are too coarsely spaced to look smooth
-LEAST_VALUE = 1e-150
-# smallest number of samples in a step: the stages alone may all miss a force that acts for a quarter of the step
-MIN_SAMPLES_IN_STEP = 8.0
-RESAMPLE_BELOW = 0.25  # samples ahead are taken again if their spacing has to fall below this fraction of the last one
-MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
+# changes of a component are ignored unless the range of its samples exceeds two limits: LEAST_RANGE rtol times the
+# largest value so far; and LEAST_VALUE, because squares of smaller values underflow
+LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
+MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: all stages may miss a force that lasts a quarter of it
+RESAMPLE_BELOW = 0.25  # times ahead are sampled again if the spacing has to fall below this fraction of the last one
+MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers at t
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
-EQUAL_CHANGES = 1e-5  # two changes count as one up to this distance, relative to the widest spacing of samples
+EQUAL_CHANGES = 1e-5  # two changes count as one if their distance is at most this fraction of the widest spacing so far
 # changes are recorded only later than this time after the start, in units of tolerances[GAP]: before that, rounding
 # errors make forces that begin at zero, such as 1 - cos(t), look sudden
 MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a sudden change exceeds this multiple of the changes next to it; a smooth slope does not
-SHORT_STEP = 0.5  # a discontinuity is suspected if a step is below this fraction of the longest of the last steps
+SHORT_STEP = 0.5  # a step below this fraction of the longest of the last steps may be due to a discontinuity
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # accelerations decay (see _acceleration_lasts) if one changes by more than this fraction of the largest acceleration
 # while a velocity changes by its tolerance
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # changes up to this time (in spacings of samples) after the beginning of a step count as passed
+CHANGE_MARGIN = 0.01  # a change counts as passed up to this time (in spacings of samples) after a step begins
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes, after the samples, that stores the largest |value| of each column
 MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes that stores values between two samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
@@ -187,7 +185,7 @@ N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store in `values` forces, C_t and b at `time`, in the state that (q, v) reaches in `elapsed` s at constant a."""
+    """Store forces, C_t and b at `time` in `values`, for the state that (q, v) reaches in `elapsed` s at constant a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -198,14 +196,14 @@ def _sample_forces(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _least_ranges(tolerances, largest, n):
-    """Return the smallest range of samples to be examined, for forces (the first n components) and for C_t and b."""
+    """Return the ranges of samples up to which changes are ignored: for the n forces, and for C_t and b."""
     least = LEAST_RANGE * tolerances[RTOL]
     return max(LEAST_VALUE, least * largest_of(largest[:n])), max(LEAST_VALUE, least * largest_of(largest[n:]))
 
 
 @compiled
 def _is_smooth_bend(values, k, n):
-    """Return whether the second differences at k and beside k are similar in sign and size, for n + 1 values."""
+    """Return whether n + 1 values bend at k like a smooth curve: second differences at k and beside k are similar."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -238,8 +236,8 @@ def _find_sudden_bend(values, n, slope, min_range, strict):
 def _first_sudden_bend(values, n, detrends, min_range):
     """Return the index of the first sudden bend of n + 1 samples (0: none), and the limit of its second difference.
 
-    The search is repeated among the values before the bend, until it finds no earlier bend. If `detrends` is 1, each
-    search subtracts the straight line from the first to the last value. `min_range`: see `_find_sudden_bend`.
+    After a bend is found, the values before it are searched again, until no earlier bend is found. If `detrends` is 1,
+    each search subtracts the straight line from the first to the last value. `min_range`: see `_find_sudden_bend`.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
     while index > 1:  # strict = True, because a few samples of a smooth curve may bend as much as a jump
@@ -253,7 +251,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return whether two samples differ by more than `limit`, and much more than from the samples on either side."""
+    """Return whether two successive samples differ by more than `limit`, and much more than the pairs beside them."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     neighbouring_change = max(sign * (first_value - previous), sign * (following - second_value))
@@ -262,7 +260,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time right after the change of component j between sample k, at `low`, and sample k + 1, at `high`."""
+    """Return the time right after component j changes, between sample k (at time `low`) and k + 1 (at time `high`)."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):
@@ -278,7 +276,7 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 
 @compiled
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
-    """Update LAST_CHANGE and SHORTEST_CHANGE in `clock` by sudden changes right before and after the bend at `index`.
+    """Update LAST_CHANGE and SHORTEST_CHANGE in `clock` by sudden changes next to the bend at sample `index`.
 
     Sample k, from 0 to n, is at the time begin + k * spacing. `column`: index of the component that bends. `limit`:
     largest difference of two samples that is not a sudden change.
@@ -301,10 +299,10 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 
 @compiled
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
-    """Return the time of the first sample with a sudden change of a component (or infinity), and of the last sample.
+    """Take a set of samples; return the time of the first sudden change (or infinity), and the time of the last sample.
 
     (q, v, a) is the state at t. The first sample is at `begin`, the last one at `last` or earlier. Samples follow the
-    motion if `follows_motion` is 1, or are taken at the state (q, v) if it is 0.
+    motion if `follows_motion` is 1, and are taken at the fixed state (q, v) if it is 0.
     """
     changes, n, t_first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -361,7 +359,7 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
-    """Return whether accelerations last: a change of a velocity by its tolerance hardly changes them.
+    """Return whether accelerations last, which means: changes of velocities by their tolerances hardly change them.
 
     If stiff friction keeps a body at rest, accelerations do not last: they are rounding errors of balanced forces, and
     a parabola with these accelerations would lead far from the state of rest. (Q, V, A) is scratch.
@@ -401,7 +399,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # dense samples along the motion replace samples at a fixed state, unless these must continue at a known change
+    # dense samples along the motion replace samples at a fixed state, unless the latter must continue at a change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -416,13 +414,13 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
     """Sample the forces ahead at constant (q, v); return the time of the first sudden change, at most `next_change`."""
     max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
-    # closer samples are needed neither for multistep methods (JUMP_RATIO = 1), whose error estimates show a jump, nor
-    # if C_t or b may jump (MAY_JUMP = 1), because then each step is checked for jumps
+    # sample known times again, if more closely, except for multistep methods (JUMP_RATIO = 1), whose error estimates
+    # show a jump, and if C_t or b may jump (MAY_JUMP = 1), because then each step is checked for jumps
     may_resample = control[at.JUMP_RATIO] > 1.0 and control[at.MAY_JUMP] == 0.0
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # then the next samples must show this change, too
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # then the next samples must be as close, to show it
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)
@@ -448,7 +446,7 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     next_change = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > t_near else np.inf
     next_change_of_motion = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > t_near else np.inf
     is_at_change = next_change == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
-    # do not sample again near the end of a run: ever shorter sets of samples would show the same change again
+    # do not sample again if a step as short as a spacing begins at the change: ever shorter sets would show it again
     if control[at.BY_TIME] == 1.0 and not (is_at_change and size <= (1.0 + CHANGE_MARGIN) * clock[at.SAMPLED_EVERY]):
         next_change = _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = next_change

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
     FIXED_STEP_FAILED,  # a step of fixed size failed
     RANK_LOST,  # C_q has lost rank: no partition can be chosen
     MAX_STEPS_REACHED,
-    ROWS_VIOLATED,  # redundant constraints are violated at the end of a step
+    ROWS_VIOLATED,  # constraints that counted as redundant are violated at the end of a step
     NEAR_SINGULAR,  # a singular position is near: the caller crosses it
     SWITCH_METHOD,  # the method is unsuited: the caller continues with another one
     AT_DISCONTINUITY,  # C_t or b jumps here: the caller writes the state after the jump to new_state
-    NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller takes a dense form
+    NEEDS_DENSE,  # sparse factors in fixed order cannot decide which rows are independent: the caller takes dense ones
     NEEDS_COMPILATION,  # the step is not compiled: the caller compiles it and repeats the call
 ) = range(12)
 SUSPENDED = 0.5  # value of MAY_CROSS after all attempts to cross a singular position have failed
@@ -27,7 +27,7 @@ CONTINUE = -1  # value that functions return in place of an end code if the loop
 
 # indices in the rule of step-size control: the ratio of the next step size to the present one is SAFETY
 # error**-EXPONENT, but at least FACTOR_MIN and at most FACTOR_MAX. If LEAST_ERROR > 0, the ratio also depends on the
-# trend of the error from step to step (Hairer & Wanner II, IV.8), in which errors count as at least LEAST_ERROR
+# error of the step before (Hairer & Wanner II, IV.8); there, errors below LEAST_ERROR are replaced by LEAST_ERROR
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
 # indices in the history of step-size control: size (s) and error (in tolerances) of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
@@ -36,8 +36,8 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
 (
     MAX_STEP,  # largest step (s)
     FIXED_STEP,  # fixed step size (s); 0: step-size control
-    LIMIT_START,  # value (s) of H_LIMIT if none of the last LIMIT_MEMORY steps failed
-    LIMIT_FACTOR,  # value of H_LIMIT after a failed step, relative to the size of this step
+    LIMIT_START,  # upper limit (s) of step sizes, H_LIMIT in `clock`, if none of the last LIMIT_MEMORY steps failed
+    LIMIT_FACTOR,  # upper limit of step sizes after a failed step, relative to the size of this step
     LIMIT_MEMORY,  # number of accepted steps during which a failed step limits the step size
     MAX_STEPS,  # largest number of accepted steps
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
@@ -48,15 +48,15 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     MAY_CROSS,
     SHORTEST,  # smallest allowed step size (s); steps of up to EQUAL_SPACINGS spacings of t are not allowed, either
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
-    TRIAL_STEPS,  # stop with SWITCH_METHOD if one of the first TRIAL_STEPS steps proposes a next size of at most GAP
+    TRIAL_STEPS,  # stop with SWITCH_METHOD if a next size is at most tolerances[GAP] within the first TRIAL_STEPS steps
     MAY_JUMP,  # 1: C_t or b may jump
-    JUMP_RATIO,  # largest ratio of a step's error to its estimate if a force jumps in the step
+    JUMP_RATIO,  # largest ratio of true error to error estimate in a step in which a force jumps
     SPACING,  # spacing (s) of samples of the forces ahead of a step, see discontinuities.py; 0: no samples
-    TIME_SPACING,  # largest spacing (s) of samples at a fixed state (these are taken ahead of short steps, too)
+    TIME_SPACING,  # largest spacing (s) of samples at a fixed state, which are taken even if steps are shorter
     # 1: samples ahead follow the motion; 0: samples use the present q and v, because a callback failed along the motion
     SAMPLE_MOTION,
     BY_TIME,  # 1: forces may change suddenly with time
-    BY_STATE,  # 1: forces may change suddenly with position or velocity; short steps also need samples along the motion
+    BY_STATE,  # 1: forces may change suddenly with position or velocity; then short steps sample the motion, too
     FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: this size is a guess, and may grow before the step
     MAX_EVALUATION_GAP,  # longest part of a step without an evaluation of the equations, relative to the step size
     TAKES_MANY,  # 1: the method can take many steps in one call, without checks between them

@@ -37,8 +37,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-# methods with a trend keep a step size that could grow by at most this factor, to save a factorization
-KEEP_BELOW_RATIO = 1.2
+KEEP_BELOW_RATIO = 1.2  # methods that use the trend keep h, and so their factors, if it could grow by at most this
 
 
 @compiled
@@ -92,7 +91,7 @@ def size_on_grid(clock, t, h, target, goal):
     margin = max(1e-6 * h, rounding)
     n_grid_steps = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + margin:
-        n_grid_steps = 0.0  # all grid times up to `target` are counted already
+        n_grid_steps = 0.0  # earlier steps have counted all grid times up to `target`
     end = clock[at.T_START] + (clock[at.N_FIXED] + n_grid_steps) * h
     reaches_goal = goal <= end + margin
     size = h
@@ -105,7 +104,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, left, crosses_jump):
-    """Return the size (s) of a step (at most about h), and whether it reaches the goal, which is `left` s ahead."""
+    """Return the size (s) of a step (about h at most), and whether it reaches the goal, a time `left` s ahead."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:

@@ -57,7 +57,7 @@ FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if the step size times the eigenvalue is below this number
 ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
-STABILITY_LIMIT = 3.0  # if h rho exceeds this multiple of LIMIT, stability must limit the step of the explicit method
+STABILITY_LIMIT = 3.0  # if h rho exceeds this multiple of LIMIT, stability surely limits steps of the explicit method
 # if the Jacobian is computed by finite differences (about eight evaluations per coordinate), a trial that may not pay
 # also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
@@ -68,16 +68,15 @@ COUNTED_FRACTION_OF_RUN = 0.3  # from the beginning, this fraction of the expect
 # a trial begins, whatever the rates are, if the run has cost more than this multiple of MIN_COST_IN_TRIALS trials.
 # After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # rho is "hidden" if it exceeds this multiple of the rate of the motion
+MIN_RATIO_TO_MOTION = 30.0  # rho is "hidden" (not seen in the motion) above this multiple of the motion's rate
 QUIET_FACTOR = 10.0  # steps at the stability limit excite oscillations with velocities of up to this many tolerances
 # with a hidden rate rho, an implicit method may allow longer steps if h rho exceeds this multiple of LIMIT
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
 RETURN_BELOW = 0.4  # the explicit method is tried again if h rho is below this multiple of LIMIT
-# factor on errors of the implicit method during its trial: its order is lower than the explicit method's order, and it
-# must not win by larger errors
+# factor on errors of the implicit method on trial: its order is lower, and it must not win by larger errors
 TRIAL_ERROR_FACTOR = 10.0
-MEAN_WEIGHT = 0.8  # every step updates the mean step size: weight of the previous mean
+MEAN_WEIGHT = 0.8  # weight of the old mean step size when a step updates it; the new step size has the rest
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
 MIN_GAIN = 1.2  # a trial succeeds if it divides the cost of a second of motion by at least this factor
@@ -86,11 +85,12 @@ N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful 
 # values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
-# indices in `options`, which contains in this order: the N_PAIR options of the pair; for each method its step-size rule
-# (see loop_state.py) and, at REUSE_OF, its value of REUSE; the options of the first and of the second method. LIMIT:
-# the implicit method is tried if h rho exceeds LIMIT in N_ESTIMATES estimates. MATRIX_COST: cost of a Jacobian in
-# evaluations. COST_RATIO: cost of an evaluation by the second method, in evaluations by the first. SIZE_1: number of
-# options of the first method
+# `options` contains in this order: the N_PAIR options of the pair, at the indices below; for each method its step-size
+# rule (see loop_state.py) and, at REUSE_OF, its value of REUSE; the options of the first, then of the second method.
+# - LIMIT, N_ESTIMATES: the implicit method is tried if h rho exceeds LIMIT in N_ESTIMATES estimates
+# - MATRIX_COST: cost of a Jacobian, in evaluations of accelerations
+# - COST_RATIO: cost of an evaluation by the second method, in evaluations by the first
+# - SIZE_1: number of options of the first method
 LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
@@ -109,7 +109,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     RATE,  # last estimate of rho (1/s)
     FIRST_MEMORY,  # number of entries of the memory of the first method
     H_MEAN,  # mean step size (s)
-    HISTORY,  # index at which the history of step-size control in this phase begins: 2 numbers, see loop_state.py
+    HISTORY,  # first index of the history of step-size control in this phase: two numbers, see loop_state.py
     _HISTORY_ERROR,
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
@@ -244,7 +244,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 def _has_small_vibrations(w, tolerances, state, rate):
     """Return whether vibrations with the present accelerations have velocities of at most QUIET_FACTOR tolerances.
 
-    `rate`: angular frequency (1/s) of these vibrations.
+    At the angular frequency `rate` (1/s), the amplitude of a velocity is the one of its acceleration over `rate`.
     """
     n = w.Q.size
     for i in w.independent_v:
@@ -336,7 +336,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         or is_costly
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT is not reset
+    if is_cheap and h_rho <= 1.0:  # (while a trial is too expensive, N_ABOVE_LIMIT keeps its value)
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than in the previous explicit phase
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
@@ -365,7 +365,7 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method; first choose this method anew if an estimate of rho, or a verdict, is due.
+    """Attempt a step by the active method; first choose this method anew if rho must be estimated or a trial judged.
 
     The memory of a method is cleared when this method becomes active. The active method determines the step-size rule.
     """

@@ -7,8 +7,8 @@ numbers: one number for each unknown node, or one for each of eight steps that a
 LANES = 8  # number of lanes, that is, of numbers that are computed at once
 ORDER = 12.0  # the error estimate is proportional to this power of the step size
 MAX_ROUNDING = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
-# codes: how the iteration of the stages ended. REJECTED: the step is rejected. GUESSED: the step size was a guess, and
-# must be replaced by another guess. NOT_COMPUTED: accelerations at the nodes could not be computed
+# how the iteration of the stages ended. REJECTED: the step is rejected. GUESSED: the step size was a guess, and another
+# guess must be tried. NOT_COMPUTED: accelerations at the nodes could not be computed
 CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
 
 (
@@ -18,15 +18,15 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: accelerations are predicted by a polynomial; 0: they are predicted to be constant
     CURRENT,  # 0 or 1: which of the two stored polynomials belongs to the last accepted step
-    TRIED,  # 1: the other polynomial belongs to the attempted step
+    TRIED,  # 1: the other one of the stored polynomials belongs to the attempted step
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     OLD_DEGREE,  # value of DEGREE before a rejection, which a later step restores; 0: no step was rejected
     MAY_GUESS,  # 1: the step size is a guess, and is replaced if the contraction is far from its target
-    N_MASS_FIRST,  # number of coming steps that use the elimination that begins with M
+    N_MASS_FIRST,  # number of coming steps that eliminate M first, because another order of elimination has failed
     N_GUESSES,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
-    LIMITED,  # number of steps whose size the convergence limited, minus the number of other steps; at least 0
-    FAILURES,  # twice the number of steps that did not converge, minus the number of accepted steps; at least 0
+    LIMITED,  # a count, at least 0: +1 for each step whose size the convergence limited, -1 for each other step
+    FAILURES,  # a count, at least 0: +2 for each step that did not converge, -1 for each accepted step
     DEFECT,  # largest defect between nodes, relative to the allowed defect; -1: not evaluated
     RHO,  # contraction by a sweep: ratio of successive changes of the velocities
     SWEEPS,  # number of sweeps in the step
@@ -38,8 +38,8 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR_OF_ERROR,  # largest ratio of the next step size to this one that the error allows
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
     ALLOWED_H,  # largest size (s) that the error would have allowed for the last step
-    SIZE,  # largest sum of a velocity and its change in the step, relative to the tolerances
-    STRICTER,  # largest of all WEIGHTS, divided by the largest WEIGHT of an iterated coordinate
+    SIZE,  # largest |v| + |change of v in the step|, relative to the tolerances: the scale of rounding errors STRICTER,
+    # largest of all WEIGHTS, divided by the largest of the iterated coordinates, on which accelerations depend
     REPEATS,  # 1: each sweep evaluates accelerations twice, first at old and then at new velocities; 0: once
 ) = range(29)
 # offsets of the arrays that follow the scalars
@@ -54,9 +54,8 @@ WEIGHTS = 72  # offset of n_q numbers: reciprocals of the allowed errors of velo
 def array_offsets(n, n_iterated, n_rows):
     """Return the offsets of the arrays whose sizes depend on the mechanism, and the length of the memory.
 
-    Arrays of the stages: accelerations (n lanes), positions, velocities and two polynomials (n_iterated lanes each),
-    and Legendre coefficients of the accelerations (n lanes). Arrays of the projection: t, q and v (1 + 2 n lanes), a (n
-    lanes) and lam (n_rows lanes).
+    Arrays of the stages, in groups of lanes: accelerations (n), positions, velocities and two polynomials (n_iterated
+    each), Legendre coefficients of the accelerations (n). Of the projection: t, q, v (1 + 2 n), a (n), lam (n_rows).
     """
     a = WEIGHTS + LANES * (-(-n // LANES))
     q = a + LANES * n

@@ -1,8 +1,9 @@
 """Define what all kernels share: types, compiling decorators, the workspace, the table of callbacks, tolerances.
 
 Each kind of callback has a fixed signature, and writes its results into an argument. So the integrator is compiled
-once, and receives the functions of any mechanism and any method as arguments. In all kernels, `f` is the `Kit` of
-functions and data, `w` the workspace `Work`, `t` the time in s, and `h` a step size in s.
+once, and receives the functions of any mechanism and any method as arguments. Arguments have the same names in all
+kernels: `f` is the `Kit` (the functions and constant data of a system and a method), `w` the workspace `Work` (the
+arrays that kernels write), `t` the time and `h` a step size in s.
 """
 
 import hashlib
@@ -44,20 +45,20 @@ class Work(NamedTuple):
     """
 
     M: Any  # (n_q, n_q) mass matrix
-    L: Any  # (n_q, n_q) inverse of a constant M, else the factors of M, dense (see ldl_factor) or banded
+    L: Any  # (n_q, n_q) inverse of M if M is constant, else the factors of M, dense (see ldl_factor) or banded
     G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
     entries: Any  # view of `G` as a vector
     augmented: Any  # view of the memory of `G` and, after it, of `M`
-    S: Any  # (r_v, r_v) G M^-1 G^T for the independent rows of G; its factors replace it
+    S: Any  # (r_v, r_v) G M^-1 G^T for the independent rows of G, which is overwritten by its factors
     W: Any  # (r_v, n_q) G M^-1 for the independent rows of G
-    A: Any  # (n_dof, n_dof) T^T M T; its factors replace it; empty where S is used
+    A: Any  # (n_dof, n_dof) T^T M T (T: null space of G), overwritten by its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
     D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T; last row: dependent velocities for v_i = 0; columns in elimination order
     Gx: Any  # (n_c + n_a, n_q) C_q and A at a displaced position (for Gamma by differences); scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) the G that was used to compute S and W, for constant M; NaN: none yet
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of G that have been nonzero, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; empty without the augmented form
-    places: Any  # (n_c + n_a + 1) index of the first entry of each row of G, then the columns of all entries
+    row_entries: Any  # (n_c + n_a + 1) where each row's list begins, then the lists: columns of nonzero entries of G
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: with twice the time step, and with the previous time step
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b at later times, see discontinuities.py
@@ -81,7 +82,7 @@ class Work(NamedTuple):
     independent_v: Any  # (n_dof) indices of the independent velocities
     index_v: Any  # program that factors G_d
     values_v: Any  # the factors of G_d
-    index_a: Any  # program that factors the augmented matrix; its SIZE is 0 until the program is written
+    index_a: Any  # program that factors the augmented matrix; index_a[SIZE] is 0 until the program is written
     values_a: Any  # the factors of the augmented matrix; empty in other forms
     right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix, and scratch
     order: Any  # (n_q) scratch: order of the columns in full pivoting
@@ -108,7 +109,7 @@ class Work(NamedTuple):
 
 _INTEGER_FIELDS = {
     *("rows", "dependent", "independent", "index", "rows_v", "dependent_v", "independent_v", "index_v"),
-    *("index_a", "places", "order", "row_order", "counters", "lapack"),
+    *("index_a", "row_entries", "order", "row_order", "counters", "lapack"),
 }
 _MATRIX_FIELDS = {
     *("M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "mass_pattern", "Gamma_tried", "rates"),
@@ -414,7 +415,7 @@ def is_beyond_gap(tolerances, h):
 
 @merged
 def gap_ratio(tolerances, h):
-    """Return h / tolerances[GAP] for a step of size h; 0 if this ratio is at most 1, or if the step size is fixed."""
+    """Return h / tolerances[GAP] if a step of size h is too long; 0 if it is not, or if the step size is fixed."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

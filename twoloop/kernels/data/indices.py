@@ -24,11 +24,16 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     STOPPED,  # the time limit of the run has passed, see TIME_IS_UP
 ) = range(13)
 
-# indices in Functions.flags, whole numbers that describe a system to kernels. CONSTANT_MASS and DIAGONAL_MASS: 1 if M
-# is constant, or diagonal. BANDWIDTH: -1 if linear algebra is not banded. FORM: form of the linear equations of
-# accelerations, see linalg/saddle_point.py. DENSE_FORM: value of FORM to use if sparse factors have too many entries.
-# IS_GENERATED: 1 if the inner loop is code generated for the mechanism. FIRST_GIVEN: first index of the flags in GIVEN
-CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, IS_GENERATED, FIRST_GIVEN = range(7)
+# indices in Functions.flags, whole numbers that describe a system to kernels
+(
+    CONSTANT_MASS,  # 1: M is constant
+    DIAGONAL_MASS,  # 1: M is diagonal
+    BANDWIDTH,  # bandwidth of M for banded linear algebra; -1: linear algebra is not banded
+    FORM,  # form of the linear equations for accelerations: one of the four below, see linalg/saddle_point.py
+    DENSE_FORM,  # the value of FORM to use if sparse factors have too many entries
+    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism
+    FIRST_GIVEN,  # first index of the flags in GIVEN
+) = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM; for FIXED_ORDER see sparse_inner_loop.py
 # indices of the flags of optional callbacks: 1 if the callback is given
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
@@ -70,7 +75,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     CONTRADICTION,  # index of a row that is violated although it counted as redundant
     PIVOT,  # smallest pivot of the last full pivoting, for rows scaled to 1; small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check for singular positions
-    NEAR_NOW,  # 1: the last check found a singular position nearby; 2: the next check must first renew the partition
+    NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check must first renew the partition
     MASS_SCALE,  # factor on M in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
     HAS_GAMMA,  # 1: the fused callback has computed w.Rate and w.Gamma[:n_c] for the current state
@@ -78,7 +83,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     EXPLICIT_STEP,  # 1: the last attempted step of a pair of methods was explicit
     DEFECT,  # largest defect of the attempted step, relative to the allowed defect; -1: not evaluated
     LARGEST_DEFECT,  # largest value of DEFECT in the accepted steps
-    UNCHECKED,  # number of accepted steps without an evaluation of the defect
+    UNCHECKED,  # number of accepted steps whose defect was not evaluated
     WIDEST_GAP,  # longest time (s) between two evaluations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of C_t or b
     NEXT_JUMP,  # time (s) of the next known jump of C_t or b
@@ -102,7 +107,7 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
 # indices in `tolerances`, the array that steps read; for the tolerances see eq. (26) of the paper
 (
     RTOL,
-    ESTIMATE,  # 0 for steps of fixed size, else 1
+    ESTIMATE,  # 1: errors of steps are estimated; 0: not, because the step size is fixed
     LEAST,  # smallest tolerance of a coordinate or a velocity
     GAP,  # longest time between two evaluations of the equations (s)
     DEFECT_GAP,  # longest time (s) between two evaluations in steps that evaluate their defect between nodes
@@ -114,14 +119,20 @@ REPORTED_ERROR = 30.0  # velocity errors of more tolerances than this are report
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
 # kinds of intervals between accepted states, for dense output: which data do the polynomials interpolate?
 (
-    SEPARATE,  # q and v in one polynomial, v and a in another: errors of q and v are independent, steps are small
-    VELOCITIES,  # q and v in one polynomial and its derivative: a contains the noise of stiff modes
-    ACCELERATIONS,  # q, v and a in one polynomial and its derivatives
+    SEPARATE,  # one polynomial for q (through q and v), another for v (through v and a): their errors are independent
+    VELOCITIES,  # one polynomial through q and v, not a, because a contains the noise of stiff modes
+    ACCELERATIONS,  # one polynomial through q, v and a
     ACROSS,  # same as ACCELERATIONS, for a step across a singular position
     JUMP,  # no polynomial: the interval is a few spacings of floating-point numbers long, and velocities jump in it
 ) = range(5)
-# columns of the table of intervals, which has one row for each interval that contains output times. FIRST_OWN and
-# LAST_OWN: indices of the states at the ends of the interval. KIND: kind of the interval. FIRST_TIME and END_TIME - 1:
-# indices of the first and last output time in the interval. LOW and HIGH: indices of the first and last state that the
-# polynomial may interpolate, because velocities jump beyond these states
-FIRST_OWN, LAST_OWN, KIND, FIRST_TIME, END_TIME, LOW, HIGH, N_COLUMNS = range(8)
+# columns of the table of intervals, which has one row for each interval that contains output times
+(
+    FIRST_OWN,  # index of the state at the beginning of the interval
+    LAST_OWN,  # index of the state at its end
+    KIND,  # kind of the interval
+    FIRST_TIME,  # index of the first output time in the interval
+    END_TIME,  # 1 + index of the last output time in the interval
+    LOW,  # index of the first state that the polynomial may interpolate; velocities jump before it
+    HIGH,  # index of the last state that the polynomial may interpolate; velocities jump after it
+    N_COLUMNS,
+) = range(8)

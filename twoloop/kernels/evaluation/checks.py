@@ -128,7 +128,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # the state satisfies the constraints up to rounding. DEFINITE: M varies, and all its eigenvalues exceed their limit by
 # the factor EIGENVALUE_MARGIN. INDEFINITE: M varies, and an eigenvalue is below its limit by this factor
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position apply up to this distance from it, relative to these sizes
+MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position apply up to this distance from it, relative to the sizes
 ROUNDING_OF_ZERO = 2.0**-52  # coordinates up to this size, relative to the largest, may be rounding errors of zero
 EIGENVALUE_MARGIN = 2.0  # eigenvalues must differ from their limit by this factor, so that rounding does not decide
 
@@ -147,7 +147,6 @@ def _set_to_zero(A):
 
 @exact
 def _has_empty_row(rows):
-    """Return whether one of the rows contains only zeros."""
     has_empty_row = False
     for i in range(len(rows)):
         has_empty_row = has_empty_row or largest_of(rows[i]) == 0.0
@@ -173,7 +172,7 @@ def _is_symmetric(mass, tolerance):
 def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
     """Return whether the constraint `value` is a rounding error: at most `tolerance` times the sum of its |terms|.
 
-    The terms are `rate` and row[j] * state[j] for all j; a smaller |state[j]| than sizes[j] or `min_size` is raised.
+    The terms are `rate` and row[j] * state[j] for all j; |state[j]| counts as at least sizes[j] and `min_size`.
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):

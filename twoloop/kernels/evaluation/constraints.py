@@ -27,8 +27,8 @@ def constraint_rows(f, w, t, q, G):
 @compiled
 def _clear_recorded_entries(w):
     for i in range(w.Rate.size):
-        for k in range(w.places[i], w.places[i + 1]):
-            w.G[i, w.places[k]] = 0.0
+        for k in range(w.row_entries[i], w.row_entries[i + 1]):
+            w.G[i, w.row_entries[k]] = 0.0
 
 
 @merged
@@ -46,8 +46,8 @@ def row_residual(w, v, rows):
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
-        for p in range(w.places[row], w.places[row + 1]):
-            total += w.G[row, w.places[p]] * v[w.places[p]]
+        for p in range(w.row_entries[row], w.row_entries[row + 1]):
+            total += w.G[row, w.row_entries[p]] * v[w.row_entries[p]]
         w.z[k] = total
 
 
@@ -79,7 +79,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store right-hand sides in the rows of D: -G_j for each independent column j of G, and -`rate` in the last row."""
+    """Store right-hand sides for the matrix G_d in the rows of D: -G_j for each independent column j; last, -`rate`."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -88,8 +88,8 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-# largest step (s) of a finite difference, and largest change of q during a step, relative to max|q|. MIN_STEP_RATIO:
-# smallest result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
+# a step of a finite difference is at most MAX_DIFFERENCE_STEP s, and so short that q changes by at most
+# MAX_DIFFERENCE_STEP max|q|; but this second limit makes it no shorter than MIN_STEP_RATIO times MAX_DIFFERENCE_STEP s
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the previous step
 ROUNDING_DISAGREEMENT = 1e-9  # due to rounding, Gamma with the steps e and 2 e may differ by this fraction
@@ -123,7 +123,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return the side of t on which to take differences: 1 (after t) or -1 if C_t or b jumps on the other; 0: both."""
+    """Return where to take differences: 1 (after t) or -1 (before t), if C_t or b jumps on the other side; 0: both."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -220,15 +220,14 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
     Errors are relative to the largest entry of Gamma so far in this run. The step e is GAMMA_STEP_RATIO times
-    largest_difference_step. A new step is chosen if the differences with e and 2 e disagree, as they do for a drive of
-    several kilohertz.
+    largest_difference_step; a new one is chosen if differences with e and 2 e disagree, as in drives of kilohertz.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.gamma_step_ratio * largest_step)
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
-            return DONE  # either Gamma is not finite, which the caller reports, or there is no scale to judge errors by
+            return DONE  # Gamma is not finite, which the caller reports, or there is no scale yet to judge errors by
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
         if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:

@@ -90,7 +90,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_equations_at(f, w, t, q):
-    """Factor the linear system for accelerations at (t, q), using the rows and w.D (NULL_SPACE) in w; return a code."""
+    """Factor the linear system for accelerations at (t, q), given the rows and (if NULL_SPACE) w.D; return a code."""
     if f.constant_mass == 0:
         w.factored = 0.0
         mass_matrix(f, w, t, q)
@@ -102,7 +102,7 @@ def factor_equations_at(f, w, t, q):
 
 @merged
 def compute_accelerations(f, w, t, q, v, a):
-    """Compute the accelerations `a` at (q, v) from the rows, their factors and w.D (NULL_SPACE); return a code."""
+    """Compute the accelerations `a` at (q, v), given the rows, their factors and (if NULL_SPACE) w.D; return a code."""
     w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:
@@ -126,8 +126,8 @@ def _record_gamma_scale(w, a):
     """Increase GAMMA_SCALE, the scale of errors of Gamma, to at least the largest sum over j of |G_ij a_j|."""
     for i in range(w.Rate.size):
         total = 0.0
-        for p in range(w.places[i], w.places[i + 1]):
-            total += abs(w.G[i, w.places[p]] * a[w.places[p]])
+        for p in range(w.row_entries[i], w.row_entries[i + 1]):
+            total += abs(w.G[i, w.row_entries[p]] * a[w.row_entries[p]])
         w.gamma_scale = max(w.gamma_scale, total)
 
 
@@ -144,7 +144,7 @@ def compute_multipliers(f, w, a, lam):
 def _factor_rows_at(f, w, t, q, v):
     """Store in w the rows of G at q, their factors and, for NULL_SPACE, the null space w.D; return a code.
 
-    The fused callback also computes Gamma, which depends on v. The state (q, v) may be off the constraints.
+    The callback `kinematics` also computes Gamma, which depends on v. The state (q, v) may be off the constraints.
     """
     if f.kinematics_given == 1:
         kinematics(f, w, t, q, v)
@@ -226,7 +226,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
             w.has_gamma = 0.0  # Gamma was computed at the old velocities: compute it again
         if not is_last and correction_q > CONTRACTION * last_correction:
             if is_rounding_of_positions(w, q, correction_q):
-                break  # without this correction: it would be noise, which moves light bodies by much more than others
+                break  # omit this correction, which is noise: it would move light bodies by much more than others
             return INNER_DIVERGED
         for j in range(q.size):
             q[j] += w.y[j]
@@ -244,9 +244,9 @@ ROUNDING_OF_Q = 2e-14  # change of q that counts as rounding, relative to max|q|
 
 @merged
 def _verify_pattern(w):
-    """Return DONE if w.pattern has all nonzero entries of w.G; else write new programs, and return a code of failure.
+    """Return DONE if w.pattern contains all nonzero entries of w.G; else write new programs that use the new entries.
 
-    The code is INNER_DIVERGED, or SINGULAR if no program exists.
+    The code is then INNER_DIVERGED, so that the step is repeated with them; or SINGULAR if no program can be written.
     """
     if not record_entries(w):
         return DONE
@@ -361,7 +361,7 @@ def find_tangents(f, w, t, q):
 
 @merged
 def prepare_mass(f, w, t, q):
-    """Store M(t, q) in w, and the factors of M if the form of the equations uses them; return a code."""
+    """Store M(t, q) in w by the task for this, and the factors of M if the form uses them; return a code."""
     return f.inner(f, w, tasks.PREPARE_MASS, t, q, q, 0.0, w.x, w.lam)
 
 

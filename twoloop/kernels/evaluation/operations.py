@@ -9,11 +9,12 @@ import math
 
 from twoloop.kernels.data.common import compiled, exact
 
-# kinds of operations. PENDING: product of two Taylor series; the coefficient of each order of the second series becomes
-# known only when the linear equations of this order are solved. RESULT: output of a program
+# kinds of operations. PENDING: product of two Taylor series, of which the coefficient of each order of the second is
+# unknown until the linear equations of this order are solved. RESULT: output of a program
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
 # columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of the node (for
-# RESULT: of the output) that it computes. FIRST to SECOND - 1 and SECOND to END - 1: terms of its two arguments
+# RESULT: of the output) that it computes. FIRST, SECOND, END: the first argument of the operation is the sum of the
+# terms FIRST to SECOND - 1, the second argument of the terms SECOND to END - 1
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
 # A program is a vector of integers: N_SIZES sizes (at the indices below), the rows of the table, the node of each term,
 # and the index of each result in its array. Results are numbered after all other nodes
@@ -86,7 +87,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, the first node that is a result, and the position of the list of result indices."""
+    """Return the number of results, the index of the first result in `nodes`, and where the list of indices begins."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

@@ -38,14 +38,13 @@ from twoloop.kernels.linalg.markowitz_lu import (
 
 RANK_TOLERANCE = 1e-11  # pivots up to this size count as zero, for rows scaled to 1
 PARTITION_CHANGED = -1  # code that replaces DONE if a new partition was adopted
-# min_pivot_ratio does an elimination up to this number of rows of G; with more rows, it would take too long
-MAX_ROWS_ELIMINATED = 200
+MAX_ROWS_ELIMINATED = 200  # with more rows of G, min_pivot_ratio does no elimination: it would take too long
 SENSITIVITY_GROWTH = 3.0  # a partition is poor once max|C_qd^-1 C_qi| has grown by more than this factor
 
 
 @compiled
 def scale_rows(A):
-    """Divide each row of A in place by a power of two, so that the largest entry of the row is about 1."""
+    """Scale each row of A in place by a power of two, so that its largest entry is about 1."""
     for i in range(A.shape[0]):
         largest = largest_of(A[i])
         if largest > 0.0 and largest < np.inf:
@@ -220,16 +219,16 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store in w.places (see Work) the column indices of the entries of each row of w.G, from w.pattern."""
+    """Store the columns of the nonzero entries of each row of w.G, given by w.pattern, in w.row_entries (see Work)."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
-        w.places[i] = index
+        w.row_entries[i] = index
         for j in range(w.pattern.shape[1]):
             if w.pattern[i, j] != 0.0:
-                w.places[index] = j
+                w.row_entries[index] = j
                 index += 1
-    w.places[n_rows] = index
+    w.row_entries[n_rows] = index
 
 
 @compiled
@@ -364,8 +363,8 @@ def partition_is_poor(w):
 MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # an iteration counts as convergent if each correction is at most this fraction of the previous one
 ROUNDING_OF_CORRECTIONS = 1e-12  # rounding may cause corrections up to this size, relative to the largest coordinate
-# factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding, because small parts amplify errors:
-# the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, and a chain of 1,000 such rods by more
+# factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding, because small bodies amplify
+# errors: the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, and a chain of rods by more
 AMPLIFICATION = 1e3
 ROUNDING_OF_ROWS = 2e-15  # |C_i| counts as a rounding error up to this fraction of the largest |G_ij q_j|
 MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.rounded, the rounding error of q
@@ -418,8 +417,8 @@ def _is_on_constraints(w, q):
     """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
     for i in range(w.C.size):
         largest_term = 0.0
-        for p in range(w.places[i], w.places[i + 1]):
-            largest_term = max(largest_term, abs(w.G[i, w.places[p]] * q[w.places[p]]))
+        for p in range(w.row_entries[i], w.row_entries[i + 1]):
+            largest_term = max(largest_term, abs(w.G[i, w.row_entries[p]] * q[w.row_entries[p]]))
         if not abs(w.C[i]) <= ROUNDING_OF_ROWS * largest_term:
             return False
     return True
@@ -427,7 +426,7 @@ def _is_on_constraints(w, q):
 
 @merged
 def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
-    """Solve eq. (15) by Newton's method for the dependent positions in q; return a code.
+    """Solve C(t, q) = 0, eq. (15), by Newton's method for the dependent positions in q; return a code.
 
     The iteration ends after a correction of at most `tolerance`. On return, w has the rows and factors at q or, if the
     last correction was at most `reuse_limit`, at q before this correction. The callback `kinematics` also stores Gamma.
@@ -484,8 +483,7 @@ def find_null_space(f, w, t, q):
 def restore_velocities(f, w, t, q, v, reuse_limit):
     """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, by the factors in w.
 
-    If no velocity changes by more than `reuse_limit`, HAS_GAMMA stays set: w.Gamma, as computed by the callback
-    `kinematics`, is still valid.
+    If no velocity changes by more than `reuse_limit`, HAS_GAMMA stays set: w.Gamma from `kinematics` is still valid.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size

@@ -69,8 +69,7 @@ SUSPECT_PIVOT = 1e-6  # a row is checked if its pivot, which may be a rounding e
 MIN_PIVOT = 1e-10  # factors by 1-by-1 pivots are accurate if each pivot is at least this fraction of its row's size
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular near a singular position, where stages must be projected
-# solutions are refined once if the smallest pivot, relative to the size of its row, is at most REFINE_ONCE_BELOW, and
-# twice if it is at most REFINE_TWICE_BELOW
+# solutions are refined once or twice if the smallest pivot, relative to the size of its row, is at most this
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
 
@@ -207,7 +206,7 @@ def _choose_rows(f, w, t, q):
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
         return _failure_of_factorization(w, t, q)
     order, n_q = pivot_order_of(f.ldl_program), w.Q.size
-    copy(w.is_independent, w.z)  # w.z is 0 for rows that must be checked
+    copy(w.is_independent, w.z)  # w.z: 0 for rows that must be checked
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
@@ -444,7 +443,7 @@ def _project_state(f, w, t, q, v, theta):
         is_last = is_last or correction_q <= w.pivot * theta
         if not is_last and correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            # this correction is left out: it would be noise, which moves light bodies by much more than others
+            # omit this correction, which is noise: it would move light bodies by much more than others
             return (
                 DONE
                 if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))

@@ -22,7 +22,7 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
     n_fresh, n_running = 0, 0
     for k in range(LANES):
         previous_run = int(work[at.RUN * LANES + k])
-        # the generated code of a series method ends a run by RUNNING = 0, without storing a reason in `status`
+        # the generated code of a Taylor method ends a run by RUNNING = 0 only: store the reason in `status` here
         if work[at.RUNNING * LANES + k] == 0.0 and previous_run >= 0 and status[previous_run] == at.UNDECIDED:
             status[previous_run] = at.MANY_REJECTIONS if work[at.N_REJECTED * LANES + k] < np.inf else at.NO_VALUES
         work[at.ACTIVE * LANES + k] = work[at.IS_NEW * LANES + k] = 0.0

@@ -20,9 +20,9 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, whose first N_RULE entries are the step-size rule. JUMP_RATIO: largest ratio of error to
-# estimate if a force jumps; FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest
-# tolerance of a coordinate. N_HEAD: index of the first of the method's options for a single run
+# indices in `options`, between the step-size rule (N_RULE numbers) and the options of the method in a single run
+# - JUMP_RATIO: largest ratio of true error to error estimate in a step in which a force jumps
+# - FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest tolerance of a coordinate
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
 SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
@@ -78,7 +78,7 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Store the next step size, at most control[GAP], in H and X (0 in lanes without a run); copy RUNNING to ACTIVE."""
+    """Store the next step size, at most control[GAP], in H and X (lanes without a run: 0); set ACTIVE to RUNNING."""
     t1 = control[at.T1]
     for k in range(LANES):
         work[at.H * LANES + k], t = 0.0, work[at.T * LANES + k]
@@ -110,7 +110,7 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW onto the constraints; if this changes NEW by more than ERROR tolerances, store the change in ERROR.
+    """Project NEW onto the constraints; raise ERROR to the change that this causes, in tolerances, if it is larger.
 
     Velocities change by more than the tolerances if a drive jumps or bends between stages. `predicted_v` is scratch.
     """

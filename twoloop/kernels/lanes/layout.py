@@ -16,10 +16,16 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, inlined, merged
 
-# status of a run: not ended; ended at t1; or (negative) the reason why the run has to be repeated outside the lanes,
-# such as CALLBACKS_DIFFER: callbacks disagree with the generated code
-UNDECIDED, ENDED = 0, 1
-NO_START, NO_STATE, NO_VALUES, MANY_REJECTIONS, MANY_STEPS, CALLBACKS_DIFFER = range(-6, 0)
+UNDECIDED, ENDED = 0, 1  # status of a run: not ended yet; ended at t1
+# negative status: why a run has to be repeated outside the lanes
+(
+    NO_START,  # the generated code could not compute the accelerations at the start
+    NO_STATE,  # a state at an output time could not be projected
+    NO_VALUES,  # the equations have no values in a step
+    MANY_REJECTIONS,  # too many successive steps were rejected
+    MANY_STEPS,  # the run takes too many steps
+    CALLBACKS_DIFFER,  # callbacks disagree with the generated code
+) = range(-6, 0)
 
 LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of doubles in a SIMD register
 
@@ -27,13 +33,13 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
 (
     T,  # time of STATE (s)
     T_NEW,  # time of NEW (s)
-    UNIT,  # unit of time of a series (s)
+    UNIT,  # unit of time in which a Taylor series is computed (s)
     H,  # size of the step (s)
     X,  # time (s) from the beginning of the step to the state to be computed
     ACTIVE,  # 1 in lanes where the next task has to run; a task that fails in a lane sets 0 there
     DEFECT,  # defect at the end of the step, relative to the allowed defect
-    PREDICTION_ERROR,  # difference of predicted and projected positions, over its limit, see step_size.py
-    LENGTH,  # step size that a series allows, in units of UNIT
+    PREDICTION_ERROR,  # difference of predicted and projected positions, relative to its limit, see step_size.py
+    LENGTH,  # step size that a Taylor series allows, in units of UNIT
     LONGEST,  # largest allowed step size (s)
     REQUESTED,  # 1 in lanes that begin a run, or need a state within the step
     WORST_DEFECT,  # largest defect within the step, relative to the allowed defect
@@ -57,8 +63,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# names of tasks: functions (order, control, work) that are generated for a mechanism. The methods of the same names in
-# generate/lane_code.py describe them
+# names of generated functions (order, control, work); methods of the same names in generate/lane_code.py describe them
 TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_prediction_error", "commit")
 TASKS_OF_STARTS, TASKS_OF_STAGES, TASKS_OF_EXPLICIT = ("compute_rows",), ("compute_accelerations",), ("compute_stages",)
 TASKS_OF_SERIES = (
@@ -79,8 +84,16 @@ CODE.add_function("step", STEP)
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
 # indices in `settings`, whole numbers that describe the mechanism and the method
-N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)
-T0, T1, GAP, RTOL, ATOL = range(5)  # indices in `control`; ATOL: first of the n absolute tolerances
+(
+    N,  # number of coordinates
+    N_ROWS,  # number of constraints
+    ORDER,  # order of the Taylor series
+    CHECKS_REDUNDANT,  # 1: redundant rows must be checked at the end of each step
+    N_NUMBERS,  # number of numbers that the generated code reads
+    N_EVALUATIONS,  # number of evaluations within a step
+) = range(6)
+# indices in `control`: start, end (s), longest time (s) between evaluations, rtol, first of the n absolute tolerances
+T0, T1, GAP, RTOL, ATOL = range(5)
 
 SHORTEST = 1e-13  # smallest step size, relative to the larger of |t| at its beginning and |t1|
 
@@ -170,7 +183,7 @@ def add_product(work, target, x, y, sign):
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return the value that `raise_to_ratio` stores in one lane; `target`, `error`, etc. are indices in `work`."""
+    """Return the value that `raise_to_ratio` stores in one lane; all arguments but `factor` are indices in `work`."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
@@ -218,7 +231,6 @@ def _subtract_product(work, target, x, y, imaginary, imaginary_y):
 
 @merged
 def _exchange_entries(work, first, second, k):
-    """Exchange the entries of the vectors `first` and `second` in lane k."""
     i, j = first * LANES + k, second * LANES + k
     work[i], work[j] = work[j], work[i]
 

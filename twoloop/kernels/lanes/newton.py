@@ -47,7 +47,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 (
     ITERATING,  # 1 in lanes whose iteration has not ended
     DONE,  # 1 in lanes whose iteration has converged
-    CHANGE_BEFORE,  # correction by the previous iteration, relative to SCALE_Q and SCALE_V, see _has_iteration_ended
+    CHANGE_BEFORE,  # correction by the iteration before, relative to SCALE_Q and SCALE_V
     SCALE_Q,  # largest absolute position at the stages, at least 1
     SCALE_V,  # largest absolute velocity at the stages, at least 1
     LARGEST_Q,  # largest correction of positions, divided by the square of the step size
@@ -57,30 +57,29 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     DURATION,  # duration of an error of the velocities (s), see velocity_errors.py; 0: not known
     N_SINGLE_VECTORS,
 ) = range(11)
-# indices of the blocks of n vectors: accelerations at STATE; q, v and a at the beginning of the step; scratch for sums;
-# q, v and a in the middle of the step; estimated errors of q and of v; the error of v before filters and after one
-# filter; the real and the imaginary part of a complex vector
+# indices of the blocks of n vectors
 (
-    START,
-    BEGIN_Q,
+    START,  # accelerations at STATE
+    BEGIN_Q,  # q, v and a at the beginning of the step
     BEGIN_V,
     BEGIN_A,
-    SUMS,
-    MIDDLE_Q,
+    SUMS,  # scratch
+    MIDDLE_Q,  # q, v and a in the middle of the step
     MIDDLE_V,
     MIDDLE_A,
-    E_Q,
+    E_Q,  # estimated errors of q and v
     E_V,
-    UNFILTERED,
-    FILTERED_ONCE,
-    COMPLEX,
-    _IMAGINARY,
+    UNFILTERED,  # estimated error of v before filters
+    FILTERED_ONCE,  # estimated error of v after one filter
+    COMPLEX,  # real part of a complex vector
+    _IMAGINARY,  # imaginary part of this vector
     N_VECTORS,
 ) = range(15)
-# indices of the blocks (s, n): accelerations of the stages, and of the stages of the previous step; residuals; and
-# corrections. The weights (s, s) follow the blocks
+# indices of the blocks (s, n): stage accelerations of this step, stage accelerations of the previous step, residuals of
+# Newton's method, and its corrections. The weights (s, s) follow the blocks
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
-# indices of the matrices (n, n). SYSTEMS: first of the systems, each with a real and an imaginary part; pivots follow
+# indices of the matrices (n, n): derivatives of the accelerations by q and by v; then, for each linear system, its real
+# and its imaginary part. The pivots follow the matrices
 DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 

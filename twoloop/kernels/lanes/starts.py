@@ -21,7 +21,7 @@ from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, 
 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
 ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, because some eigenvalues of G G^T are zero then
-MAX_REDUNDANT_EIGENVALUE = 1e-4  # a combination of rows counts as redundant if its eigenvalue of G G^T is at most this
+MAX_REDUNDANT_EIGENVALUE = 1e-4  # an eigenvector of G G^T counts as a redundant combination up to this eigenvalue
 # number of inverse iterations for each row of Z: few suffice, because redundant combinations have tiny eigenvalues
 N_REDUNDANT_ITERATIONS = 5
 # inverse iterations start from irregular numbers: multiples of this number, modulo 1
@@ -211,25 +211,29 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# another assembly counts as near if the projection of a displaced position differs from its linear prediction by C_q by
-# more than this fraction of the displacement
+# another assembly counts as near if a displaced position is projected farther than this from its linear prediction by
+# C_q, relative to the displacement
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # rows of norm 1 count as independent if all eigenvalues of G G^T are at least this
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; `settings` of runs has N_EVALUATIONS there
-# other guesses are displaced from the projected positions by the change from the first guess to the projected positions
-# times the first factor, plus the weakest direction times the second factor
+# three other guesses. A guess is displaced from the projected positions by its first factor times the change from the
+# first guess to the projected positions, plus its second factor times the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def offsets_in_memory(memory, n, n_rows, n_entries, n_redundant):
     """Return the offsets (in vectors) of the parts of the method's memory, which begins at `memory`, and of its end.
 
-    The memory begins with C and C_t (n_rows each), and the entries of G; the generated code writes these parts. The
-    other parts are a right-hand side x (n_rows); a change of positions or velocities, the projected positions, the
-    change from the guess to the projected positions, the weakest direction, the displacement of another guess, and a
-    row of G (n each); the results of `factor_gram` at the projected positions; and its results at NEW, the current
-    iterate (q, v), see layout.py. The weakest direction is the direction that the rows of G determine least.
+    The memory begins with C and C_t (n_rows each) and the entries of G, which the generated code writes. Then follow
+
+    - x (n_rows), a right-hand side
+    - change (n), of positions or velocities
+    - nearest_positions (n), the projected positions; change_from_guess (n), from the guess to these positions
+    - weakest_direction (n), the direction that the rows of G determine least
+    - displacement (n), of another guess from the projected positions
+    - row (n), a row of G
+    - results of `factor_gram` at the projected positions, and at NEW, the current iterate (q, v), see layout.py
     """
     G = memory + 2 * n_rows
     x = G + n_entries

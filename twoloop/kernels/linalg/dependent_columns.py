@@ -8,12 +8,12 @@ from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, 
 
 NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries of G: always zero, constant, varying
 ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows, which have the fewest entries
-# limits of a pivot block, in three tiers, which are tried in this order
+# limits that entries must meet to be a pivot block: three pairs of limits, tried in this order, each looser
 # - MAX_SQUARES: largest sum of squares of the changes of the block's coordinates if each other coordinate moves by 1
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
 #   squared ratio of the pivot to the norm of its column of G
-# Pivots of the first tier stay large for 98 % of a turn of a spatial four-bar, pivots of the second tier for 34 %. The
-# last tier is well above MIN_PIVOT_SQUARE of generate/null_space.py, so that a choice stays valid for some motion
+# With the first pair, pivots stay large for 98 % of a turn of a spatial four-bar, with the second for 34 %. The last
+# limits are well above MIN_PIVOT_SQUARE of generate/null_space.py, so that a choice stays valid for some motion
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 MIN_CONSTANT_PIVOT = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
 CANCELLATION = 1e-12  # the difference a - b of two constants counts as zero up to this fraction of |b|

@@ -3,8 +3,8 @@
 A mechanism's Jacobian has few nonzero entries, and their pattern does not change. So the order of elimination is chosen
 once for each partition (Markowitz's rule with a threshold), and written as a program, a list of operations. Later
 factorizations follow this program, without a search for pivots and without tests for zeros. If multipliers of the
-elimination become large, another order is chosen. If the program is nearly as long as for a full matrix, dense
-factors replace the sparse ones.
+elimination become large, another order is chosen. Factors are dense if the program is nearly as long as for a full
+matrix.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
 lists that it changes. So the work grows as the number of rows times the number of entries, not as the rows cubed.
@@ -21,28 +21,40 @@ MIN_PIVOT_RATIO = 0.1  # smallest pivot, relative to the largest entry in its co
 MAX_SPARSE_RATIO = 0.5  # sparse factors are used if they need at most this share of the subtractions of dense factors
 MAX_SPARSE_ROWS = 3  # up to this number of rows, factors are sparse whatever the number of subtractions
 ZERO_PIVOT = 1e-11  # pivots count as zero up to this fraction of the largest pivot so far
-# memory is allocated for MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r subtractions in a program of r rows; if more are
-# needed, factors are dense
+# most subtractions in a program of r rows: MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r; with more, factors are dense
 MIN_SUBTRACTIONS, SUBTRACTIONS_PER_ROW = 2000, 100
 MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or column of sparse factors; with more, they are dense
 
 ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last means: use dense factors
 
-# indices in `index`. SIZE: number of rows r. DENSE: 1 if the factors are dense. SIGN: sign of the permutations (1, -1).
-# N_SLOTS: number of entries of the factors. FIRST_LOWER: first entry of L. WIDTH: number of columns of the Jacobian.
-# After these numbers, `index` contains arrays: rows (r) and columns (r) of the matrix in the order of elimination; row
-# exchanges of dense factors (r); for each row of U, the index of its first entry (r) and the index after its last entry
-# (r); for each row of L, the index of its first entry, followed by the end of L (r + 1); for each entry, its row, its
-# column and its source, the index in `entries` (see `factor`) of its initial value, or of a zero for fill-in; for each
-# subtraction, the index of the entry that it changes; and the lists for choosing an order. Entries are sorted: first
-# the diagonal, then U from its last row up, then L from its first row down
-SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
-# indices of arrays with one number per row or column. ROW_SIZE: number of entries in the list of a row. COLUMN_SIZE:
-# number of entries in the list of a column, without eliminated rows. ACTIVE_ROW_SIZE: number of entries of a row in
-# columns that are not eliminated. ROW_POSITION, COLUMN_POSITION: positions in the order so far. LOOKUP: scratch, for
-# 1 + the index of a row in the list of a column, or for the slot of the entry in a column
-ROW_SIZE, COLUMN_SIZE, ACTIVE_ROW_SIZE, ROW_POSITION, COLUMN_POSITION, LOOKUP, N_COUNTS = range(7)
-# indices of lists. COLUMNS, SOURCES: columns and sources of a row's entries. ROWS: rows of a column's entries
+# indices of the numbers at the beginning of `index`
+(
+    SIZE,  # number of rows r
+    DENSE,  # 1: the factors are dense
+    SIGN,  # sign (1 or -1) of the permutation of rows times the sign of the permutation of columns
+    N_SLOTS,  # number of entries of the factors
+    FIRST_LOWER,  # index of the first entry of L
+    WIDTH,  # number of columns of the Jacobian
+    N_HEAD,
+) = range(7)
+# After these numbers, `index` contains the following arrays; entries are sorted: diagonal, U from its last row up, L
+# - rows (r) and columns (r) of the matrix in the order of elimination; row exchanges of dense factors (r)
+# - for each row of U, the index of its first entry (r), then the index after its last entry (r)
+# - for each row of L, the index of its first entry, followed by the end of L (r + 1)
+# - for each entry its row, column and source: index in `entries` (see `factor`) of its initial value; fill-in: of a 0
+# - for each subtraction, the index of the entry that it changes; then the lists of `views_of_lists`
+
+# indices of arrays that have one number for each row or column, while an order of elimination is chosen
+(
+    ROW_SIZE,  # number of entries in the list of a row
+    COLUMN_SIZE,  # number of entries in the list of a column, without eliminated rows
+    ACTIVE_ROW_SIZE,  # number of entries of a row in columns that are not eliminated
+    ROW_POSITION,  # position of a row in the order so far
+    COLUMN_POSITION,  # position of a column in the order so far
+    LOOKUP,  # scratch
+    N_COUNTS,
+) = range(7)
+# indices of lists: columns and sources of the entries of a row, and rows of the entries of a column
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
@@ -81,31 +93,31 @@ def row_exchanges_of(index):
 
 @merged
 def index_of_upper_begins(r):
-    """Return the position in `index` of the list of the first entries of the rows of U."""
+    """Return where in `index` the list of the first entries of the rows of U begins."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return the position in `index` of the list of the ends of the rows of U."""
+    """Return where in `index` the list of the ends of the rows of U begins."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return the position in `index` of the list of the first entries of the rows of L, followed by the end of L."""
+    """Return where in `index` the list of the first entries of the rows of L begins."""
     return N_HEAD + 5 * r
 
 
 @merged
 def index_of_entries(r):
-    """Return the position in `index` of the lists of rows, columns and sources of the entries."""
+    """Return where in `index` the lists of rows, columns and sources of the entries begin."""
     return N_HEAD + 6 * r + 1
 
 
 @inlined
 def views_of_lists(index, values):
-    """Return three views for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
+    """Return views of the arrays for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), values (r, w).
 
     w is the largest number of entries in a row or column.
     """
@@ -127,7 +139,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j), with its number and the index of its source, to the lists; return False if a list is full."""
+    """Add entry (i, j), with its value `number` and its `source`, to the lists; return False if a list is full."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:

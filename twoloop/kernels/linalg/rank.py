@@ -147,20 +147,20 @@ def singular_values_exceed(rows, ratio, gram):
 BOUND_ROUNDING = 1e-12  # largest rounding error of a pivot, relative to the bound that the pivot is compared with
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
 TINY = 1e-300  # divisor that replaces zero
-# if the ratio of the smallest to the largest eigenvalue of M exceeds SIMILAR_EIGENVALUES, no term s g g^T is added to
-# M, and the pivots of S = G M^-1 G^T decide which rows are independent. If a pivot exceeds INDEPENDENT, the part of its
-# row that is orthogonal to previous rows is at least 3e-9 of the row's norm: sqrt(INDEPENDENT * SIMILAR_EIGENVALUES).
-# For a dependent row, this part must be at most DEPENDENT of the row's norm
+# If the ratio of the smallest to the largest eigenvalue of M exceeds SIMILAR_EIGENVALUES, no term s g g^T is added to
+# M, and the pivots of S = G M^-1 G^T decide which rows are independent. A row with a pivot above INDEPENDENT is: its
+# part orthogonal to previous rows is at least 3e-9 = sqrt(INDEPENDENT * SIMILAR_EIGENVALUES) of its norm. A row is
+# dependent if this part is at most DEPENDENT of its norm. Otherwise the decision is uncertain, and made differently
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
-# a redundant row is a combination of independent rows; an independent row is exchanged with it if its coefficient (rows
-# scaled to norm 1) exceeds this limit. Where a coefficient passes through zero, the independent rows become dependent,
-# as at each dead centre of the slider-crank with two rods; so rows with large coefficients should be independent. The
-# limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
+# A redundant row is a combination of independent rows. If the coefficient of an independent row in it (rows scaled to
+# norm 1) exceeds this limit, the two rows are exchanged. This multiplies the volume that the independent rows span by
+# the coefficient: the rows are farther from becoming dependent, as at each dead centre of the slider-crank with two
+# rods. The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
 MAX_COEFFICIENT = 1.5
-# up to this ratio, two coefficients count as equal, and the first row is chosen: in symmetrical mechanisms, rounding
-# would choose among many equal coefficients, differently at each start
+# if the ratio of two coefficients is at most this, they count as equal, and the first row is chosen: in symmetrical
+# mechanisms, rounding would otherwise choose among many equal coefficients, differently at each start
 TIE_RATIO = 1.01
-# entries count as zero up to this fraction of the largest entry of their row: rounding of a start leaves such entries
+# an entry counts as zero up to this fraction of the largest entry of its row: a rounded start makes zeros this large
 ZERO_ENTRY = 1e-12
 
 

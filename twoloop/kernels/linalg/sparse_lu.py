@@ -44,9 +44,9 @@ def newton_program(
     body_groups: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors Newton's matrix; None if the program would have too many updates.
+    """Return the program that factors Newton's matrix, as `factorization_program` does for M and G.
 
-    `tangents`: the entries of K and D, both triangles, in the order of `grouped_entries`.
+    `tangents`: entries of K and D, both triangles, in the order of `grouped_entries`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
     group_begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))

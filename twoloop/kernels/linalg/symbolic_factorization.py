@@ -3,16 +3,18 @@
     [M  G^T]
     [G   0 ]  = L D L^T
 
-is factored in an order of elimination that is chosen once, by the pattern of entries alone. Pivots are single entries:
-see sparse_ldl.py and sparse_lu.py. A "slot" is the index of a number of the factors: the pivots come first, in their
-order, then the columns of L, each downwards.
+The matrix is factored in an order of elimination that is chosen once, by the pattern of entries alone. Pivots are
+single entries: see sparse_ldl.py and sparse_lu.py. A "slot" is the index of a number in the array of the factors, which
+contains the pivots in their order, then the columns of L, each downwards.
 
-Coordinates that M couples, or that the system declares as a group, form a body; the rows that involve the same bodies
-form a joint. Bodies with few joints are eliminated first. G M^-1 G^T remains, which is positive definite, so that any
-order of its joints is stable. A body with more joints, a hub, would couple all these joints, and is ordered among the
-joints, by constrained minimum degree. A joint may involve a hub, directly or through eliminated joints. It may be
-eliminated before this hub only if its rows are independent without the motion of the hub: one of its bodies must have
-no support yet. A support of a body is the ground, or a hub, to which eliminated joints connect the body.
+Terms: coordinates that M couples, or that the system declares as a group, form a body. The rows of G that involve the
+same bodies form a joint. A body with more than MAX_JOINTS joints is a hub. A part is a set of bodies that eliminated
+joints connect. A support of a part is the ground, or a hub, to which an eliminated joint connects it.
+
+Bodies other than hubs are eliminated first. G M^-1 G^T remains, which is positive definite, so that any order of its
+joints is stable. To eliminate a hub, too, would couple all its joints; so hubs are ordered among the joints, by minimum
+degree with one condition. A joint that involves a hub, directly or through eliminated joints, may be eliminated before
+this hub only if its rows are independent without the motion of the hub: one of its parts must have no support yet.
 """
 
 import heapq
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MAX_JOINTS = 4  # a body with at most this number of joints is eliminated before its joints; with more, it is a hub
+MAX_JOINTS = 4  # a body with more joints is a hub; other bodies are eliminated before their joints
 
 Integers = NDArray[np.int64]
 
@@ -50,11 +52,11 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Supports (ground, hubs not eliminated yet) of parts; a part is a set of bodies that eliminated joints connect."""
+    """Supports of the parts (see the module's docstring) while joints and hubs are eliminated one after another."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        # bodies with a single coordinate: a joint with such a body may fix a part, as a joint with the ground does
+        # hubs with a single coordinate: a joint with such a hub may fix a part, and counts as a joint with the ground
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
@@ -85,10 +87,7 @@ class _PartSupports:
         self._merge_parts([hub, *supported_bodies], False, frozenset())
 
     def _merge_parts(self, bodies: Iterable[int], is_grounded: bool, hubs: AbstractSet[int]) -> None:
-        """Merge the parts (bodies connected by eliminated joints) that contain `bodies`.
-
-        The `hubs` also support the merged part, and so does the ground if `is_grounded`.
-        """
+        """Merge the parts that contain `bodies`; add `hubs`, and the ground if `is_grounded`, to their supports."""
         first, *others = bodies
         part = self.parts.find(first)
         for body in others:
@@ -125,7 +124,8 @@ def elimination_order(
         Rows of single bodies. Unless the body is a hub, its rows are eliminated before all joints, so that a dependence
         on other rows cannot make their pivots small.
     couplings : (rows, columns), optional
-        Entries of K and D, which couple bodies as springs do. All bodies are then hubs, each with its `early_rows`.
+        Entries of K and D (derivatives of forces), which couple bodies as springs do. All bodies are then hubs, and
+        each is eliminated together with its `early_rows`.
     """
     body_of = bodies_of(n_q, mass_entries, body_groups)
     bodies_in_row: list[set[int]] = [set() for _ in range(n_rows)]
@@ -168,7 +168,7 @@ def elimination_order(
 
 
 def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], groups: Iterable[Sequence[int]]) -> list[int]:
-    """Return, for each coordinate, the index of the first coordinate of the same body."""
+    """Return for each coordinate the first coordinate of the same body, which identifies the body."""
     pairs = np.array([(first, other) for first, *others in groups for other in others], dtype=np.int64).reshape(-1, 2)
     rows, columns = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
     representatives, previous = np.arange(n_q), np.full(n_q, -1)
@@ -193,7 +193,7 @@ def _minimum_degree_order(
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
     Among the joints and hubs that may be eliminated, the next is the one whose neighbours have the fewest rows and
-    coordinates. `pairs`: pairs of hubs with another coupling than a joint. `lone_bodies`: see `_PartSupports`.
+    coordinates (`sizes`). `pairs`: hubs that are coupled otherwise than by a joint. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -224,7 +224,7 @@ def _minimum_degree_order(
         if is_eliminated[node] or degree_on_heap != degree(node):
             continue  # this entry of the heap is outdated: a newer one replaces it
         if node < n_joints and not supports.can_eliminate(node):
-            continue  # a hub must be eliminated first; its elimination puts this joint, a neighbour, on the heap again
+            continue  # after a hub is eliminated, this joint, which is its neighbour, is put on the heap again
         is_eliminated[node] = True
         order.append(node)
         affected_nodes = neighbours[node]
@@ -242,10 +242,20 @@ def _minimum_degree_order(
 
 Entries = tuple[Integers, Integers]  # row indices and column indices of the nonzero entries of a matrix
 
-# a program begins with sizes, which have these indices; functions at the end of this module return its other sections
-N_COORDINATES, N_PIVOTS, N_OFF_DIAGONAL, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
-ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program with at most this number of updates (multiplications) is always written
-# a longer program is written if it has at most MAX_UPDATE_RATIO n^3 updates for n pivots: else dense factors are faster
+# indices of the sizes at the beginning of a program; functions at the end of this module return its other sections
+(
+    N_COORDINATES,  # n_q
+    N_PIVOTS,  # number of coordinates and rows
+    N_OFF_DIAGONAL,  # number of entries of L below the diagonal
+    N_UPDATES,  # number of updates, each a multiplication and a subtraction
+    N_RUNS,  # length of the section that `update_runs_of` returns
+    N_OF_MASS,  # number of entries of M
+    N_OF_JACOBIAN,  # number of entries of G
+    N_STIFFENED,  # number of products of two entries of G that stiffen M
+    N_HEAD,
+) = range(9)
+ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program with at most this number of updates is always written
+# a longer program of n pivots is written if it has at most MAX_UPDATE_RATIO n^3 updates: else dense factors are faster
 MAX_UPDATE_RATIO = 1e-3
 MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer program takes too much memory
 
@@ -262,7 +272,7 @@ def factorization_program(
 
     mass, jacobian : entries of M, both triangles, and of G. If an entry is listed repeatedly, its numbers are added.
     body_groups : groups of coordinates that form one body each, even if M does not couple them.
-    stiff_rows : rows g along which M is to be stiffened by a multiple of g g^T; M must have the entries of g g^T.
+    stiff_rows : rows g of G that are added to M as s g g^T, because M is singular; M must have the entries of g g^T.
     """
     order = elimination_order(n_q, n_rows, mass, jacobian, body_groups, stiff_rows)
     return program_in_order(order, n_q, mass, jacobian, stiff_rows)
@@ -318,7 +328,7 @@ def program_in_order(
 
 
 def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Return [length, first target] of each "run" of off-diagonal updates with consecutive target slots.
+    """Divide the off-diagonal updates into "runs" with consecutive target slots; return [length, first target] of each.
 
     The rows of a joint are adjacent in all columns, so that runs are long: the numbers of a run are read and written as
     vectors, and the program is a tenth as long as a list of all targets.
@@ -330,7 +340,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return, for all products of two entries of a row in `chosen`, the rows and the indices of both entries."""
+    """List all products of two entries in the same row, for the rows in `chosen`: row, and indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
@@ -353,9 +363,9 @@ def _index_pairs(m: int) -> Entries:
 
 
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
-    """Return, for each column of L, the indices of the rows with an entry below the diagonal.
+    """Return, for each column of L, the rows that have an entry below the diagonal, including fill-in.
 
-    If i is the first row of a column, elimination adds all rows of this column to column i.
+    If i is the first of these rows, the elimination of the column adds all of them to column i.
     """
     rows_below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):

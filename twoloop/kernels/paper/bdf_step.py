@@ -22,7 +22,7 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-SAFETY = 0.9  # safety factor on the step size after a rejected step, and smallest size ratio after an accepted step
+SAFETY = 0.9  # factor on the step size after a rejected step, and smallest ratio of step sizes after an accepted step
 MIN_STEP_FACTOR = 0.2  # smallest step-size ratio after a rejected step, or after a step far from its prediction
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
 STEP_SIZE_FACTOR = 6.0  # further factor on the error in the choice of the next step size, to avoid rejections (VODE)
@@ -43,7 +43,7 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
     N_MEMORY_SCALARS,
 ) = range(7)
 # indices of rows of coefficients. SPANS: times (s) from earlier points of the history to its last point. NEW_SPANS:
-# times (s) from all points of the history to the end of the step. ERROR_CONSTANTS: for the orders 0, 1, ...
+# times (s) from all points of the history to the end of the step. ERROR_CONSTANTS: one for each of the orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -67,7 +67,7 @@ def _coefficient_row(memory, row):
 
 @inlined
 def _history_views(memory, n):
-    """Return views of `memory`: differences, trial differences, prediction, rate, and scratch.
+    """Return views of `memory`: differences, trial differences (of the attempted step), prediction, rate, and scratch.
 
     Arrays of differences have the shape (N_DIFFERENCES, 2 n). The prediction of (q, v) and its rate have 2 n entries.
     """
@@ -157,8 +157,7 @@ def _corrector_coefficient(h, k):
 def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
     """Solve y = prediction + c (y' - rate) at time t for y = (q_i, v_i); return a code.
 
-    The fixed-point iteration is on the independent accelerations. On return, all of `new_state` satisfies the
-    equations. `a_new` is scratch.
+    The iteration is on the independent accelerations. Then all of `new_state` satisfies the equations. a_new: scratch.
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]

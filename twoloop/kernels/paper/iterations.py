@@ -20,10 +20,13 @@ from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, table
 # accepted step and after this attempt. Without compensation, the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# indices in `memory`: first of scalars; then of blocks (s, n_q), with a row for each stage, such as accelerations A;
-# then of vectors (n_q), such as positions Q and velocities V. ROUNDING: first of N_ROUNDING vectors of rounding errors
+# scalars in `memory`: whether a step was attempted (1), and its size (s); the same of the last accepted step
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
+# indices of the blocks (s, n_q) in `memory`, with a row for each stage: accelerations of the last accepted step, of the
+# attempted step, and of half a step; positions and velocities of the stages
 A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+# indices of the vectors (n_q) in `memory`. _FULL: at the end of the whole step. _MID: at the end of the first half
+# step. _OLD: before an iteration. ROUNDING: first of N_ROUNDING vectors of rounding errors
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
 
 
@@ -34,14 +37,14 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def memory_block(memory, s, n, index):
-    """Return a view (s, n) of the block number `index`, such as A_PREVIOUS, in `memory`."""
+    """Return a view (s, n) of block `index`, such as A_PREVIOUS, of `memory`."""
     start = N_MEMORY_SCALARS + index * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
 def memory_vector(memory, s, n, index):
-    """Return a view (n) of the vector number `index`, such as Q_FULL, in `memory`."""
+    """Return a view (n) of vector `index`, such as Q_FULL, of `memory`."""
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + index * n
     return memory[start : start + n]
 
@@ -70,7 +73,7 @@ def rounding_errors_of(memory, s, n, tolerances):
 
 @merged
 def store_rounding_errors(rounding):
-    """Copy the rounding errors of this attempt to the rows of `rounding` that belong to the last accepted step."""
+    """Make the rounding errors of this attempt, which is accepted, those of the last accepted step in `rounding`."""
     for i in range(rounding.shape[0] // 2):
         copy(rounding[rounding.shape[0] // 2 + i], rounding[i])
 

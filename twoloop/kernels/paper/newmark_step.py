@@ -11,7 +11,7 @@ from twoloop.kernels.linalg.dense import copy
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
 # if the largest |coordinate| grows by more than this factor, _motion_rate assumes a start from rest at the origin
 GROWTH_AFTER_REST = 2.0
-TINY = 1e-300  # added to the tolerance, which would be zero for a mechanism at rest at the origin
+TINY = 1e-300  # added to the tolerance of a step, which is zero for a mechanism at rest at the origin
 
 # indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. The new accelerations (n_q) follow
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
@@ -22,7 +22,6 @@ BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 @merged
 def _largest_abs(x, lower_bound):
-    """Return max|x_m|, or `lower_bound` if this is larger."""
     for m in range(x.size):
         lower_bound = max(lower_bound, abs(x[m]))
     return lower_bound

@@ -73,7 +73,6 @@ def memory_size(n_q: int) -> int:
 
 
 def _padded_size(n_q: int) -> int:
-    """Return n_q, rounded up to a multiple of 4."""
     return (n_q + 3) // 4 * 4
 
 
@@ -86,7 +85,7 @@ def _row(memory, index):
 
 @inlined
 def _difference_table(memory, n, index):
-    """Return a view of the table of differences with the index `index`: N_TERMS + 1 rows of n entries, padded.
+    """Return a view of table `index` (0 or 1) of differences: N_TERMS + 1 rows of n entries, padded.
 
     The difference phi_i is row i - 1 plus the last row.
     """
@@ -97,7 +96,7 @@ def _difference_table(memory, n, index):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return two scratch rows (n, padded), for v and for q: mean accelerations, and later reciprocals of tolerances."""
+    """Return two scratch rows (n, padded), for v and for q: first mean accelerations, later reciprocal tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]

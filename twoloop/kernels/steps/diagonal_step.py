@@ -65,7 +65,7 @@ def _is_symmetric(A):
 
 @compiled
 def _fill_newton_matrix(w, memory, n, m, z, H):
-    """Store T^T (M - z^2 K - z D) T in H (m^2 entries, row by row); m is the number of independent coordinates."""
+    """Store T^T (M - z^2 K - z D) T in H (m^2 numbers, row by row); m is the number of independent coordinates."""
     N, Kr, Dr = (
         matrix_storage(w, n, at.SYSTEMS),
         matrix_storage(w, n, at.DERIVATIVE_Q),
@@ -93,7 +93,7 @@ def factor_newton_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        # L D L^T fails for an indefinite matrix (for example, with a compressed beam): fill it again, and use L U
+        # L D L^T fails if the matrix is indefinite (for example, with a compressed beam): fill it again, and use L U
         _fill_newton_matrix(w, memory, n, m, z, storage)
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
@@ -241,8 +241,7 @@ def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
 def solve_stage(f, w, options, memory, t, h, A_stage):
     """Solve for the accelerations A_stage (1, n_q) of a stage at t by Newton's method; return a code.
 
-    On entry, A_stage contains predicted accelerations. The positions and velocities of the stage are stored in the
-    vectors Q_MID and V_MID of `memory`.
+    On entry, A_stage contains predicted accelerations. Q_MID and V_MID in `memory` become the state of the stage.
     """
     n = w.Q.size
     z = h * gamma_of(options)
@@ -491,7 +490,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[at.DIAGONAL_OFFSET])
         _, A_stage, a_end = stage_views(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # F at the new state would differ by the stiffness times the rest of Newton's error
+        copy(A_stage[s - 1], a_end)  # not F at the new state, which would amplify Newton's last error by the stiffness
         memory[at.IS_FRESH] = 0.0
 
 

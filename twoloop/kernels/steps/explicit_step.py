@@ -18,8 +18,7 @@ from twoloop.kernels.linalg.dense import copy, sum_rows
 # indices of the scalars in `options`, which are arguments of options_array. After the scalars, `options` contains
 # A (s, s), b (s), c (s) and the weights of the two error estimates (s each). FREE: 1 if stages are not projected
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
-# indices of the vectors in `memory`; the slopes [v, a] of the s stages follow. A vector or slope has 2 n_q numbers,
-# padded to a multiple of BLOCK_SIZE
+# indices of the vectors in `memory`; the slopes [v, a] of the s stages follow. All have 2 n_q numbers, padded
 STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
 BLOCK_SIZE = 8  # vectors are padded to a multiple of this size, so that loops over them have no remainder
 # STRICT: factor on the error estimate once a run has come near a singular position, because phase errors grow at each
@@ -58,7 +57,6 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def _padded_width(n):
-    """Return 2 n, rounded up to a multiple of BLOCK_SIZE."""
     return (2 * n + BLOCK_SIZE - 1) // BLOCK_SIZE * BLOCK_SIZE
 
 

@@ -43,11 +43,15 @@ from twoloop.kernels.evaluation.inner_loop import check_redundant_rows, project,
 from twoloop.kernels.evaluation.partition import MIN_CORRECTION
 from twoloop.kernels.linalg.dense import copy
 
-# indices in `options`. THETA: largest last correction of a projection; N_ITERATED: number of coordinates whose
-# accelerations are iterated; N_ROWS: number of constraints; FREE: step size, in units of tolerances[DEFECT_GAP], above
-# which nodes are too far apart to detect short forces, and the defect is evaluated between nodes; MAY_REPEAT: 1
-# if a sweep may evaluate the accelerations twice, 0 if their code is split, so that the second time takes equally long
-THETA, N_ITERATED, N_ROWS, FREE, MAY_REPEAT, N_OPTIONS = range(6)
+# indices in `options`
+(
+    THETA,  # a projection has converged if its last correction is at most this, see `project`
+    N_ITERATED,  # number of coordinates whose accelerations are iterated
+    N_ROWS,  # number of constraints
+    FREE,  # in steps longer than FREE * tolerances[DEFECT_GAP], the defect is also evaluated between the nodes
+    MAY_REPEAT,  # 1: a sweep may evaluate accelerations twice; 0: their code is split, and the second time no cheaper
+    N_OPTIONS,
+) = range(6)
 
 START_CONTRACTION = 0.12  # contraction rho for which the first step size is chosen after its first guess is rejected
 MAX_GUESSES = 4  # largest number of guesses of the first step size
@@ -56,8 +60,8 @@ SAFETY = 0.75  # factor on the step size for which the estimated error would equ
 MAX_LIMITED = 24.0  # the motion counts as stiff, and another method takes over, if LIMITED reaches this value
 MIN_CURVATURE = 0.1  # accelerations hardly vary within a step if CURVATURE is below this value
 N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
-MIN_PIVOT_RATIO = 0.4  # a singular position is near if a pivot is below this fraction of that at the step's beginning
-# below this tolerance, another method takes over after a singular position: else five more runs of A02 are wrong
+MIN_PIVOT_RATIO = 0.4  # a singular position is near if a pivot falls below this fraction of its value at the beginning
+# with a smaller tolerance, another method takes over after a singular position: else five more runs of A02 end wrong
 TIGHT_TOLERANCE = 1e-8
 MAX_FAILURES = 12.0  # another method takes over at this value of FAILURES, to which a step without convergence adds 2
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
@@ -69,7 +73,7 @@ LEAST_TREND = 0.4  # lower bound of the trend, the ratio of step sizes that the 
 # ratio of the step sizes that the convergence allows with and without repeated evaluation at new velocities
 GAIN_BY_REPEATS = 1.5
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
-# the error does: the second evaluation then saves no time
+# the error allows: the second evaluation then saves no time
 MAX_REACH = 2.5
 MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
 _array_offsets = merged(array_offsets)

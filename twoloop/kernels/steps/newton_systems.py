@@ -72,7 +72,7 @@ from twoloop.kernels.steps.stages import (
 )
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
-EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative difference, caused by rounding of times
+EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative difference, which rounding of times causes
 # largest Newton correction, relative to the smallest tolerance, that counts as a rounding error if it does not decrease
 MAX_ROUNDING_CORRECTION = 0.1
 
@@ -323,9 +323,9 @@ def _band_view(numbers, n, b):
 
 @inlined
 def _border_views(w, n, r, b):
-    """Return views of three arrays stored after K: independent rows of C_q (r, n), D (n - r + 1, r), and indices (r).
+    """Return views of three arrays stored after K: independent rows of C_q (r, n), w.D (n - r + 1, r), indices (r).
 
-    C_q and D, a copy of w.D, belong to the state where K was computed. The indices are the dependent coordinates.
+    The first two are copies from the state where K was computed. The indices are the dependent coordinates.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -517,7 +517,7 @@ N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch re
 
 
 def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: int) -> int:
-    """Return the length of w.matrices for sparse storage, whose parts are described at the next three functions."""
+    """Return the length of w.matrices for sparse storage; the next three functions return views of its parts."""
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
     n_factors = n + 2 * int(program[N_OFF_DIAGONAL])
@@ -561,7 +561,7 @@ def _sparse_scratch(f, w):
 
 @inlined
 def _sparse_factor_view(f, w, k):
-    """Return a view of w.matrices, as real numbers: the factors for gamma0 (k = 0), or for the eigenvalue k - 1."""
+    """Return a real view of the factors in w.matrices: of the filter matrix (k = 0), or for eigenvalue k - 1 of A."""
     n = f.newton_program[N_PIVOTS]
     n_factors = n + 2 * f.newton_program[N_OFF_DIAGONAL]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -693,7 +693,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store in `right` the right-hand side of the bordered system, [M r; G r]; redundant rows may stiffen M."""
+    """Store the right-hand side of the bordered system, [M r; G r] (redundant rows may stiffen M), in `right`."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)

@@ -14,14 +14,19 @@ from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, c
 from twoloop.kernels.data.indices import NOT_LOADED
 
 MAX_STEP_RATIO = 3.0  # the previous step's polynomial predicts the stages of a step at most this multiple as long
-# factor on the result of `estimate_end_error` in methods with Richardson's estimate: this estimate misses only jumps of
-# the force between an end of the step and the nearest stage
-END_ERROR_WEIGHT = 0.01
+END_ERROR_WEIGHT = 0.01  # factor on `estimate_end_error` beside Richardson's estimate, which misses jumps at ends only
 
 # indices of the scalars in `options`. After the scalars, `options` contains A and A @ A (s, s each), b, b @ A and c (s
-# each), and the weights (s each) that extrapolate from the nodes to 0 and to 1. EXTRAPOLATION: 1 / (2^order - 1), or 0:
-# no extrapolation; OUTER_TEST: argument `outer_test` of options_array; POWER: order - 1
-STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
+# each), and the weights (s each) that extrapolate from the nodes to 0 and to 1
+(
+    STAGES,  # number of stages s
+    INNER_TOL,  # tolerance of the inner loop
+    OUTER_TOL,  # tolerance of the outer loop
+    EXTRAPOLATION,  # 1 / (2^order - 1); 0: no extrapolation
+    OUTER_TEST,  # 1: test (32) of the paper also covers dependent coordinates; 0: only independent ones
+    POWER,  # order - 1
+    N_SCALARS,
+) = range(7)
 
 
 def options_array(
@@ -34,11 +39,7 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of an implicit Runge-Kutta method with the tableau A, b, c.
-
-    `outer_test`: 1 if test (32) of the paper also covers dependent coordinates, else 0. `extrapolation` and `power` are
-    explained above, at EXTRAPOLATION and POWER.
-    """
+    """Return the array `options` of an implicit Runge-Kutta method with the tableau A, b, c; see STAGES etc. above."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     vectors = (b, b @ A, c, lagrange_values(c, 0.0), lagrange_values(c, 1.0))
@@ -98,8 +99,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     differs from the accelerations by e, of order h^s. If terms of successive orders decrease by a constant factor f,
     then e = w f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, even between an end of
     the step and the nearest stage, the terms do not decrease, and the estimate is h w: steps then shrink until the jump
-    no longer matters. Methods need a second estimate, too, because e may pass through zero: single steps of pendulums
-    then had errors of up to 100 tolerances.
+    no longer matters. Methods need a second estimate, too: e may pass through zero, with errors up to 100 tolerances.
     """
     s, n = A_stage.shape
     offset = N_SCALARS + 2 * s * s + 3 * s
@@ -125,16 +125,20 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     return largest
 
 
-# indices of the scalars that newton_options adds to `options`, counted from `newton_options_index`. N_REAL, N_PAIRS:
-# number of real eigenvalues of A, and of complex pairs; GAMMA0: first real eigenvalue or, if there is none, smallest
-# absolute value of an eigenvalue; TESTS_VELOCITIES: 1 if the error test includes velocities. After the scalars,
-# `options` contains the weights e (s) of the error estimate. For each eigenvalue follow its real and imaginary part,
-# its row of T^-1 and its column of T (for both s real parts, then s imaginary parts); T has the eigenvectors of A
-N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
+# indices of the scalars that newton_options adds to `options`, counted from `newton_options_index`. After them,
+# `options` contains the weights e (s) of the error estimate and then, for each eigenvalue of A = T diag(eigenvalues)
+# T^-1: its real and imaginary part, its row of T^-1 and its column of T (of both, s real parts, then s imaginary parts)
+(
+    N_REAL,  # number of real eigenvalues of A
+    N_PAIRS,  # number of pairs of complex eigenvalues
+    GAMMA0,  # first real eigenvalue or, if there is none, smallest absolute value of an eigenvalue
+    TESTS_VELOCITIES,  # 1: the error test includes velocities
+    N_EIGEN_SCALARS,
+) = range(5)
 
 # indices of the scalars in `memory`
 (
-    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt (in diagonal_step.py: there was one)
+    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt; diagonal_step.py: an attempt was made
     H_TRIAL,  # step size of the last attempt (s)
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step (s)
@@ -149,24 +153,24 @@ N_REAL, N_PAIRS, GAMMA0, TESTS_VELOCITIES, N_EIGEN_SCALARS = range(5)
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
-# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous and of the attempted step, residuals,
-# positions and velocities of the stages
+# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous step and of the attempted step,
+# residuals, positions and velocities of the stages
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-# indices of the vectors (n_q) after the blocks: accelerations, displaced positions and velocities, estimated errors of
-# positions and velocities, state and accelerations at the middle stage
+# indices of the vectors (n_q) after the blocks: accelerations at a displaced state, displaced positions and velocities,
+# estimated errors of positions and velocities, and positions, velocities and accelerations at the middle stage
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# indices of the parts of w.matrices, n_q^2 entries each, in dense and banded storage; for J_q, K, T etc. see
-# newton_systems.py. DERIVATIVE_Q: in dense storage J_q, or T^T K T if diagonal_step.py factors its own matrices; in
-# banded storage the band of K, followed by the independent rows of C_q and by w.D. DERIVATIVE_V: J_v, or T^T D T, or
-# the band of D. FILTER: factors of the real matrix that filters errors. SYSTEMS: first of two parts for each eigenvalue
-# of A, with the factors of its complex matrix (in diagonal_step.py: T^T M T)
+# indices of the parts of w.matrices, n_q^2 numbers each, in dense and banded storage (see newton_systems.py for J_q, K)
+# - DERIVATIVE_Q: J_q, or T^T K T if diagonal_step.py factors its own matrices; banded: the band of K, rows of C_q, w.D
+# - DERIVATIVE_V: J_v, or T^T D T; banded: the band of D
+# - FILTER: factors of the real matrix that filters errors
+# - SYSTEMS: two parts for each eigenvalue of A, the factors of its complex matrix; in diagonal_step.py, T^T M T
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], tests_velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the entries of `options` for Newton's method, to be appended to the result of `options_array`; see N_REAL.
+    """Return the part of `options` for Newton's method, which follows the result of `options_array`; see N_REAL.
 
     A must be diagonalizable. `tests_velocities`: whether the error test includes velocities.
     """
@@ -210,9 +214,9 @@ def n_matrices(n_systems: int) -> int:
     return SYSTEMS + 2 * n_systems
 
 
-# `options` of a diagonally implicit method begin with the options of Newton's method for one stage, A = [[gamma]], in
-# which N_REAL has the index NEWTON_OFFSET. At DIAGONAL_OFFSET follow the number of stages, A, c, b - b^, the jump
-# weights, and 1 if steps with an error estimate end at the result of the embedded formula, otherwise 0
+# `options` of a diagonally implicit method begin with the options of Newton's method for one stage, A = [[gamma]]; the
+# index of N_REAL is then NEWTON_OFFSET. At DIAGONAL_OFFSET follow: number of stages, A, c, b - b^, jump weights, and 1
+# if steps with an error estimate end at the result of the embedded formula, else 0 (see `diagonal_options`)
 NEWTON_OFFSET = N_SCALARS + 2 + 5
 DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 
@@ -251,7 +255,7 @@ def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
 
 @merged
 def newton_options_index(s):
-    """Return the index in `options` of N_REAL, the first of the entries by `newton_options`, for s stages."""
+    """Return the index in `options` of N_REAL, where the part by `newton_options` begins, for s stages."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
@@ -316,7 +320,7 @@ def complex_vector(memory, s, n, n_systems, index):
 
 @kernel(ATTEMPT)
 def request_loading(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Return an attempt with the code NOT_LOADED, so that the caller of the kernel loads the step, and tries again."""
+    """Return an `Attempt` with the code NOT_LOADED: the caller of the kernel then loads the step, and tries again."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 

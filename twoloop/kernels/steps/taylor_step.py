@@ -39,22 +39,26 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 
-# indices of the scalars in `options`. ORDER: order of the series of q; THETA: limit of a projection's last correction;
-# N_NODES: number of quantities of the program; EARLY_WIDTH, LATE_WIDTH: numbers of early and late operations, padded;
-# KEEP: 1 if consecutive steps evaluate the series about the first state, to interpolate within a step. After the
-# scalars, `options` contains the offsets of the program's arrays, then these arrays, with integers as bit patterns
-ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
+# indices of the scalars in `options`; the offsets of the program's arrays follow, then these arrays (integers: as bits)
+(
+    ORDER,  # order of the series of q
+    THETA,  # a projection has converged if its last correction is at most this, see `project`
+    N_NODES,  # number of quantities of the program
+    EARLY_WIDTH,  # number, padded, of early operations, which depend on t and q only
+    LATE_WIDTH,  # number, padded, of late operations, which depend on v, too
+    KEEP,  # 1: consecutive steps evaluate the series about the first state, to interpolate within a step
+    N_SCALARS,
+) = range(7)
 # indices of the arrays of a table (OperationGroups) and of a list of sums (Sums), see twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # index of one more array of a list of sums, which contains the index where each sum is stored
-# first positions, among the program's arrays, of the two tables and of the two lists of sums
+SUM_INDICES = N_SUMS  # index of one more array of a list of sums: where the result of each sum is stored
+# indices, among the program's arrays, at which the tables of early and late operations and the two lists of sums begin
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
 
-# indices of the scalars in `memory`. After the scalars, `memory` contains two series of q (ORDER + 1, n_q each) and the
-# arrays of `array_views`
+# indices of the scalars in `memory`, before two series of q (ORDER + 1, n_q each) and the arrays of `array_views`
 (
     HAS_SERIES,  # 1: the current series has been computed
     CURRENT,  # index, 0 or 1, of the current series: the series about the beginning of the step
@@ -132,7 +136,7 @@ def sum_of_products(X, Y, K, total):
 
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
-    """Store in `out` the arguments of the operations in group g (sums of `values`, without their constants)."""
+    """Store the arguments of the operations in group g in `out`: sums of `values`, without their constants."""
     column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
@@ -144,7 +148,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store in `out` each of the `sums` of `values`, multiplied by `scale` and without its constant."""
+    """Store each of the `sums` of `values`, without its constant and multiplied by `scale`, in `out`."""
     column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -249,8 +253,8 @@ def _fill_second_factors(options, table, values, y):
 def array_views(options, memory, n, n_rows):
     """Return views N, X1, Y1, X2, Y2, total1, total2, r and c of `memory`.
 
-    N contains coefficients of the quantities, X1 to Y2 coefficients of arguments of early and late operations, total1
-    and total2 sums of products; r (n) and c (n_rows) are right-hand sides.
+    N: coefficients of the quantities. X1, Y1, total1: coefficients of both arguments of early operations, and sums of
+    their products; X2, Y2, total2: the same for late operations. r (n) and c (n_rows): right-hand sides.
     """
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
@@ -352,10 +356,10 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-# ends of steps should have this distance from the constraints, before projection, relative to the allowed distance
+# distance of ends of steps from the constraints, before the projection, that step sizes aim at; 1: the allowed distance
 TARGET_PREDICTION_ERROR = 0.3
-# near the beginning of a step, the series is exact, so that its defect is a rounding error. A defect up to MAX_NOISE
-# allowed defects also counts as a rounding error if it is at most NOISE_RATIO times this defect
+# near the beginning of a step, the series is exact, so that its defect there is a rounding error. A later defect up to
+# MAX_NOISE allowed defects counts as a rounding error, too, if it is at most NOISE_RATIO times the defect there
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
 # the times at which the defect is checked shift by this fraction of their spacing at each attempt: multiples of the
@@ -518,7 +522,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
-        error = x / memory[ALLOWED_SIZE]  # the error is about a power of this ratio; a ratio up to 1 bounds it
+        error = x / memory[ALLOWED_SIZE]  # the error is about a power of this ratio, so at most 1 if the ratio is
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
