@@ -152,8 +152,8 @@ def compiles_quickly(shared: SharedCode) -> bool:
 class CollocationCode:
     """Generator of the functions for the collocation steps of one mechanism.
 
-    The emitters in the methods differ in their numbers: `emit` writes operations on vectors of LANES numbers, `num` on
-    single numbers, `vec2` on vectors of two numbers, and `wide` on vectors with one number for each coordinate.
+    The methods use several emitters: `emit` writes operations on vectors of LANES numbers, `num` on single numbers,
+    `vec2` on vectors of two numbers, and `wide` on vectors whose numbers belong to successive coordinates.
 
     shared : code of the equations, whose coefficients the functions use, too.
 
@@ -462,7 +462,7 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # spectra are stored after the last sweep
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # memory that is free until then
         builder.jump(loop)
         builder.position_at_end(after)
 

@@ -142,7 +142,7 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
     if system.called_in_python:  # Python functions may store their arguments: do not call them with symbols yet
         return None
 
-    def make(equations: Callable[[], Equations]) -> Any:
+    def find_kinds(equations: Callable[[], Equations]) -> Any:
         try:
             entries = [*equations().expressions("jacobian").flat, *equations().expressions("nonholonomic").flat]
         except (Untraceable, ArithmeticError, RecursionError):
@@ -150,9 +150,9 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
         return np.array([2 if expr.terms else int(expr.constant != 0.0) for expr in entries], dtype=np.int64)
 
     cache = shared_cache(system)
-    kinds = cache.remembered("kinds of entries", partial(make, partial(cache.equations, system)))
+    kinds = cache.remembered("kinds of entries", partial(find_kinds, partial(cache.equations, system)))
     if kinds is None:  # a callback branches on parameters: it can be traced only for the parameters of one system
-        kinds = system.remembered("kinds of entries", partial(make, partial(Equations, system)))
+        kinds = system.remembered("kinds of entries", partial(find_kinds, partial(Equations, system)))
     return kinds
 
 

@@ -159,7 +159,7 @@ class LaneSteps:
                 power = order - 1 - m
                 row = emit.pointer(memory.series, power * n)
                 for j, (q, v, a) in zip(group, _triples(carried), strict=True):
-                    # with a first and q last, each new number can take the register of the old number
+                    # in this order (a, v, q), each new number can take the register of the old one
                     a = a * x + v
                     v = v * x + q
                     new += [q * x + emit.load(row, j), v, a]

@@ -368,8 +368,8 @@ def solve_refined(
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
     """Return a and lam (independent rows) with M a + G^T lam = r, G a = c; refine them if `choice.is_refined`.
 
-    Also return conditions (pairs of expressions, the first of which is larger unless the solution has lost too many
-    digits): refinement must change a little, relative to a or, near equilibrium, to the accelerations by r alone.
+    Also return conditions: pairs of expressions, the first of which is larger unless refinement changes the solution
+    too much, relative to a or, near equilibrium, where a is small, to the acceleration of all masses by r alone.
 
     `solve`: function that solves a linear system by the factors of [M + s g^T g, G^T; G 0], where rows g were added to
     M as in PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.

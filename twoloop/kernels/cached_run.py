@@ -5,8 +5,8 @@ steps, and fills one array (`f` is the kit, `w` the workspace; `b` has the other
 
     unused | report: N_REPORT numbers, counters | times | steps | states | unused
                                                                 ^ a fixed index
-`advance` writes the states from the fixed index on. The other parts, whose length depends on the number of steps, are
-copied to the places before it. Python copies the used part as one slice, and splits it when a field is read.
+`advance` writes the states, which begin at the fixed index. The other parts, whose length depends on the number of
+steps, are copied to the places before it. Python copies the used part as one slice, and splits it when it is read.
 """
 
 import math

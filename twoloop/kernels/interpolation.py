@@ -24,8 +24,8 @@ MAX_VELOCITY_ROUNDING = 10.0
 # a position counts as singular if its pivot is below this fraction of the larger pivot at the two ends of the interval
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5  # positions with a smaller pivot always count as singular; see min_pivot_ratio in partition.py
-# a position with a pivot below WEAK_PIVOT also counts as singular if velocities of the polynomials violate constraints
-# by at most MAX_VIOLATION tolerances; this violation is about the pivot times the change by the projection
+# a position with a pivot below WEAK_PIVOT counts as singular, too, if pivot * (change of velocities by the projection)
+# is at most MAX_VIOLATION tolerances: this is about the violation of the constraints, which is then too small to matter
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 

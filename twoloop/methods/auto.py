@@ -14,26 +14,26 @@ from twoloop.methods.plan import Method, Plan, cached_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
-MANY_COORDINATES = 16  # from this number of coordinates on, evaluations may cost more than the algebra of Adams' method
-# from MANY_COORDINATES on, Adams replaces DOP853 up to this number of constraints per coordinate; with more constraints
-# projections cost more than evaluations
-MAX_CONSTRAINT_RATIO = 0.25
-ADAMS_TOLERANCE = 1e-10  # below this tolerance, Adams replaces DOP853 from MANY_COORDINATES on
-VERY_MANY_COORDINATES = 64  # Adams replaces DOP853 from this number of coordinates on, except with sparse matrices
+# Adams may replace DOP853 if there are at least MANY_COORDINATES coordinates: evaluations may then cost more than the
+# algebra of Adams' method. It does if there are at most MAX_CONSTRAINT_RATIO constraints per coordinate (with more,
+# projections cost more than evaluations); or if the tolerance is below ADAMS_TOLERANCE; or if there are at least
+# VERY_MANY_COORDINATES coordinates, except with sparse matrices
+MANY_COORDINATES, VERY_MANY_COORDINATES, MAX_CONSTRAINT_RATIO, ADAMS_TOLERANCE = 16, 64, 0.25, 1e-10
 MAX_NEWTON_COORDINATES = 1000  # Newton's method, with full matrices, is tried up to this number of coordinates
 # if the other methods need short steps, a series is chosen at any looser tolerance by the rule for this tolerance
 SHORT_STEP_TOLERANCE = 1e-9
 SERIES_TOLERANCE = 1e-6  # a Taylor series may cost less than DOP853 if the tolerance is below this
 MAX_OPERATIONS = 12  # up to this number of operations per coordinate, a Taylor series costs less than DOP853
-# replaces MAX_OPERATIONS below FEW_COORDINATES and, at looser tolerances, from MANY_COORDINATES on
-MAX_OPERATIONS_FEW = 8
-FEW_COORDINATES = 5  # with fewer coordinates, MAX_OPERATIONS_FEW replaces MAX_OPERATIONS
-SERIES_TOLERANCE_MANY = 1e-8  # with generated code, replaces SERIES_TOLERANCE from MANY_COORDINATES on
-LOOSE = 3e-5  # from this tolerance on, the method for few digits integrates stiff motion
+# MAX_OPERATIONS_FEW replaces MAX_OPERATIONS with fewer than FEW_COORDINATES coordinates and, at looser tolerances than
+# SERIES_TOLERANCE, with at least MANY_COORDINATES
+MAX_OPERATIONS_FEW, FEW_COORDINATES = 8, 5
+# replaces SERIES_TOLERANCE if there is generated code, and there are at least MANY_COORDINATES coordinates
+SERIES_TOLERANCE_MANY = 1e-8
+LOOSE = 3e-5  # at this tolerance and looser ones, the method for few digits integrates stiff motion
 TIGHTEST = 9e-7  # below this tolerance, the method for many digits integrates stiff motion
-# from this h rho on (rho: largest rate of motion), stiffness may limit steps of DOP853 (stable to 5.9) and of Adams
+# if h rho is at least this (rho: largest rate of motion), stiffness may limit steps of DOP853 (stable to 5.9), of Adams
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25
-LIMIT_FEW_OF_MANY = 2.0  # replaces LIMIT_FEW from MANY_COORDINATES on, where evaluations cost more than a trial
+LIMIT_FEW_OF_MANY = 2.0  # replaces LIMIT_FEW with at least MANY_COORDINATES: evaluations then cost more than a trial
 # number of successive estimates of h rho above the limit before a trial: more than one, because accuracy may allow a
 # few long steps; for Adams, and with LIMIT_FEW_OF_MANY, one estimate is enough
 ESTIMATES_FEW = 2
@@ -86,13 +86,13 @@ class Auto:
     A run begins with one of these methods:
 
     - `lanes` with generated code (`compiled=True` of `solve_dae`, or its default for small mechanisms). If this method
-      cannot continue, or the equations are too long for it, the run uses `series` at tolerances below 1e-6 (from 16
-      coordinates on: below 1e-8), else `few`, or `many` from 64 coordinates on.
+      cannot continue, or the equations are too long for it, the run uses `series` at tolerances below 1e-6 (with 16
+      coordinates or more: below 1e-8), else `few`, or `many` with 64 coordinates or more.
     - `series` if the operations of the callbacks can be traced and are few: at most 12 per coordinate (8 with fewer
       than five coordinates) at tolerances below 1e-6; at looser tolerances at most 8, with 16 coordinates or more.
-    - `many` from 64 coordinates on, and from 16 on if there are at most a quarter as many constraints or the tolerance
-      is below 1e-10. Systems that give the entries of sparse matrices need one of the last two conditions, because
-      their projections, one per step, cost as much as evaluations.
+    - `many` with 64 coordinates or more; with 16 or more, if there are at most a quarter as many constraints or the
+      tolerance is below 1e-10. Systems that give the entries of sparse matrices need one of the last two conditions,
+      because their projections, one per step, cost as much as evaluations.
     - `few` otherwise.
 
     At looser tolerances a run also begins with `series` if the other methods may take no steps longer than a hundredth
@@ -104,15 +104,15 @@ class Auto:
     then after every 600 (two to four times as many with generated code). This rate sets the limit of stability of the
     explicit steps. The implicit method is tried for 15 steps if
 
-    - steps have come near the limit, at two successive estimates (at one with `many`, and with `few` from 16
-      coordinates on);
+    - steps have come near the limit, at two successive estimates (at one with `many`, and with `few` if there are 16
+      coordinates or more);
     - steps are above 5 % of the limit, and the rate is more than thirty times the rate of the motion itself, or all
       velocities that could vibrate or decay at this rate are within ten tolerances;
     - the whole run is expected to cost a thousand trials.
 
     Unless steps are far above the limit, the trial waits until the run has cost three trials, and 64 evaluations for
     each independent coordinate if tangents have to be computed by differences. Three tenths of the expected cost of the
-    whole run count as spent. The implicit method (`loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else
+    whole run count as spent. The implicit method (`loose` at tolerances of 3e-5 or looser, `tightest` below 9e-7, else
     `tight`) is kept if a second of motion costs less with it, counted in evaluations and Newton matrices. The run
     returns to the explicit method if the steps come below the limit, or if the explicit method costs less. Counts
     decide, not times, so that a run can be repeated.

@@ -121,7 +121,7 @@ class BDF:
     order max_order from the beginning; 3-stage Gauss steps compute the past points that this order needs.
 
     In undamped motion, small oscillations lose energy with orders 1, 2 and 5 and gain energy with orders 3 and 4, at
-    the rate of the truncation error; from order 3 on, large ones may lose or gain energy. The fixed-point iteration
+    the rate of the truncation error; large ones may lose or gain energy with orders 3 to 5. The fixed-point iteration
     limits h to about the reciprocal of the largest frequency or rate of decay, so that stiff problems need small steps.
 
     For large systems with sparse matrices, all coordinates are integrated, and the end of each step is moved onto the

@@ -21,7 +21,7 @@ from twoloop.methods.plan import (
 from twoloop.methods.tableaux import Tableau
 
 NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps with Newton's method; stiff forces magnify rounding errors
-# from this h rho on (rho: largest rate), fixed-point iteration converges so slowly that Newton's method is tried
+# if h rho is at least this (rho: largest rate), fixed-point iteration is so slow that Newton's method is tried
 LIMIT_OF_FIXED_POINT = 1.5
 # largest condition number of the matrix of eigenvectors of A; 1 / MAX_CONDITION: smallest allowed |eigenvalue| of A
 MAX_CONDITION = 1e8

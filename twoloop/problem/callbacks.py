@@ -24,7 +24,7 @@ from twoloop.kernels.compile.linking import Dispatcher
 Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # row and column indices
 
-LARGE = 64  # from this number of coordinates, entries are faster than dense matrices (from 36 for chains of bars)
+LARGE = 64  # with at least this number of coordinates, entries are faster than dense matrices (chains of bars: 36)
 # for the kind of callback that returns a dense matrix, the kind that returns the values of its entries
 VALUES_OF = {"mass": "mass_values", "jacobian": "jacobian_values"}
 

@@ -188,7 +188,7 @@ RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 DEAD_CENTRE_RATIO = 0.01
 # two positions count as equal if their distance is at most this fraction of the largest change by the projection
 MAX_EQUAL_DISTANCE = 0.1
-MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in units of `Scales.columns`
+MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in its unit (`Scales.columns`)
 
 
 class Move(NamedTuple):

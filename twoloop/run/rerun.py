@@ -193,8 +193,8 @@ class RerunPiece(NamedTuple):
 class IndependentRerun:
     """Integrator that reruns pieces of a run with another method; each piece starts from a state of the run.
 
-    (t, q, v): any state of the run. `method`: "explicit" for `DOP853`; for stiff pieces "all" or "positions", a Radau
-    method whose error test includes all components, or only positions.
+    (t, q, v): any state of the run, for which arrays are allocated. `method`: "explicit" for `DOP853`; for stiff pieces
+    "all" or "positions", a Radau method whose error test includes all components, or only positions.
     """
 
     def __init__(

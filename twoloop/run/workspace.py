@@ -113,7 +113,7 @@ def _derivative_entries(
 MASSLESS_RATIO = 1e-10
 # a row g may be added (as g g^T) to a singular M if its component along massless directions is at least this fraction
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # Newton's matrix may get sparse factors if n_q is at least this multiple of LARGE
+MIN_SIZE_NEWTON = 1.6  # Newton's matrix may get sparse factors if n_q is at least this multiple of LARGE (callbacks.py)
 MAX_SHARE = 0.05  # sparse factors pay if their entries and operations are at most this fraction of those of dense ones
 
 

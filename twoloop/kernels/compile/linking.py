@@ -265,7 +265,7 @@ class _HelperLibrary(CPUCodeLibrary):
         return _CodegenWithoutEnvironment(self._codegen)
 
     def get_pointer_to_function(self, name: str) -> int:
-        return 0
+        return 0  # Python never calls a helper
 
     def _optimize_final_module(self) -> None:
         pass  # the code is optimised as part of the callers

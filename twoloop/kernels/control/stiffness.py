@@ -393,7 +393,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # if a step of fixed size does not converge, it cannot be shortened: use the implicit method from now on
+        # a step of fixed size that does not converge cannot be shortened: use the implicit method now, and later
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0

@@ -38,8 +38,8 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR_OF_ERROR,  # largest ratio of the next step size to this one that the error allows
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
     ALLOWED_H,  # largest size (s) that the error would have allowed for the last step
-    SIZE,  # largest |v| + |change of v in the step|, relative to the tolerances: the scale of rounding errors STRICTER,
-    # largest of all WEIGHTS, divided by the largest of the iterated coordinates, on which accelerations depend
+    SIZE,  # largest |v| + |change of v in the step|, relative to the tolerances: the scale of rounding errors
+    STRICTER,  # largest of all WEIGHTS, divided by the largest of an iterated coordinate
     REPEATS,  # 1: each sweep evaluates accelerations twice, first at old and then at new velocities; 0: once
 ) = range(29)
 # offsets of the arrays that follow the scalars

@@ -251,7 +251,7 @@ Entries = tuple[Integers, Integers]  # row indices and column indices of the non
     N_RUNS,  # length of the section that `update_runs_of` returns
     N_OF_MASS,  # number of entries of M
     N_OF_JACOBIAN,  # number of entries of G
-    N_STIFFENED,  # number of products of two entries of G that stiffen M
+    N_STIFFENED,  # number of products of two entries of G that are added to a singular M
     N_HEAD,
 ) = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program with at most this number of updates is always written
@@ -414,7 +414,7 @@ def update_runs_of(program):
 
 @inlined
 def mass_entries_of(program):
-    """Return the rows, columns and slots of the entries of M."""
+    """Return the rows and columns of the entries of M, and their slots (indices in the array of the factors)."""
     n = program[N_OF_MASS]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     return program[begin : begin + n], program[begin + n : begin + 2 * n], program[begin + 2 * n : begin + 3 * n]
@@ -422,7 +422,7 @@ def mass_entries_of(program):
 
 @inlined
 def jacobian_entries_of(program):
-    """Return the rows, columns and slots of the entries of G."""
+    """Return the rows and columns of the entries of G, and their slots (indices in the array of the factors)."""
     n = program[N_OF_JACOBIAN]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS] + 3 * program[N_OF_MASS]
     return program[begin : begin + n], program[begin + n : begin + 2 * n], program[begin + 2 * n : begin + 3 * n]
@@ -430,7 +430,7 @@ def jacobian_entries_of(program):
 
 @inlined
 def stiffening_products_of(program):
-    """Return, for each product of two entries of G that stiffens M: row, indices of both entries, and slot."""
+    """Return, for each product of two entries of G that is added to M: row, indices of both entries, and slot."""
     n = program[N_STIFFENED]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     begin += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
