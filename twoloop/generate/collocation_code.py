@@ -385,19 +385,19 @@ class CollocationCode:
         """
         builder, num = emit.builder, Emitter(emit.builder)
 
-        def number(value: float) -> Value:
+        def literal(value: float) -> Value:
             return constant(DOUBLE, value)
 
         has_estimate = builder.compare("fcmp one", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
         degree, stricter = num.load(work, mem.DEGREE), num.load(work, mem.STRICTER)
         target = builder.select(
             degree >= 6.0,
-            builder.select(degree >= 7.0, number(TARGET_SWEEPS + 2), number(TARGET_SWEEPS + 1)),
-            number(TARGET_SWEEPS),
+            builder.select(degree >= 7.0, literal(TARGET_SWEEPS + 2), literal(TARGET_SWEEPS + 1)),
+            literal(TARGET_SWEEPS),
         )
-        max_sweeps = builder.select(has_estimate, target + EXTRA_SWEEPS, number(MAX_SWEEPS_OF_FIXED))
+        max_sweeps = builder.select(has_estimate, target + EXTRA_SWEEPS, literal(MAX_SWEEPS_OF_FIXED))
         kappa, noise = (
-            builder.select(has_estimate, number(usual), number(fixed))
+            builder.select(has_estimate, literal(usual), literal(fixed))
             for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (mem.MAX_ROUNDING, ROUNDING_OF_FIXED))
         )
         noise = noise * (num.load(work, mem.SIZE) * stricter)
@@ -416,15 +416,15 @@ class CollocationCode:
         change = stricter * self._integrate(emit, work, state)
         sweep = sweeps + 1.0
 
-        contraction = change / num.maximum(change_before, number(MIN_DIVISOR))
-        contraction = num.minimum(num.maximum(contraction, number(MIN_RHO)), number(MAX_RHO))
+        contraction = change / num.maximum(change_before, literal(MIN_DIVISOR))
+        contraction = num.minimum(num.maximum(contraction, literal(MIN_RHO)), literal(MAX_RHO))
         rho_now = builder.select(sweep > 1.0, contraction, rho)
         is_out_of_range = (rho_now < FAST_START) | (rho_now > SLOW_START)
-        was_guessed = may_guess & builder.compare("fcmp oeq", sweep, number(2.0)) & (is_out_of_range & (change > 0.0))
+        was_guessed = may_guess & builder.compare("fcmp oeq", sweep, literal(2.0)) & (is_out_of_range & (change > 0.0))
         is_stagnant = (sweep > 2.0) & ((change >= STAGNATION_RATIO * change_before) & (change <= noise))
         has_converged = (rho_now * change <= kappa) | is_stagnant
         is_slow = (sweep > 3.0) & has_estimate & (rho_now >= MAX_CONTRACTION)
-        is_refused = is_slow | (sweep >= max_sweeps) | builder.compare("fcmp uge", change, number(INFINITE))
+        is_refused = is_slow | (sweep >= max_sweeps) | builder.compare("fcmp uge", change, literal(INFINITE))
         stops = was_guessed | has_converged | is_refused
         for phi, value in zip(carried, (sweep, change, rho_now), strict=True):
             phi.add_incoming(value, builder.block)
@@ -435,9 +435,9 @@ class CollocationCode:
             builder.ret(fallback())
         for value, index in ((sweep, mem.SWEEPS), (change, mem.CHANGE), (target, mem.N_TARGET), (rho_now, mem.RHO)):
             num.store(value, work, index)
-        code = builder.select(has_converged, number(mem.CONVERGED), number(mem.REJECTED))
-        code = builder.select(was_guessed, number(mem.GUESSED), code)
-        with builder.if_then(builder.compare("fcmp oeq", code, number(mem.CONVERGED)) & has_estimate):
+        code = builder.select(has_converged, literal(mem.CONVERGED), literal(mem.REJECTED))
+        code = builder.select(was_guessed, literal(mem.GUESSED), code)
+        with builder.if_then(builder.compare("fcmp oeq", code, literal(mem.CONVERGED)) & has_estimate):
             self._call(emit, "judge_nodes", self._estimate_error, [work, state])
         return code
 

@@ -472,10 +472,10 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
     try:
         choice = _choice_at(system, t0, q0)
 
-        def make(cache: TraceCache) -> SharedCode:
+        def generate(cache: TraceCache) -> SharedCode:
             return SharedCode(Elimination(system, choice, cache.equations(system)), cache)
 
-        code: GeneratedCode = derive_cached(system, ("code", choice), make, lambda code: check(code.traced))
+        code: GeneratedCode = derive_cached(system, ("code", choice), generate, lambda code: check(code.traced))
         if (choice.added_rows or choice.is_refined) and not _loss(code, system, t0, q0) <= LARGEST_LOSS:
             raise Untraceable(f"elimination without pivots loses the digits of little inertia in {system.name!r}")
     except Untraceable as error:

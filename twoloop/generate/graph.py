@@ -332,7 +332,7 @@ class Affine:
             square = self.graph.square(square, is_high_power) if n else square
         return result.reciprocal() if exponent < 0.0 else result
 
-    def _function(self, kind: int, numeric_function: Callable[[float], float]) -> "Affine":
+    def _apply(self, kind: int, numeric_function: Callable[[float], float]) -> "Affine":
         if not self.terms:
             return Affine(self.graph, numeric_function(self.constant), {})
         return self.graph.operation(kind, self)
@@ -346,21 +346,21 @@ class Affine:
 
     def square_root(self) -> "Affine":
         """Return the square root of this expression."""
-        return self._function(op.SQUARE_ROOT, SQRT)
+        return self._apply(op.SQUARE_ROOT, SQRT)
 
     def exponential(self) -> "Affine":
         """Return the exponential of this expression."""
-        return self._function(op.EXPONENTIAL, EXP)
+        return self._apply(op.EXPONENTIAL, EXP)
 
     def sine(self) -> "Affine":
         """Return the sine of this expression; record the cosine, too, because the derivative needs it."""
-        self._function(op.COSINE, COS)
-        return self._function(op.SINE, SIN)
+        self._apply(op.COSINE, COS)
+        return self._apply(op.SINE, SIN)
 
     def cosine(self) -> "Affine":
         """Return the cosine of this expression; record the sine, too, because the derivative needs it."""
-        self._function(op.SINE, SIN)
-        return self._function(op.COSINE, COS)
+        self._apply(op.SINE, SIN)
+        return self._apply(op.COSINE, COS)
 
     def as_term(self) -> "Affine":
         """Return the expression if it is a number or a multiple of one quantity; else record it as a new quantity."""

@@ -86,15 +86,16 @@ class SeriesProgram:
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
         """Return a copy of the program with coefficients for the parameters of one system."""
 
-        def sums(exprs: Sums) -> Sums:
+        def specialized(exprs: Sums) -> Sums:
             coefficient, constant = evaluate(exprs.coefficient), evaluate(exprs.constant)
             further_coefficient = evaluate(exprs.further_coefficient)
             return exprs._replace(coefficient=coefficient, constant=constant, further_coefficient=further_coefficient)
 
         early, late = (
-            OperationGroups(table.groups, sums(table.first), sums(table.second)) for table in (self.early, self.late)
+            OperationGroups(table.groups, specialized(table.first), specialized(table.second))
+            for table in (self.early, self.late)
         )
-        rows, balance = sums(self.rows), sums(self.balance)
+        rows, balance = specialized(self.rows), specialized(self.balance)
         assert self.traced is not None
         traced = self.traced.specialize(system, evaluate)
         return replace(self, early=early, late=late, rows=rows, balance=balance, traced=traced)
@@ -121,10 +122,10 @@ def series_for(system: ConstrainedSystem, check: Check = accept_traces) -> Serie
     Raise Untraceable in the same cases as `series_program`.
     """
 
-    def make(cache: TraceCache) -> SeriesProgram:
+    def trace_series(cache: TraceCache) -> SeriesProgram:
         return series_program(system, cache.equations(system))
 
-    program: SeriesProgram = derive_cached(system, "series", make, lambda program: check(program.traced))
+    program: SeriesProgram = derive_cached(system, "series", trace_series, lambda program: check(program.traced))
     return program
 
 

@@ -92,20 +92,20 @@ def _dependence(system: ConstrainedSystem, force_was_traced: bool) -> Dependence
 
 
 def _make_analysis(system: ConstrainedSystem) -> Any:
-    def make(cache: TraceCache) -> Dependence:
+    def analyse(cache: TraceCache) -> Dependence:
         equations = cache.equations(system)
 
-        def needed(kinds: tuple[str, ...]) -> list[int]:
+        def quantities_of(kinds: tuple[str, ...]) -> list[int]:
             exprs = [expr for kind in kinds if kind in system.given for expr in equations.expressions(kind).ravel()]
             return equations.graph.quantities_for(exprs)
 
         graph = equations.graph
-        by_state, by_time = needed(STATE_CALLBACKS), needed(TIME_CALLBACKS)
+        by_state, by_time = quantities_of(STATE_CALLBACKS), quantities_of(TIME_CALLBACKS)
         short_forces = ShortForces(_has_time_pulses(graph, by_time), _has_state_pulses(graph, by_state, system.n_q))
         is_steep = _quantities_may_be_steep(graph, sorted({*by_state, *by_time}))
         return Dependence(short_forces, is_steep, frozenset(graph.traced))
 
-    return make
+    return analyse
 
 
 class DegreeAlgebra(Algebra[float]):

@@ -160,25 +160,25 @@ def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]
     """Return a wrapper of a function that refuses symbols, because the function might not handle them like numbers."""
 
     @functools.wraps(function_of_numbers)
-    def function(*arguments: Any, **options: Any) -> Any:
+    def call_with_numbers(*arguments: Any, **options: Any) -> Any:
         _refuse_symbols([*arguments, *options.values()], f"calls {name} on")
         return function_of_numbers(*arguments, **options)
 
-    return function
+    return call_with_numbers
 
 
 def _number_or_symbol(numeric: Any, symbolic: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that calls `symbolic` if an argument is or contains a symbol, else `numeric`."""
 
-    def function(*arguments: Any) -> Any:
+    def call_matching(*arguments: Any) -> Any:
         if _first_symbol(arguments) is None:
             has_parameters = any(type(x) is Parameter for x in arguments)
             return apply_function(numeric.__name__, *arguments) if has_parameters else numeric(*arguments)
         if any(isinstance(x, np.ndarray) for x in arguments if type(x) is not Affine):
-            return elementwise(function, arguments)
+            return elementwise(call_matching, arguments)
         return symbolic(*arguments)
 
-    return function
+    return call_matching
 
 
 def _is_real_dtype(dtype: Any) -> bool:
@@ -188,25 +188,25 @@ def _is_real_dtype(dtype: Any) -> bool:
 def _symbolic_constructor(constructor: Any) -> Callable[..., Any]:
     """Return a substitute for `zeros`, `ones` or `empty` that returns arrays which can contain expressions."""
 
-    def function(shape: Any, dtype: Any = None, **options: Any) -> Any:
+    def construct(shape: Any, dtype: Any = None, **options: Any) -> Any:
         if not _is_real_dtype(dtype):
             return constructor(shape, dtype, **options)
         return np.full(shape, 1.0 if constructor is np.ones else 0.0, dtype=object)
 
-    return function
+    return construct
 
 
 def _symbolic_conversion(conversion: Any) -> Callable[..., Any]:
     """Return a substitute for `array`, `asarray` or `ascontiguousarray` that also accepts expressions."""
 
-    def function(value: Any, dtype: Any = None, **options: Any) -> Any:
+    def convert(value: Any, dtype: Any = None, **options: Any) -> Any:
         if _first_symbol(value) is None and not _has_parameters(value):
             return conversion(value, dtype, **options)
         if not _is_real_dtype(dtype):
             _refuse_symbols(value, f"makes {np.dtype(dtype).name} of")
         return conversion(value, object, **options)
 
-    return function
+    return convert
 
 
 def _symbolic_full(shape: Any, value: Any, dtype: Any = None) -> Any:

@@ -118,7 +118,7 @@ class Run:
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) that are still to be tried
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.piece_ends: list[float] = []  # times (s) at which the next steps along the polynomial across it end
+        self.piece_ends: list[float] = []  # ends (s) of the next steps along the polynomial across the position
         self.origins: list[Any] = []  # the `Origin` of each polynomial across the position that is still to be tried
         self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it

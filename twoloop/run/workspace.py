@@ -200,9 +200,9 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body to which a joint refers; of all bodies, if each has seven coordinates.
+    """Return the coordinates of each body that `system.joints` name; of all bodies, if each has seven coordinates.
 
-    A joint refers to only one of its two bodies. So there may be bodies at the ends of chains that no joint refers to.
+    A joint in this list names only one of its two bodies: bodies at the ends of chains may be missing in the list.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - body[0] for j in body) for body in coordinates_by_joint}

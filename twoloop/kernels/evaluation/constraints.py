@@ -220,7 +220,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
     Errors are relative to the largest entry of Gamma so far in this run. The step e is GAMMA_STEP_RATIO times
-    largest_difference_step; a new one is chosen if differences with e and 2 e disagree, as in drives of kilohertz.
+    largest_difference_step; a new one is chosen if differences with e and 2 e disagree, as for kilohertz drives.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.gamma_step_ratio * largest_step)

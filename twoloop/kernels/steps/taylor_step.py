@@ -98,7 +98,7 @@ def _integer_array(options, index):
 
 
 @inlined
-def _floats(options, index):
+def _float_array(options, index):
     return options[int(options[N_SCALARS + index]) : int(options[N_SCALARS + index + 1])]
 
 
@@ -137,11 +137,11 @@ def sum_of_products(X, Y, K, total):
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
     """Store the arguments of the operations in group g in `out`: sums of `values`, without their constants."""
-    column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
+    column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
     row, column = _integer_array(options, sums + ROW), _integer_array(options, sums + MORE_COLUMN)
-    coefficient = _floats(options, sums + MORE_COEFFICIENT)
+    coefficient = _float_array(options, sums + MORE_COEFFICIENT)
     for e in range(groups[g + more], groups[g + more + 1]):
         out[row[e]] += coefficient[e] * values[column[e]]
 
@@ -149,12 +149,12 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 @merged
 def _store_sums(options, sums, scale, values, out):
     """Store each of the `sums` of `values`, without its constant and multiplied by `scale`, in `out`."""
-    column, coefficient = _integer_array(options, sums + COLUMN), _floats(options, sums + COEFFICIENT)
+    column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
         out[indices[o]] = scale * coefficient[o] * values[column[o]]
     row, column = _integer_array(options, sums + ROW), _integer_array(options, sums + MORE_COLUMN)
-    coefficient = _floats(options, sums + MORE_COEFFICIENT)
+    coefficient = _float_array(options, sums + MORE_COEFFICIENT)
     for e in range(row.size):
         out[row[e]] += scale * coefficient[e] * values[column[e]]
 
@@ -166,7 +166,10 @@ def start_operations(options, table, values, z, x, y):
     Pending products, whose second factor depends on the accelerations, are set to zero.
     """
     groups = _integer_array(options, table + GROUPS)
-    constant, constant_2 = _floats(options, table + FIRST + CONSTANT), _floats(options, table + SECOND + CONSTANT)
+    constant, constant_2 = (
+        _float_array(options, table + FIRST + CONSTANT),
+        _float_array(options, table + SECOND + CONSTANT),
+    )
     for g in range(0, groups.size, N_GROUP):
         kind = groups[g]
         _fill_arguments(options, table + FIRST, groups, g, MORE_FIRST, values, x)
@@ -324,7 +327,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     A, LAM = 1 + 2 * n, 1 + 3 * n
     begin_early = LAM + n_rows
     begin_late = begin_early + _integer_array(options, EARLY + FIRST + COLUMN).size
-    indices, constant = _integer_array(options, BALANCE + SUM_INDICES), _floats(options, BALANCE + CONSTANT)
+    indices, constant = _integer_array(options, BALANCE + SUM_INDICES), _float_array(options, BALANCE + CONSTANT)
 
     start_series(options, t, unit, state, N, series, begin_early, X1[0], Y1[0], r, c)
     for k in range(order - 1):
@@ -462,7 +465,7 @@ def _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, 
 
 @compiled
 def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the first defect within the step that is too large, or 0; w.defect becomes the largest allowed defect.
+    """Return the first defect within the step that is too large, or 0; raise w.defect to the largest defect before it.
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
