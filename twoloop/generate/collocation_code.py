@@ -445,7 +445,7 @@ class CollocationCode:
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
         """Return a context for instructions that compute accelerations, and run twice in each sweep if REPEATS is 1.
 
-        The context yields the velocities: at first those of the sweep, then integrals of the accelerations computed.
+        The context yields the velocities: first as the last sweep left them, then integrals of the new accelerations.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))

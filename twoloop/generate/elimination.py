@@ -253,9 +253,9 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     """Return, for each row of G that is added to M, the factor on its scale.
 
-    The factor is 1 unless M is small in all columns of the row, and the rows `singular` have entries in all these
-    columns; then it is a negative power of SCALE_STEP. Without this factor, a row on Euler parameters alone, such as
-    their norm, would hide the small inertia of a body beside heavy bodies.
+    `singular`: rows that are added because M is singular. The factor is 1 unless M is small in all columns of the row,
+    and these rows have entries in all of them; then it is a negative power of SCALE_STEP. Without it, a row on Euler
+    parameters alone, such as their norm, would hide the small inertia of a body beside heavy bodies.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0

@@ -110,8 +110,8 @@ def solve(blocks: Sequence[Block], rhs: Sequence[Affine]) -> list[Affine]:
             pending[j] += [(multiple, solution[i]) for multiple, i in zip(multiples, row_indices, strict=True)]
     for row_indices, inverse, rows_below in reversed(blocks):
         pivots = [solution[i] for i in row_indices]
-        for place, (i, row) in enumerate(zip(row_indices, inverse, strict=True)):
-            products = [(multiples[place], solution[j]) for j, multiples in rows_below]
+        for position, (i, row) in enumerate(zip(row_indices, inverse, strict=True)):
+            products = [(multiples[position], solution[j]) for j, multiples in rows_below]
             solution[i] = (_dot(row, pivots) - _collected_sum(products)).as_term()
     return solution
 

@@ -194,7 +194,7 @@ class Parameter(float):
 
     def to_power(self, exponent: float) -> "Parameter":
         """Return this number to the power `exponent`, a nonzero whole number."""
-        powers = tuple([(place, exponent * power) for place, power in self.powers])
+        powers = tuple([(atom, exponent * power) for atom, power in self.powers])
         return Parameter(_as_float(self) ** exponent, self.tape, self.scale**exponent, powers)
 
     def __neg__(self) -> "Parameter":
@@ -247,8 +247,8 @@ def _product(a: float, b: float) -> float:
     merged = tape._merged_products.get(pair)
     if merged is None:
         powers = dict(a.powers)
-        for place, exponent in b.powers:
-            powers[place] = powers.get(place, 0.0) + exponent
+        for atom, exponent in b.powers:
+            powers[atom] = powers.get(atom, 0.0) + exponent
         merged = tape._merged_products[pair] = tuple(sorted(factor for factor in powers.items() if factor[1]))
     return Parameter(_as_float(a) * _as_float(b), tape, scale, merged) if merged else scale
 

@@ -223,7 +223,7 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return key, scale, first, second: factor * multiplier is scale * first * second, with `second` normalized."""
+    """Return key, scale, first, second: factor * multiplier is scale * first * second; see `Affine.normalized`."""
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier
 
@@ -291,7 +291,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: node of each quantity."""
+    """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: numbers of the quantities."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)
@@ -332,7 +332,7 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
 
 
 def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> OperationGroups:
-    """Return the OperationGroups of groups (kind, operations); `nodes`: node of each quantity."""
+    """Return the OperationGroups of groups (kind, operations); `nodes`: number of each quantity in the program."""
     members = [member for _, group in groups for member in group]
     sums = [_convert_to_sums([member[k] for member in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
@@ -345,7 +345,7 @@ def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> 
 
 
 def _convert_to_sums(exprs: list[Affine], nodes: dict[int, int]) -> Sums:
-    """Return expressions as Sums; `nodes`: node of each quantity."""
+    """Return expressions as Sums; `nodes`: number of each quantity in the program."""
     terms = [[(nodes[i], c) for i, c in expr.terms.items()] or [(0, 0.0)] for expr in exprs]
     further_terms = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]
     return Sums(

@@ -361,7 +361,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # `set_up` need not check a start with at least this fraction of the first start's smallest pivot
+RECHECK_PIVOT = 0.1  # a start is not checked by `set_up` if its smallest pivot / the first start's is at least this
 
 
 def arrays_of(

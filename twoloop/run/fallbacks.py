@@ -164,7 +164,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     earliest, has_fixed_step = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
     base, run.mirrored_size = None, 0.0
     if not has_fixed_step:
-        base, run.mirrored_size = _find_base_state(run, [place for place in past if place[0] >= earliest])
+        base, run.mirrored_size = _find_base_state(run, [(t, state) for t, state in past if t >= earliest])
     # try several origins, because one may fail: its nodes may lie before a jump of a force; near the start or the end
     # of the run, there may be too few nodes; a polynomial from an old base may be too long
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python

@@ -246,7 +246,7 @@ def reject_velocity_jumps(
     `last_step`: [state before the last step] if velocities jumped in it. `output_states`: states at output times.
     """
     end_state, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
-    reason = describe_rounding(run, [*(place for each in crossings for place in each), *output_states], end)
+    reason = describe_rounding(run, [*(state for ends in crossings for state in ends), *output_states], end)
     if last_step:
         crossings.append(last_step)
     if crossings and not reason:

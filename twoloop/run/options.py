@@ -51,7 +51,7 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; also `untested` = None if the method tests the error of each step."""
+        """Fields `method` and `rtol` of a result; if the method tests the error of all steps, also `untested`: None."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 

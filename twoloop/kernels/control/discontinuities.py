@@ -399,7 +399,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # dense samples along the motion replace samples at a fixed state, unless the latter must continue at a change
+    # dense samples along the motion replace samples at a fixed state, unless the last of these is at a change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)

@@ -244,7 +244,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 def _has_small_vibrations(w, tolerances, state, rate):
     """Return whether vibrations with the present accelerations have velocities of at most QUIET_FACTOR tolerances.
 
-    At the angular frequency `rate` (1/s), the amplitude of a velocity is the one of its acceleration over `rate`.
+    A vibration of angular frequency `rate` (1/s) and accelerations of amplitude a has velocities of amplitude a / rate.
     """
     n = w.Q.size
     for i in w.independent_v:

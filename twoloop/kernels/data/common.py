@@ -100,7 +100,7 @@ class Work(NamedTuple):
     factors: Any  # entries of the factors, at the indices that the program gives
     pivot_sizes: Any  # (N) squared norms of the rows, for a comparison with pivots, see linalg/sparse_ldl.py
     unknowns: Any  # (N) right-hand side on entry to a solver, solution on return
-    solutions: Any  # (3 N) scratch, then (n_c) factors s of rows g that stiffen M, see linalg/sparse_ldl.py
+    solutions: Any  # (3 N) scratch, then (n_c) factors s of rows g that are added to M as s g g^T, see sparse_ldl.py
 
     sizes: Any = None  # sizes of the arrays, see `Sizes` in layout.py
     address: Any = 0  # address of `table`

@@ -78,7 +78,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check must first renew the partition
     MASS_SCALE,  # factor on M in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
-    HAS_GAMMA,  # 1: the fused callback has computed w.Rate and w.Gamma[:n_c] for the current state
+    HAS_GAMMA,  # 1: the callback `kinematics` has computed w.Rate and w.Gamma[:n_c] for the current state
     USED_GENERAL,  # 1: the general inner loop, not the generated code, computed the last state
     EXPLICIT_STEP,  # 1: the last attempted step of a pair of methods was explicit
     DEFECT,  # largest defect of the attempted step, relative to the allowed defect; -1: not evaluated

@@ -474,7 +474,7 @@ def compare_traces(
     Two numbers differ if their difference exceeds MAX_DIFFERENCE times the largest value at these states, plus
     ROUNDING_FACTOR times the error bound of the traced number. `sizes`: n_q, n_c and n_a. `is_compared`: 1 for each of
     KINDS in traced_values.py that has to be compared. Store the values of callbacks in `called` (zero on entry), the
-    values of traces in `traced`, and the error bounds of the latter in `bounds`; `nodes` is scratch.
+    values of traces in `traced`, and the error bounds of these in `bounds`; `nodes` is scratch.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

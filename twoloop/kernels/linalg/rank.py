@@ -286,7 +286,7 @@ def _list_rows(is_kept, kept):
 
 @compiled
 def _exchange_rows(C, is_kept, kept):
-    """Exchange an independent row with a redundant row if its coefficient in the latter exceeds MAX_COEFFICIENT.
+    """Exchange an independent row with a redundant row in which its coefficient exceeds MAX_COEFFICIENT.
 
     C[i, k] is the coefficient of the independent row k in the redundant row i, all rows scaled to norm 1; `is_kept` is
     1 for independent rows. Each exchange multiplies the volume that the independent rows span by the coefficient.

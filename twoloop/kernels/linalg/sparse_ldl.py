@@ -29,7 +29,7 @@ NOT_DEFINITE = -1.0  # `factor` returns this in place of the smallest squared si
 
 @compiled
 def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Store s = m / |g|^2 in `stiffness` for each row g that stiffens M; m: largest M_jj of the columns j of g."""
+    """Store s = m / |g|^2 in `stiffness` for rows g to be added to M as s g g^T; m: largest M_jj of g's columns j."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -55,7 +55,7 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store G and the stiffened M in `values`, weights s of s g g^T in `stiffness`; `scratch`: one number per pivot."""
+    """Store G, and M with added terms s g g^T, in `values`; store s in `stiffness`; `scratch`: one number per pivot."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_entries_of(program)
@@ -149,7 +149,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, rhs, right):
-    """For each redundant row g that stiffens M, add s g^T c_g to `right`; s: its stiffness; c_g: its entry in `rhs`."""
+    """For each redundant row g, if s g g^T was added to M, add s g^T c_g to `right`; c_g: the entry of g in `rhs`."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)
     product_rows, first, second, _ = stiffening_products_of(program)

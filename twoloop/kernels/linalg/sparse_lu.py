@@ -92,7 +92,7 @@ def tangent_entries_of(program):
 
 @compiled
 def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
-    """Store Newton's matrix for real or complex z in `values`; `stiffness`: s of s g g^T, for rows g that stiffen M."""
+    """Store Newton's matrix for real or complex z in `values`; `stiffness`: factors s of rows g added as s g g^T."""
     for s in range(values.size):
         values[s] = 0.0
     n_off = program[N_OFF_DIAGONAL]

@@ -73,7 +73,7 @@ def rounding_errors_of(memory, s, n, tolerances):
 
 @merged
 def store_rounding_errors(rounding):
-    """Make the rounding errors of this attempt, which is accepted, those of the last accepted step in `rounding`."""
+    """Copy the rounding errors after this attempt, which is accepted, to the rows for the last accepted step."""
     for i in range(rounding.shape[0] // 2):
         copy(rounding[rounding.shape[0] // 2 + i], rounding[i])
 

@@ -45,8 +45,8 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants for equal steps, which are lower bounds of the constants that are used. After a decrease of h, the
-# constants for the actual steps are smaller, and would underestimate the error if the force jumps
+# error constants for equal steps. Smaller constants are not used: after a decrease of h, the constants for the actual
+# steps are smaller, and would underestimate the error if the force jumps
 ERROR_CONSTANTS = _error_constants()
 
 # indices in `options`. THETA: a projection has converged if its last correction is at most THETA, see `project`

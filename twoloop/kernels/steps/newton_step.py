@@ -270,8 +270,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the extrapolated state of the middle stage may be wrong, and so may its derivatives (of friction, e.g.): the
-        # step is repeated with derivatives at its beginning
+        # the extrapolated state of the middle stage may be wrong, and so may derivatives there, as of friction: repeat
+        # the step with derivatives at its beginning
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

@@ -693,7 +693,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store the right-hand side of the bordered system, [M r; G r] (redundant rows may stiffen M), in `right`."""
+    """Store the right-hand side of the bordered system, [M r; G r] (with rows added to M), in `right`."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
