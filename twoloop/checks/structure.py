@@ -101,14 +101,14 @@ SINGULAR_MASS = 1e-12  # M may have no inverse if its smallest eigenvalue is bel
 
 def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
     """Return 1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q); read-only."""
-    return system.remembered_at("pattern", (t, q.tobytes()), lambda: _pattern_of(system, t, q))
 
+    def find_entries() -> Array:
+        size = np.maximum(np.abs(q), np.abs(q).max())
+        # entries that are zero at all these positions are found during the run
+        rows, defined = rows_at(system, t, q + size * shifts(system.n_q))
+        return (rows[defined] != 0.0).any(axis=0).astype(float)
 
-def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    size = np.maximum(np.abs(q), np.abs(q).max())
-    # entries that are zero at all these positions are found during the run
-    rows, defined = rows_at(system, t, q + size * shifts(system.n_q))
-    return (rows[defined] != 0.0).any(axis=0).astype(float)
+    return system.remembered_at("pattern", (t, q.tobytes()), find_entries)
 
 
 @cache

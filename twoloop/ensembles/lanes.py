@@ -262,17 +262,27 @@ class LaneRuns:
 
         States at `times` are written to `out_q` and `out_v`. Runs stop at the deadline, a time of `time.monotonic`.
         """
+        from twoloop.kernels.lanes.advance import advance_lanes
         from twoloop.kernels.lanes.control import MAX_STEPS
 
+        starts, code, method = self.starts, self.generated.code, self.method
+        n, n_rows = code.n, code.n_rows
+        redundant = bool(code.equations.redundant_rows.conditions)
+        settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
+        control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.n_gaps, rtol], atol, code.numbers.values])
+        n_vectors = layout.array_offsets(n, n_rows, code.n_numbers)[-1] + method.memory(code)
         n_runs = len(numbers)
         status, n_steps, n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
         n_evaluations += 1  # the evaluation at the start
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
 
         def integrate_block(rows: slice) -> None:
-            out = out_q[rows], out_v[rows], ends[rows]
-            counts = status[rows], n_steps[rows], n_evaluations[rows]
-            self._integrate_block(numbers[rows], t1, times, rtol, atol, out, counts)
+            kit = layout.LaneKit(self.generated.functions, method.step)
+            run_parameters = self.generated.coefficients_for(starts.parameters[numbers[rows]])
+            inputs = starts.q[numbers[rows]], starts.v[numbers[rows]]
+            outputs = out_q[rows], out_v[rows], ends[rows], status[rows], n_steps[rows], n_evaluations[rows]
+            arrays = times, run_parameters, *inputs, *outputs, aligned_zeros(n_vectors, layout.LANES)
+            advance_lanes(kit, settings, control, method.options, *arrays)
 
         def stop() -> None:
             """End the runs in all threads, as if they had taken MAX_STEPS steps."""
@@ -281,49 +291,6 @@ class LaneRuns:
         if not run_in_blocks(integrate_block, n_runs, threads, deadline, stop):
             status[(status == layout.MANY_STEPS) | (status == layout.UNDECIDED)] = OUT_OF_TIME
         return status, n_steps, n_evaluations, ends
-
-    def _integrate_block(
-        self,
-        numbers: Integers,
-        t1: float,
-        times: Array,
-        rtol: float,
-        atol: Array,
-        out: tuple[Array, Array, Array],
-        counts: tuple[Integers, Integers, Integers],
-    ) -> None:
-        from twoloop.kernels.lanes import advance
-
-        starts, code, method = self.starts, self.generated.code, self.method
-        n, n_rows = code.n, code.n_rows
-        run_parameters = self.generated.coefficients_for(starts.parameters[numbers])
-        begin = layout.array_offsets(n, n_rows, code.n_numbers)[-1]
-        workspace = aligned_zeros(begin + method.memory(code), layout.LANES)
-        kit = layout.LaneKit(self.generated.functions, method.step)
-        redundant = bool(code.equations.redundant_rows.conditions)
-        settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
-        control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.n_gaps, rtol], atol, code.numbers.values])
-        inputs = np.ascontiguousarray(starts.q[numbers]), np.ascontiguousarray(starts.v[numbers])
-        arrays = times, run_parameters, *inputs, *out, *counts, workspace
-        advance.advance_lanes(kit, settings, control, method.options, *arrays)
-
-    def satisfies_equations(
-        self, numbers: Integers, has_ended: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array
-    ) -> Flags:
-        """Return a mask of the runs that satisfy the equations, evaluated by the callbacks, at their end.
-
-        has_ended: mask of runs to check. q, v: (n_runs, n, n_t), up to the end. ends: rows [a, lam] at the end.
-        """
-        from twoloop.kernels.lanes.starts import motion_residuals
-
-        n, n_c = self.system.n_q, self.system.n_c
-        workspace, residuals = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(numbers), np.inf)
-        rows = np.where(has_ended, numbers, -1)
-        motion_residuals(
-            *self.kit, t1, MAX_RESIDUAL, atol, rows, self.starts.parameters, q, v, ends, workspace, residuals
-        )
-        is_satisfied: Flags = residuals <= 1.0
-        return is_satisfied
 
     def find_valid_runs(
         self,
@@ -336,12 +303,21 @@ class LaneRuns:
         v: Array,
         ends: Array,
     ) -> Flags:
-        """Return a mask of the runs that have all states and satisfy the callbacks; set the status of the others."""
+        """Return a mask of the runs that have all states and satisfy the callbacks; set the status of the others.
+
+        q, v: (n_runs, n, n_t), up to the end. ends: rows [a, lam] at the end.
+        """
+        from twoloop.kernels.lanes.starts import motion_residuals
+
         has_ended = status == layout.ENDED
         is_finite = np.isfinite(q).all(axis=(1, 2))
         is_valid = has_ended & is_finite
         status[has_ended & ~is_finite] = layout.NO_STATE
-        is_satisfied = self.satisfies_equations(numbers, is_valid, t1, atol, q, v, ends)
+        n, n_c = self.system.n_q, self.system.n_c
+        workspace, residuals = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(numbers), np.inf)
+        checked, states = np.where(is_valid, numbers, -1), (self.starts.parameters, q, v, ends)
+        motion_residuals(*self.kit, t1, MAX_RESIDUAL, atol, checked, *states, workspace, residuals)
+        is_satisfied = residuals <= 1.0
         status[is_valid & ~is_satisfied] = layout.CALLBACKS_DIFFER
         is_valid &= is_satisfied
         if self.sampling is not None:

@@ -255,14 +255,6 @@ def _evaluate_start(checked_kit, b, t, q, v, records, shifts):
 
 
 @merged
-def _add_known_entries(b):
-    """Set b.pattern to 1 at entries of the constraint rows that, according to b.kinds, are not always zero."""
-    pattern = b.pattern.reshape(b.pattern.size)
-    for k in range(b.kinds.size):
-        pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
-
-
-@merged
 def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     """Prepare a run from t to t1 with the rows and coordinates of the last run; return 0 or a code, such as REFUSED.
 
@@ -274,7 +266,9 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     has_all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
     flags = _evaluate_start(checked_kit, b, t, q, v, records, b.shifts[: 0 if has_all_entries else len(b.shifts)])
     if has_all_entries:
-        _add_known_entries(b)
+        pattern = b.pattern.reshape(b.pattern.size)
+        for k in range(b.kinds.size):  # according to b.kinds, some entries are not always zero
+            pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
     if flags & WELL_FORMED == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
     if flags & CONSISTENT == 0 and checks < STATE_CHECKED:

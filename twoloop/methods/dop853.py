@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twoloop.methods.plan import (
     INNER_TOL,
@@ -39,36 +40,28 @@ _LOWER_TRIANGLE = """
 """
 
 
-def _numbers(text: str) -> list[float]:
-    return [float(each) for each in text.split()]
+def _numbers(text: str) -> NDArray[np.float64]:
+    return np.array(text.split(), dtype=float)
 
 
 A = np.zeros((12, 12))
 A[np.tril_indices(12, -1)] = _numbers(_LOWER_TRIANGLE)
-B = np.array(
-    _numbers("""
+B = _numbers("""
 0.054293734116568765 0 0 0 0 4.450312892752409 1.8915178993145003 -5.801203960010585 0.3111643669578199
 -0.1521609496625161 0.20136540080403034 0.04471061572777259
 """)
-)
-C = np.array(
-    _numbers("""
+C = _numbers("""
 0 0.05260015195876773 0.0789002279381516 0.1183503419072274 0.2816496580927726 0.3333333333333333 0.25
 0.3076923076923077 0.6512820512820513 0.6 0.8571428571428571 1.0
 """)
-)
-E3 = np.array(
-    _numbers("""
+E3 = _numbers("""
 -0.18980075407240762 0 0 0 0 4.450312892752409 1.8915178993145003 -5.801203960010585 -0.4226823213237919
 -0.1521609496625161 0.20136540080403034 0.02265179219836082
 """)
-)
-E5 = np.array(
-    _numbers("""
+E5 = _numbers("""
 0.01312004499419488 0 0 0 0 -1.2251564463762044 -0.4957589496572502 1.6643771824549864 -0.35032884874997366
 0.3341791187130175 0.08192320648511571 -0.022355307863886294
 """)
-)
 
 
 COARSE_SHARE = 0.1  # factor on the error estimate of order 3 in the combined estimate e5^2 / sqrt(e5^2 + 0.01 e3^2)

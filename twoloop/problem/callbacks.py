@@ -48,17 +48,12 @@ def check_entries(name: str, given: Any, shape: tuple[int, int], symmetric: bool
                 f"{label} of {name} must be from 0 to {size - 1}, as the matrix has shape {shape}; given "
                 f"{vector[outside[0]]} at place {outside[0]}"
             )
-    if symmetric:
-        _check_both_triangles(name, *entries)
-    return entries
-
-
-def _check_both_triangles(name: str, rows: Integers, columns: Integers) -> None:
-    places = set(zip(rows.tolist(), columns.tolist(), strict=True))
+    places = set(zip(rows.tolist(), columns.tolist(), strict=True)) if symmetric else set()
     unmatched = sorted((i, j) for i, j in places if (j, i) not in places)
     if unmatched:
         i, j = unmatched[0]
         raise ValueError(f"{name} must name both triangles of M: ({i}, {j}) is there, and ({j}, {i}) is not")
+    return entries
 
 
 def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatcher:

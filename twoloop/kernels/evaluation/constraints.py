@@ -24,18 +24,13 @@ def constraint_rows(f, w, t, q, G):
         f.nonholonomic(t, q, f.p, G[n_c:n_rows])
 
 
-@compiled
-def _clear_recorded_entries(w):
-    for i in range(w.Rate.size):
-        for k in range(w.row_entries[i], w.row_entries[i + 1]):
-            w.G[i, w.row_entries[k]] = 0.0
-
-
 @merged
 def clear_rows(f, w):
     """Set w.G to zero; in the augmented form, clear recorded entries only (the task VERIFY_PATTERN detects others)."""
     if f.form == AUGMENTED:
-        _clear_recorded_entries(w)
+        for i in range(w.Rate.size):
+            for k in range(w.row_entries[i], w.row_entries[i + 1]):
+                w.G[i, w.row_entries[k]] = 0.0
     else:
         w.entries[:] = 0.0
 

@@ -364,6 +364,18 @@ def _failure_of_accelerations(w, t, q):
 
 
 @compiled
+def _solve_system(f, w, r, c, a, lam):
+    """Solve M a + G^T lam = r and G a = c by the factors in w; store `a` and lam; return DONE."""
+    n = r.size
+    copy(r, w.unknowns[:n])
+    copy(c, w.unknowns[n:])
+    solve_unknowns(f, w, n_refinements(w))
+    copy(w.unknowns[:n], a)
+    copy(w.unknowns[n:], lam)
+    return DONE
+
+
+@compiled
 def _compute_accelerations(f, w, t, q, v, a):
     """Compute accelerations and multipliers at (q, v) by the factors in w; store them in `a`, w.z; return a code."""
     w.n_evaluations += 1
@@ -372,12 +384,7 @@ def _compute_accelerations(f, w, t, q, v, a):
         return code
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
-    n = a.size
-    copy(w.Q, w.unknowns[:n])
-    copy(w.Gamma, w.unknowns[n:])
-    solve_unknowns(f, w, n_refinements(w))
-    copy(w.unknowns[:n], a)
-    copy(w.unknowns[n:], w.z)
+    _solve_system(f, w, w.Q, w.Gamma, a, w.z)
     return DONE if finite_vector(a) else _failure_of_accelerations(w, t, q)
 
 
@@ -458,12 +465,6 @@ def _project_state(f, w, t, q, v, theta):
 
 
 @compiled
-def _has_expected_mass_pattern(w):
-    """Return whether w.M is empty, or nonzero only at the entries for which the program was written."""
-    return w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern)
-
-
-@compiled
 def _check_redundant_rows(f, w, t, q, v):
     """Return DONE if the accepted state (q, v) satisfies all rows (w has their entries at q), else ROWS_CONTRADICT."""
     w.C[:] = 0.0
@@ -480,18 +481,6 @@ def _check_redundant_rows(f, w, t, q, v):
         if abs(w.C[i]) > MAX_VIOLATION * size * row_maxima[i] or abs(w.g[i]) > MAX_VIOLATION * speed * row_maxima[i]:
             w.contradiction = i
             return ROWS_CONTRADICT
-    return DONE
-
-
-@compiled
-def _solve_system(f, w, r, c, a, lam):
-    """Solve M a + G^T lam = r and G a = c by the factors in w; store `a` and lam; return DONE."""
-    n = r.size
-    copy(r, w.unknowns[:n])
-    copy(c, w.unknowns[n:])
-    solve_unknowns(f, w, n_refinements(w))
-    copy(w.unknowns[:n], a)
-    copy(w.unknowns[n:], lam)
     return DONE
 
 
@@ -535,4 +524,5 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if code != DONE:
         return code
     code = _compute_multipliers(f, w, lam)
-    return code if _has_expected_mass_pattern(w) else NEEDS_DENSE
+    # w.M is empty, or nonzero only at the entries for which the program was written
+    return code if w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern) else NEEDS_DENSE

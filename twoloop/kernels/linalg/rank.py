@@ -214,13 +214,6 @@ def _count_weak_eigenvalues(mass, weak_ratio, A):
 
 
 @merged
-def _scale_of_added_rows(mass, G):
-    """Return the power of two s that makes the largest entries of s G^T G and M about equal."""
-    largest, largest_of_rows = largest_of(mass.reshape(mass.size)), largest_of(G.reshape(G.size))
-    return 2.0 ** math.floor(math.log2(largest / (largest_of_rows * largest_of_rows)) + 0.5)
-
-
-@merged
 def _sort_rows_by_entries(G, order, counts):
     """Store in `order` the indices of the rows of G, sorted by number of entries, and in `counts` these numbers."""
     for k in range(len(G)):
@@ -480,7 +473,9 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
     copy_matrix(original_mass, mass)
     n_added, scale = 0, 1.0
     if n_kept > 0 and weak_ratio > 0.0 and _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
-        scale = _scale_of_added_rows(mass, G)
+        # the power of two that makes the largest entries of scale G^T G and M about equal
+        largest, largest_of_rows = largest_of(mass.reshape(mass.size)), largest_of(G.reshape(G.size))
+        scale = 2.0 ** math.floor(math.log2(largest / (largest_of_rows * largest_of_rows)) + 0.5)
         _sort_rows_by_entries(G, order, sizes)
         n_added = _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added)
     chosen[1], workspace[0] = max(n_added, 0), scale

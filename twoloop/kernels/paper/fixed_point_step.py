@@ -16,7 +16,6 @@ from twoloop.kernels.paper.iterations import (
     memory_vector,
     rounding_errors_of,
     step_views,
-    store_rounding_errors,
 )
 from twoloop.kernels.steps.stages import (
     END_ERROR_WEIGHT,
@@ -40,7 +39,9 @@ def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
             copy(trial[j], previous[j])
         memory[at.H_PREVIOUS] = memory[at.H_TRIAL]
         memory[at.HAS_PREVIOUS] = 1.0
-        store_rounding_errors(rounding_errors_of(memory, s, n, tolerances))
+        rounding = rounding_errors_of(memory, s, n, tolerances)
+        for i in range(rounding.shape[0] // 2):
+            copy(rounding[rounding.shape[0] // 2 + i], rounding[i])
     memory[at.HAS_TRIAL] = 0.0
 
 

@@ -71,13 +71,6 @@ def rounding_errors_of(memory, s, n, tolerances):
     return memory[start : start + count * n].reshape((count, n))
 
 
-@merged
-def store_rounding_errors(rounding):
-    """Copy the rounding errors after this attempt, which is accepted, to the rows for the last accepted step."""
-    for i in range(rounding.shape[0] // 2):
-        copy(rounding[rounding.shape[0] // 2 + i], rounding[i])
-
-
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
 MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_order` has failed; the paper has no limit
 # an iteration diverges if a change exceeds the first change by more than this factor; changes may grow at first,

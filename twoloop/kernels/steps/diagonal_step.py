@@ -200,14 +200,6 @@ def gamma_of(options):
 
 
 @merged
-def _set_stage_state(z, q_bar, v_bar, a, Q, V):
-    """Store the stage state V = v_bar + z a, Q = q_bar + z V (n_q); dependent entries of Q and V are start values."""
-    for m in range(Q.size):
-        V[m] = v_bar[m] + z * a[m]
-        Q[m] = q_bar[m] + z * V[m]
-
-
-@merged
 def has_dense_tangents(f, w):
     """Return whether each iteration of Newton's method factors a new dense matrix T^T (M - z^2 K - z D) T."""
     return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != FIXED_ORDER
@@ -253,7 +245,9 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     last_change = 0.0
     for iteration in range(MAX_ITERATIONS):
         w.n_outer += 1
-        _set_stage_state(z, q_bar, v_bar, a, Q, V)
+        for m in range(n):
+            V[m] = v_bar[m] + z * a[m]
+            Q[m] = q_bar[m] + z * V[m]
         code = evaluate(f, w, t, Q, V, options[at.INNER_TOL], F)
         if code != DONE:
             return code

@@ -76,13 +76,6 @@ def _vector_view(memory, n, index):
     return memory[index * _padded_width(n) : (index + 1) * _padded_width(n)]
 
 
-@inlined
-def _slope_views(memory, s, n):
-    """Return a view (s, 2 n padded) of the slopes in `memory`: velocities and accelerations [v, a] of each stage."""
-    begin = N_VECTORS * _padded_width(n)
-    return memory[begin : begin + s * _padded_width(n)].reshape((s, _padded_width(n)))
-
-
 @compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
     """Set y1 to y + h * sum_k weights[k] * slopes[k], adding y last to avoid rounding errors; `total` is scratch."""
@@ -139,7 +132,8 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         _vector_view(memory, n, FINE_ERROR),
         _vector_view(memory, n, COARSE_ERROR),
     )
-    slopes = _slope_views(memory, s, n)
+    begin, width = N_VECTORS * _padded_width(n), _padded_width(n)
+    slopes = memory[begin : begin + s * width].reshape((s, width))  # velocities and accelerations of each stage
     # near a singular position, all stages are projected, because it matters on which side of the position a stage lies,
     # and how accurate its velocities are
     is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
