@@ -11,6 +11,7 @@ where r is the mean of the half edges (MuJoCo's documentation, Computation, Flui
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,33 +47,24 @@ class Medium:
         slow = 6.0 * np.pi * self.viscosity * mean, 8.0 * np.pi * self.viscosity * mean**3
         columns = tuple(map(tuple, axes.T))
         pairs = zip((tuple(lump.centre), None), (drag, twist), slow, (self.wind, (0.0,) * 3), strict=True)
-        force, torque = (_Resistance(body, columns, at, tuple(map(float, c)), s, u) for at, c, s, u in pairs)
+        force, torque = (partial(_resistance, body, columns, at, tuple(map(float, c)), s, u) for at, c, s, u in pairs)
         model.force(body, body.point(*lump.centre), force, name=names[0])
         model.torque(body, torque, name=names[1])
 
 
-@dataclass(frozen=True, eq=False)
-class _Resistance:
-    """Evaluate the force against the velocity of a body's point or, if `point` is None, the torque against its spin."""
-
-    body: Body
-    axes: tuple[tuple[float, ...], ...]
-    point: tuple[float, ...] | None
-    quadratic: tuple[float, ...]
-    linear: float
-    wind: tuple[float, ...]
-
-    def __call__(self, t: Any, q: Any, v: Any) -> Any:
-        number = self.body.number
-        if self.point is None:
-            speed = spin_of(q, v, number)
-        else:
-            turning = rate_of_vector(q, v, number, self.point)
-            speed = [v[k] + x - w for k, x, w in zip(self.body.coordinates, turning, self.wind, strict=False)]
-        total: list[Any] = [0.0, 0.0, 0.0]
-        for axis, factor in zip(self.axes, self.quadratic, strict=True):
-            n = vector_of(q, number, axis)
-            u = sum(x * y for x, y in zip(n, speed, strict=True))
-            size = u * (factor * smooth_size(u, ROUNDED) if factor else 0.0) + self.linear * u
-            total = [x - size * y for x, y in zip(total, n, strict=True)]
-        return total
+def _resistance(
+    body: Body, axes: Any, point: Any, quadratic: Any, linear: float, wind: Any, t: Any, q: Any, v: Any
+) -> Any:
+    """Return the force against the velocity of a body's point or, if `point` is None, the torque against its spin."""
+    if point is None:
+        speed = spin_of(q, v, body.number)
+    else:
+        turning = rate_of_vector(q, v, body.number, point)
+        speed = [v[k] + x - w for k, x, w in zip(body.coordinates, turning, wind, strict=False)]
+    total: list[Any] = [0.0, 0.0, 0.0]
+    for axis, factor in zip(axes, quadratic, strict=True):
+        n = vector_of(q, body.number, axis)
+        u = sum(x * y for x, y in zip(n, speed, strict=True))
+        size = u * (factor * smooth_size(u, ROUNDED) if factor else 0.0) + linear * u
+        total = [x - size * y for x, y in zip(total, n, strict=True)]
+    return total

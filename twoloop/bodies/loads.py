@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from twoloop.bodies.collection import add, documented
@@ -50,21 +51,10 @@ def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
     return Numbers(values, tuple(f"{what} of {name} ({unit})" for what, (_, unit) in given.items()))
 
 
-@dataclass(frozen=True, eq=False)
-class PlaneGap:
-    """Measure the distance of a point of one body from a plane of another, or its displacement along it, m."""
-
-    body: Body
-    place: Array
-    other: Body
-    foot: Array
-    normal: Array
-
-    def __call__(self, t: Any, q: Any) -> Any:
-        """Return the distance, for numbers or symbols."""
-        plane = self.other.number
-        point, foot = point_of(q, self.body.number, self.place), point_of(q, plane, self.foot)
-        return sum(n * (x - y) for n, x, y in zip(vector_of(q, plane, self.normal), point, foot, strict=True))
+def _plane_gap(body: Body, place: Array, plane: Body, foot: Array, normal: Array, t: Any, q: Any) -> Any:
+    """Return the distance of a point of one body from a plane of another, or its displacement along it, m."""
+    ends = zip(point_of(q, body.number, place), point_of(q, plane.number, foot), strict=True)
+    return sum(n * (x - y) for n, (x, y) in zip(vector_of(q, plane.number, normal), ends, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -493,11 +483,11 @@ class Loads(Coordinates):
         self._different("stop", body_a, body_b)
         name = self._new_name("stop", name, body_a, body_b)
         point, foot = self._point("at", at, body_a), self._point("foot", foot, body_b)
-        gap = PlaneGap(body_a, point, body_b, foot, self._direction("normal", normal, body_b))
+        places, across = (body_a, point, body_b, foot), self._direction("normal", normal, body_b)
         if check_not_negative("friction", friction) and self.dimension == 3:
             raise ValueError(f"friction of {name!r} must be zero, as stops rub in the plane only; given {friction!r}")
-        slide = replace(gap, normal=gap.normal[::-1] * (1.0, -1.0)) if friction else None  # along the plane
-        return add(self.stops, Stop(gap, restitution, name, friction, slide))
+        slide = partial(_plane_gap, *places, across[::-1] * (1.0, -1.0)) if friction else None  # along the plane
+        return add(self.stops, Stop(partial(_plane_gap, *places, across), restitution, name, friction, slide))
 
     def limit(
         self,

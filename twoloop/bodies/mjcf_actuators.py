@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -22,7 +23,7 @@ from twoloop.bodies.file_parts import (
 )
 from twoloop.bodies.frames import vector_of
 from twoloop.bodies.parts import Body, Force
-from twoloop.bodies.tendons import SitePath, SpringTension, Tendon, bounded
+from twoloop.bodies.tendons import SitePath, SpringTension, Tendon, Tension, bounded
 from twoloop.checks.arguments import Array, check_finite
 
 ACTUATORS = (
@@ -289,7 +290,7 @@ class TendonsAndActuators:
                 self.ignored.append(f"the damping ratio of {called}")
             bias[2] *= -2.0 * np.sqrt(max(gain[0], 0.0) * mass)
         if (span := self._range(given, "ctrl", joint)) and "clampctrl" not in self.reader.disabled:
-            command = Limited(command, *span) if callable(command) else float(np.clip(command, *span))
+            command = partial(_limited, command, *span) if callable(command) else float(np.clip(command, *span))
         if filtered:
             constant = None if given["dyntype"] == "integrator" else float(given.get("dynprm", "1").split()[0])
             command = activated(command, self.activations.get(name, 0.0), constant, self._range(given, "act", joint))
@@ -301,7 +302,7 @@ class TendonsAndActuators:
         if joint is not None and (own := self._limits_of_force(joint, float(gear[0]))):
             limits = own if limits is None else (max(own[0], limits[0]), min(own[1], limits[1]))
         own_name = self.reader.free(name, f"actuator {number} of the file")
-        law = ActuatorTension(command, tuple(gain), tuple(bias), limits)
+        law = partial(_tension, command, tuple(gain), tuple(bias), limits)
         if target is None:
             self._push(given, joint, gear, law, own_name)
             return
@@ -317,7 +318,7 @@ class TendonsAndActuators:
         if k or c:
             self._law(joint, k, c, -zero, self.reader.free(None, f"gains of {own_name}"))
         factor, constant = gear[0] * gain[0], gear[0] * bias[0]
-        torque = _Commanded(command, factor, constant) if callable(command) else factor * command + constant
+        torque = partial(_commanded, command, factor, constant) if callable(command) else factor * command + constant
         self.model.motor(joint.joint, torque, name=own_name)
 
     def _target(self, given: dict[str, str], gear: float) -> Tendon | SitePath | None:
@@ -373,9 +374,7 @@ class TendonsAndActuators:
             return joint.joint in getattr(tendon, "joints", (joint.joint,))
         return self._joint_of(given) in (joint, None)
 
-    def _push(
-        self, given: dict[str, str], joint: FileJoint | None, gear: Array, law: ActuatorTension, name: str
-    ) -> None:
+    def _push(self, given: dict[str, str], joint: FileJoint | None, gear: Array, law: Tension, name: str) -> None:
         """Add an actuator whose force and torque have fixed components: at a site, at a ball, or at a free joint.
 
         Components refer to the axes of the site; of the body or its parent for torques of joints; of space for forces.
@@ -406,7 +405,7 @@ class TendonsAndActuators:
                     (self.model.torque, ()) if which else (self.model.force, (body.point(*body.local_point(at)),))
                 )
                 called = own if which == 0 else self.reader.free(None, own if sign > 0.0 else f"reaction to {name}")
-                push(body, *places, SiteForce(axes, along, law), name=called)
+                push(body, *places, partial(_site_force, axes, along, law), name=called)
 
 
 DEGREES = {"hinge": 1, "slide": 1, "ball": 3, "free": 6}
@@ -439,25 +438,17 @@ def tree_inertia(parts: list[Part], joints: list[FileJoint]) -> Array:
     return M
 
 
-class _Commanded:
-    """Evaluate the force of an actuator with a command that is a function of time."""
-
-    def __init__(self, command: Callable[[Any], Any], factor: float, constant: float):
-        self.command, self.factor, self.constant = command, factor, constant
-
-    def __call__(self, t: Any) -> Any:
-        return self.factor * self.command(t) + self.constant
+# the arguments t, q and v of the functions below may be numbers or symbols
 
 
-class Limited:
-    """Evaluate a command that is a function of time, within its range."""
+def _commanded(command: Callable[[Any], Any], factor: float, constant: float, t: Any) -> Any:
+    """Return the force of an actuator with a command that is a function of time."""
+    return factor * command(t) + constant
 
-    def __init__(self, command: Callable[[Any], Any], low: float, high: float):
-        self.command, self.low, self.high = command, low, high
 
-    def __call__(self, t: Any) -> Any:
-        """Return the command, for numbers or symbols."""
-        return bounded(self.command(t), self.low, self.high)
+def _limited(command: Callable[[Any], Any], low: float, high: float, t: Any) -> Any:
+    """Return a command that is a function of time, within its range."""
+    return bounded(command(t), low, high)
 
 
 def activated(command: float, start: float, constant: float | None, span: tuple[float, float] | None) -> Any:
@@ -469,53 +460,30 @@ def activated(command: float, start: float, constant: float | None, span: tuple[
         return start
     if constant is not None and constant <= IMMEDIATE:
         return command
-    activation = _Activation(command, start, constant)
-    return activation if span is None else Limited(activation, *span)
+    activation = partial(_activation, command, start, constant)
+    return activation if span is None else partial(_limited, activation, *span)
 
 
-@dataclass(frozen=True, eq=False)
-class _Activation:
-    """Evaluate an activation as a function of time."""
-
-    command: float
-    start: float
-    constant: float | None
-
-    def __call__(self, t: Any) -> Any:
-        if self.constant is None:
-            return self.start + self.command * t
-        return self.command + (self.start - self.command) * np.exp(-t / self.constant)
+def _activation(command: float, start: float, constant: float | None, t: Any) -> Any:
+    """Return an activation that is a function of time."""
+    if constant is None:
+        return start + command * t
+    return command + (start - command) * np.exp(-t / constant)
 
 
-@dataclass(frozen=True, eq=False)
-class ActuatorTension:
-    """Evaluate the negative force of an actuator whose gain and bias are linear in its length and rate."""
-
-    command: Any
-    gain: tuple[float, ...]
-    bias: tuple[float, ...]
-    limits: tuple[float, float] | None
-
-    def __call__(self, t: Any, length: Any, rate: Any) -> Any:
-        """Return the tension, for numbers or symbols."""
-        command = self.command(t) if callable(self.command) else self.command
-        gain, bias = (c[0] + c[1] * length + c[2] * rate for c in (self.gain, self.bias))
-        force = gain * command + bias
-        return -force if self.limits is None else -bounded(force, *self.limits)
+def _tension(
+    command: Any, gain: Sequence[float], bias: Sequence[float], limits: Any, t: Any, length: Any, rate: Any
+) -> Any:
+    """Return the negative force of an actuator whose gain and bias are linear in its length and rate."""
+    factor, constant = (c[0] + c[1] * length + c[2] * rate for c in (gain, bias))
+    force = factor * (command(t) if callable(command) else command) + constant
+    return -force if limits is None else -bounded(force, *limits)
 
 
-@dataclass(frozen=True, eq=False)
-class SiteForce:
-    """Evaluate a force or torque with constant components in the axes of a body, of an actuator without a length."""
-
-    body: Body
-    components: tuple[float, ...]
-    law: ActuatorTension
-
-    def __call__(self, t: Any, q: Any, v: Any) -> Any:
-        """Return the force along the axes of space, for numbers or symbols."""
-        size = -self.law(t, 0.0, 0.0)
-        return [size * x for x in vector_of(q, self.body.number, self.components)]
+def _site_force(body: Body, components: tuple[float, ...], law: Tension, t: Any, q: Any, v: Any) -> Any:
+    """Return, in space, the force of an actuator without a length, which has constant components in a body's axes."""
+    size = -law(t, 0.0, 0.0)
+    return [size * x for x in vector_of(q, body.number, components)]
 
 
 def is_single(joint: FileJoint) -> bool:

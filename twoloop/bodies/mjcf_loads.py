@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -230,7 +231,7 @@ class Loads(TendonsAndActuators):
         if joint.kind == "free":
             assert part.start is not None
             origin = body.local_point(part.start.x)
-            slow = _Dragging(body, origin, damping)
+            slow = partial(_drag, body, origin, damping)
             self.model.force(body, body.point(*origin), slow, name=self.reader.free(None, f"drag of {joint.name}"))
 
     def _equality(self, element: Element, number: int) -> None:
@@ -299,31 +300,26 @@ class Loads(TendonsAndActuators):
         text = given.get("polycoef", "").split()
         coefficients = numbers(" ".join([*text, *"01000"[len(text) :]]), 5, f"polycoef of a {kind} equality")
         own = self.reader.free(given.get("name"), f"equality of {' and '.join(names)}")
-        self.model.coupling(ends, Polynomial(tuple(coefficients.tolist()), tuple(offsets)), name=own)
+        row = partial(polynomial, tuple(coefficients.tolist()), tuple(offsets))
+        self.model.coupling(ends, row, name=own)
         return True
 
 
 READ = ("tendon", "equality", "actuator")  # sections, in order
 
 
-class Polynomial:
-    """Evaluate x1 - (c0 + c1 x2 + ...), a row that couples two joint coordinates, or x1 - c0 for one coordinate.
+def polynomial(coefficients: tuple[float, ...], offsets: tuple[float, ...], first: Any, *second: Any) -> Any:
+    """Return x1 - (c0 + c1 x2 + ...), a row that couples two joint coordinates, or x1 - c0 for one coordinate.
 
-    The arguments are displacements from the start of the model; `offsets`, added to them, are the displacements of the
-    joints at the start from the reference pose of the file.
+    `first` and `second` are displacements from the start of the model, numbers or symbols; `offsets`, added to them,
+    are the displacements of the joints at the start from the reference pose of the file.
     """
-
-    def __init__(self, coefficients: tuple[float, ...], offsets: tuple[float, ...]):
-        self.coefficients, self.offsets = coefficients, offsets
-
-    def __call__(self, first: Any, *second: Any) -> Any:
-        """Return the residual, for numbers or symbols."""
-        total: Any = self.coefficients[0]
-        for x in second:
-            total = 0.0
-            for coefficient in self.coefficients[::-1]:
-                total = total * (x + self.offsets[1]) + coefficient
-        return first + self.offsets[0] - total
+    total: Any = coefficients[0]
+    for x in second:
+        total = 0.0
+        for coefficient in coefficients[::-1]:
+            total = total * (x + offsets[1]) + coefficient
+    return first + offsets[0] - total
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,12 +355,7 @@ class _Resisting:
         return 4.0 * np.arctan(s / (w + 1.0)), s, e
 
 
-class _Dragging:
-    """Evaluate the force of a damper against the velocity of a point of a body."""
-
-    def __init__(self, body: Body, point: Array, damping: float):
-        self.body, self.point, self.damping = body, point, damping
-
-    def __call__(self, t: Any, q: Any, v: Any) -> Any:
-        turning = rate_of_vector(q, v, self.body.number, self.point)
-        return [-self.damping * (v[self.body.coordinates[k]] + turning[k]) for k in range(3)]
+def _drag(body: Body, point: Array, damping: float, t: Any, q: Any, v: Any) -> Any:
+    """Return the force of a damper against the velocity of a point of a body."""
+    turning = rate_of_vector(q, v, body.number, point)
+    return [-damping * (v[body.coordinates[k]] + turning[k]) for k in range(3)]

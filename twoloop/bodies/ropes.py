@@ -15,7 +15,7 @@ from twoloop.bodies.functions import n_arguments
 from twoloop.bodies.loads import CoordinateGap, Loads, Row, function_rows
 from twoloop.bodies.parts import COINCIDE, Body, ModelJoint, Numbers
 from twoloop.bodies.rotation_rates import in_body_axes
-from twoloop.bodies.tendons import PrescribedTension, SpringTension, Tendon
+from twoloop.bodies.tendons import SpringTension, Tendon, prescribed_tension
 from twoloop.checks.arguments import check_finite, check_not_negative, check_positive, shown
 from twoloop.problem.description import Stop
 
@@ -204,7 +204,7 @@ class Ropes(Loads):
         if k or c:
             tendon.pull(self, SpringTension((k,), (c,), rest, rest), name)
         if force is not None:
-            tendon.pull(self, PrescribedTension(force, arity), self._new_name(f"force of {name}", None))
+            tendon.pull(self, partial(prescribed_tension, force, arity), self._new_name(f"force of {name}", None))
         return tendon
 
     def bound(self, tendon: Any, lower: float | None, upper: float | None) -> None:

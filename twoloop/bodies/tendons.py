@@ -201,16 +201,9 @@ class SpringTension:
         return length - self.longest
 
 
-@dataclass(frozen=True, eq=False)
-class PrescribedTension:
-    """Evaluate a tension that is a number or a function of t, or of t, length and rate."""
-
-    force: Any
-    n_arguments: int
-
-    def __call__(self, t: Any, length: Any, rate: Any) -> Any:
-        """Return the tension, for numbers or symbols."""
-        return self.force(*(t, length, rate)[: self.n_arguments]) if self.n_arguments else self.force
+def prescribed_tension(force: Any, n_arguments: int, t: Any, length: Any, rate: Any) -> Any:
+    """Return a tension that is a number or a function of t, or of t, length and rate, for numbers or symbols."""
+    return force(*(t, length, rate)[:n_arguments]) if n_arguments else force
 
 
 def bounded(x: Any, low: float, high: float) -> Any:

@@ -32,7 +32,7 @@ from twoloop.bodies.file_parts import (
     text_of,
 )
 from twoloop.bodies.loads import function_rows
-from twoloop.bodies.mjcf_loads import Polynomial
+from twoloop.bodies.mjcf_loads import polynomial
 from twoloop.bodies.parameter_layout import POINT
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.rotation import euler_parameters, perpendiculars
@@ -365,7 +365,7 @@ class _Reader:
             float(numbers(mimic.get(key, default), 1, f"{key} of the mimic of joint {freed.name!r}")[0])
             for key, default in (("multiplier", "1"), ("offset", "0"))
         )
-        row = Polynomial((offset, factor), (freed.displacement, leader.displacement))
+        row = partial(polynomial, (offset, factor), (freed.displacement, leader.displacement))
         add_coupling([freed.joint, leader.joint], row, name=f"mimic of {freed.name}")
         return True
 

@@ -20,7 +20,7 @@ that of the Euler-Bernoulli beam, for any mesh. This is part of the benchmark an
 """
 
 import math
-from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -241,18 +241,11 @@ def gamma(t, q, v, p, Qd):
     Qd[0] = -p[AMPLITUDE] * p[FREQUENCY] ** 2 * math.sin(p[FREQUENCY] * t)
 
 
-@dataclass(frozen=True, eq=False)
-class Energy:
-    """Evaluate the kinetic, elastic and gravitational energy of a beam, J, at t, q and v."""
-
-    M: Array
-    p: Array
-
-    def __call__(self, t: Any, q: ArrayLike, v: ArrayLike) -> Any:
-        """Evaluate for one state, or for many given as columns."""
-        q, v = np.asarray(q), np.asarray(v)
-        weight = self.p[FALL] * self.M[1::6].sum(axis=0)
-        return 0.5 * (v * (self.M @ v)).sum(axis=0) + elastic_energy(q, self.p) + weight @ q
+def _energy(M: Array, p: Array, t: Any, q: ArrayLike, v: ArrayLike) -> Any:
+    """Return the kinetic, elastic and gravitational energy of a beam, J, at one state, or at many given as columns."""
+    q, v = np.asarray(q), np.asarray(v)
+    weight = p[FALL] * M[1::6].sum(axis=0)
+    return 0.5 * (v * (M @ v)).sum(axis=0) + elastic_energy(q, p) + weight @ q
 
 
 def ancf_beam(
@@ -380,7 +373,7 @@ def ancf_beam(
         q0=q0.ravel(),
         v0=v0.ravel(),
         t_span=(0.0, 2.0),
-        energy=Energy(M, p),
+        energy=partial(_energy, M, p),
         drawing=_centre_line(n_elements, l),
         parameters={"n_elements": n_elements, "start": start, **parameters},
         note=f"start assumed, as the paper does not state it: straight along x, gravity across it, {STARTS[start]}",

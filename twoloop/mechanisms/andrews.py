@@ -5,7 +5,6 @@ Differential Equations II, Sect. VII.7, and in the Test Set for IVP Solvers, "an
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -115,21 +114,17 @@ def gamma(t, q, v, p, Qd):
     Qd[5] = y - ZF * six * math.sin(q[5] + q[6]) + U * seven * math.cos(q[6])
 
 
-@dataclass(frozen=True, eq=False)
-class Energy:
-    """Evaluate kinetic energy, spring energy, and the potential -TORQUE beta of the constant torque, J."""
-
-    def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Evaluate for one state, or for many given as columns."""
-        q, v = np.asarray(q), np.asarray(v)
-        kinetic = np.empty(q.shape[1:])
-        for place in np.ndindex(*q.shape[1:]):
-            M = np.zeros((7, 7))
-            mass(0.0, np.ascontiguousarray(q[(slice(None), *place)]), np.zeros(0), M)
-            kinetic[place] = 0.5 * v[(slice(None), *place)] @ M @ v[(slice(None), *place)]
-        s, c = np.sin(q[2]), np.cos(q[2])
-        length = np.hypot(SD * c + SC * s + XB - XC, SD * s - SC * c + YB - YC)
-        return kinetic + 0.5 * SPRING * (length - LENGTH) ** 2 - TORQUE * q[0]
+def energy(t: Any, q: Array, v: Array) -> Any:
+    """Return kinetic energy, spring energy and the potential -TORQUE beta of the torque, J, for one state or many."""
+    q, v = np.asarray(q), np.asarray(v)
+    kinetic = np.empty(q.shape[1:])
+    for place in np.ndindex(*q.shape[1:]):
+        M = np.zeros((7, 7))
+        mass(0.0, np.ascontiguousarray(q[(slice(None), *place)]), np.zeros(0), M)
+        kinetic[place] = 0.5 * v[(slice(None), *place)] @ M @ v[(slice(None), *place)]
+    s, c = np.sin(q[2]), np.cos(q[2])
+    length = np.hypot(SD * c + SC * s + XB - XC, SD * s - SC * c + YB - YC)
+    return kinetic + 0.5 * SPRING * (length - LENGTH) ** 2 - TORQUE * q[0]
 
 
 # pairs of the joints below: crank, coupler, the triangle of body 3, the spring, and the two bars of each other loop
@@ -179,7 +174,7 @@ def andrews() -> Problem:
         q0=q0,
         v0=np.zeros(7),
         t_span=(0.0, 0.03),
-        energy=Energy(),
+        energy=energy,
         conserved=True,
         drawing=Drawing(joints, BARS, (1, 2, 6, 8)),
         parameters=PARAMETERS,

@@ -12,8 +12,8 @@ The callbacks are compiled once for all mechanisms; the parameters hold the term
 The begin and end of a scalar are indices in p; the scalar is its constant and pairs (i, coefficient).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -92,17 +92,10 @@ def gamma(t, q, v, p, Qd):
         Qd[int(p[k])] -= 2.0 * p[k + 1] * linear_part(p, a, a_end, v) * linear_part(p, b, b_end, v)
 
 
-@dataclass(frozen=True, eq=False)
-class Energy:
-    """Evaluate kinetic energy with a constant mass and potential of a constant force, J, for one state or many."""
-
-    mass: Array
-    force: Array
-
-    def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Evaluate for one state, or for many given as columns."""
-        q, v = np.asarray(q), np.asarray(v)
-        return 0.5 * np.einsum("i...,ij,j...->...", v, self.mass, v) - self.force @ q
+def _energy(mass: Array, force: Array, t: Any, q: Array, v: Array) -> Any:
+    """Return kinetic energy with a constant mass and potential of a constant force, J, for one state or many."""
+    q, v = np.asarray(q), np.asarray(v)
+    return 0.5 * np.einsum("i...,ij,j...->...", v, mass, v) - force @ q
 
 
 class QuadraticSystem:
@@ -183,9 +176,9 @@ class QuadraticSystem:
         )
 
     @property
-    def energy(self) -> Energy:
+    def energy(self) -> Callable[..., Any]:
         """Return the energy as a function of t, q and v."""
-        return Energy(self.mass, self.force)
+        return partial(_energy, self.mass, self.force)
 
     def drawing(self, *traced: Sequence[Scalar]) -> Drawing:
         """Return the lines so far, and the paths of the points given."""

@@ -6,7 +6,6 @@ crank pin from the slider, which equals the length of the rod.
 
 import cmath
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -226,20 +225,14 @@ def gamma(t, q, v, p, Qd):
     Qd[1] = -crank * math.sin(q[0]) - rod * math.sin(q[2])
 
 
-@dataclass(frozen=True, eq=False)
-class Energy:
-    """Evaluate kinetic energy, spring energy, and the potential of F; the damper dissipates them."""
-
-    p: Array
-
-    def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Evaluate for one state, or for many given as columns."""
-        q, v = np.asarray(q), np.asarray(v)
-        a, J1, m2, J2, k, _, l0, F = self.p
-        x = q[1] - 0.5 * (np.cos(q[2]) + a * np.cos(q[0]))
-        length = np.hypot(x, 0.5 * (np.sin(q[2]) + a * np.sin(q[0])))
-        kinetic = 0.5 * (J1 * v[0] ** 2 + m2 * v[1] ** 2 + J2 * v[2] ** 2)
-        return kinetic + 0.5 * k * (length - l0) ** 2 - F * (q[1] + np.cos(q[2]))
+def energy(t: Any, q: Array, v: Array) -> Any:
+    """Return kinetic energy, spring energy and the potential of F, which a damper dissipates, for one or many states."""
+    q, v = np.asarray(q), np.asarray(v)
+    a, J1, m2, J2, k, _, l0, F = PARAMETERS.values()
+    x = q[1] - 0.5 * (np.cos(q[2]) + a * np.cos(q[0]))
+    length = np.hypot(x, 0.5 * (np.sin(q[2]) + a * np.sin(q[0])))
+    kinetic = 0.5 * (J1 * v[0] ** 2 + m2 * v[1] ** 2 + J2 * v[2] ** 2)
+    return kinetic + 0.5 * k * (length - l0) ** 2 - F * (q[1] + np.cos(q[2]))
 
 
 def joints(q: Array) -> Array:
@@ -260,13 +253,12 @@ def sundials_slider_crank() -> Problem:
     >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
     (3, 2, 10.0)
     """
-    p = np.array(list(PARAMETERS.values()))
     tilt = math.asin(-PARAMETERS["a"])
     system = ConstrainedSystem(
         n_q=3,
         n_c=2,
         **callbacks_in(globals()),
-        parameters=p,
+        parameters=list(PARAMETERS.values()),
         constant_mass=True,
         name="SUNDIALS slider-crank",
     )
@@ -276,7 +268,7 @@ def sundials_slider_crank() -> Problem:
         q0=np.array([0.5 * math.pi, math.cos(tilt), tilt]),
         v0=np.zeros(3),
         t_span=(0.0, 10.0),
-        energy=Energy(p),
+        energy=energy,
         drawing=Drawing(joints, ((0, 1), (1, 2), (3, 4)), (1, 4)),
         parameters=PARAMETERS,
         reference=stored_reference("SUNDIALS slider-crank"),
