@@ -226,7 +226,7 @@ def gamma(t, q, v, p, Qd):
 
 
 def energy(t: Any, q: Array, v: Array) -> Any:
-    """Return kinetic energy, spring energy and the potential of F, which a damper dissipates, for one or many states."""
+    """Return kinetic energy, spring energy and the potential of F, which a damper dissipates, for one state or many."""
     q, v = np.asarray(q), np.asarray(v)
     a, J1, m2, J2, k, _, l0, F = PARAMETERS.values()
     x = q[1] - 0.5 * (np.cos(q[2]) + a * np.cos(q[0]))
