@@ -1,7 +1,8 @@
 """Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
-`advance` serves all methods: the functions of a method are in the kit `f`, its data in `options` and `memory`. `w` is
-the workspace, `Work`; `t`, `size`: time, step size (s); `state`, `new_state`: [q, v, a, lam] before and after a step.
+`advance` serves all methods: the functions of a method are in the kit `f`, its data in `options` and `memory`. Common
+arguments: `w`: workspace (`Work`); `clock`, `control`: state and settings of the loop, see loop_state.py; `t`, `size`:
+time and step size (s); `state`, `new_state`: [q, v, a, lam] before and after a step.
 """
 
 import numpy as np
@@ -58,9 +59,10 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import PARTITION_CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
+SUDDEN_ERROR = 10.0  # if a rejected step has a larger error, in tolerances, it is assumed that a force jumps within it
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to the size of a rejected step
-# short steps end the trial of a method only after this number of accepted steps: the first size is a guess
+# a method on trial is given up if its steps are short, but not before this number of accepted steps, because the size
+# of the first step is a guess
 FIRST_JUDGED_STEP = 2
 
 
@@ -69,7 +71,7 @@ def start(f, w, t, state):
     """Factor M, choose the partition, and store a and lam in `state`; return DONE or a failure code."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
-    w.last_jump = t  # C_t or b of a drive may be discontinuous at the start
+    w.last_jump = t  # a drive may start suddenly: treat t as a jump of C_t and b (of A v + b = 0)
     code = prepare_mass(f, w, t, q)
     if code == DONE:
         code = renew_partition(f, w, t, q)
@@ -77,14 +79,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.gamma_given == 0:  # again: errors of Gamma are relative to a scale that is known only now
+    if code == DONE and f.gamma_given == 0:  # again, with the scale of Gamma that is known only now
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return whether C_t and b have a JUMP or a RAMP in a step, or are SMOOTH; and the times (s) at its ends."""
+    """Return JUMP, RAMP or SMOOTH for C_t and b (of A v + b = 0) within a step, and the times (s) at the ends of it."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -98,9 +100,9 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return a code, the error in tolerances, and the proposed ratio of the next size to `size`.
+    """Attempt a step; return a code, the error in tolerances, and the ratio of the next size to `size` (0: not known).
 
-    If the step crosses a jump of C_t or b (`crosses_jump`), the caller has already computed `new_state`. Ratio 0: none.
+    If `crosses_jump`, the step only crosses a jump of C_t or b: `new_state` already contains the state after the jump.
     """
     w.orientation_new = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -123,9 +125,10 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 
 @merged
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return whether a step must be repeated because C_t or b jumps, or has a ramp, within the step.
+    """Return True if a step must be repeated because C_t or b jumps, or has a steep ramp, within the step.
 
-    Store in `clock`: for a jump, its first and last time JUMP_FROM and JUMP_TO; for a ramp, the next step size H_NEXT.
+    For a jump, store the interval that contains it in clock[JUMP_FROM] and clock[JUMP_TO]. For a ramp, store the next
+    step size in clock[H_NEXT].
     """
     kind, low, high = _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
@@ -141,10 +144,10 @@ def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, st
 
 @merged
 def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
-    """Prepare the repetition of a failed step and return CONTINUE, or return an end code.
+    """Prepare the repetition of a step that failed with `code`, and return CONTINUE; else return an end code.
 
     A step is repeated with a smaller size, a new partition, or both. A step of fixed size is repeated only once, with a
-    new partition. `t_repeated`: time (s) at which the last repeated step of fixed size began.
+    new partition. `t_repeated`: time (s) from which a step of fixed size was last repeated.
     """
     n = w.Q.size
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
@@ -173,9 +176,9 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
 
 @merged
 def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
-    """Store a size below `size` in clock[H_NEXT] after a step whose error was too large; return CONTINUE.
+    """After a step with too large an error, store the next, smaller size in clock[H_NEXT] and return CONTINUE.
 
-    Return an end code instead if a singular position is near. `proposed_size`: size (s) that follows from the error.
+    If a singular position is near, return an end code. `proposed_size`: next size (s) according to the error.
     """
     n = w.Q.size
     w.n_rejected_error += 1
@@ -192,7 +195,7 @@ def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
 
 @merged
 def _can_take_many_steps(control, clock):
-    """Return whether the method may take many steps in one call, without checks between these steps."""
+    """Return True if the method may take many steps in one call, without checks by `advance` between them."""
     if control[at.TAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
@@ -202,7 +205,7 @@ def _can_take_many_steps(control, clock):
 
 @merged
 def _pass_output_time(f, w, clock, outputs, state):
-    """Record the pivot at an output time, and increment clock[NEXT_OUTPUT]; return whether no output time is left."""
+    """Record the smallest pivot at an output time; go on to the next output time; return True if there is none."""
     record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
@@ -215,18 +218,19 @@ _ADVANCE_SIGNATURE = i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS)
 def advance(
     f, w, options, memory, tolerances, control, clock, state, new_state, outputs, out_t, out_state, out_steps, filled
 ):
-    """Integrate from clock[T] and `state` until all times in `outputs` are reached; return an end code (loop_state.py).
+    """Integrate from clock[T] and `state` to the last time in `outputs`; return an end code, see loop_state.py.
 
-    Steps are shortened to end at output times. A step size is the difference of two floating-point times, so that the
-    sum of the step sizes is exact. `clock` and `state` are updated in place; `new_state` is scratch, except if the next
-    step crosses a jump (APPLIES_JUMP = 1): then it contains the state after the jump.
-    With STORE_ALL = 1, all accepted states are stored in rows of out_t and out_state, otherwise the states at output
-    times only; each accepted step is stored in a row of out_steps. On return, filled[0] is the number of rows stored in
-    out_t and out_state, and filled[1] the number of rows stored in out_steps.
+    - Update `clock` and `state` in place. `new_state` is scratch; but if clock[APPLIES_JUMP] is 1, the next step
+      crosses a jump of C_t or b, and `new_state` contains the state after the jump.
+    - Shorten steps so that they end at output times. A step size is the difference of two floating-point times, so that
+      step sizes add up to the exact time.
+    - Store times and states in out_t and out_state: after each accepted step if control[STORE_ALL] is 1, otherwise at
+      output times only. Store each accepted step in a row of out_steps. Store the number of entries of out_t in
+      filled[0], and the number of rows of out_steps in filled[1].
     """
     fixed_size = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
-    t_repeated = np.inf  # beginning (s) of the last step of fixed size that was repeated with a new partition
+    t_repeated = np.inf  # time (s) from which a step of fixed size was last repeated with a new partition
     filled[0] = 0
     filled[1] = 0
     n_attempts = 0.0
@@ -266,7 +270,7 @@ def advance(
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        n_grid_steps = 1.0  # number of steps on the grid of fixed steps that this step completes
+        n_grid_steps = 1.0  # for a fixed step size: number (0 or 1) of intervals of the time grid that it completes
         if fixed_size:
             size, n_grid_steps, reaches_goal = size_on_grid(clock, t, h, target, goal)
         else:
@@ -288,10 +292,10 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        if w.time_is_up == 1.0:  # the time limit may have cut evaluations short: discard this attempt
+        if w.time_is_up == 1.0:  # the time limit has passed, perhaps within this attempt: discard it
             f.commit(f, w, options, memory, tolerances, False)
             return at.PAUSED
-        # near a jump of a force, the error estimate may be small by chance: until JUMP_END, `error_factor` increases it
+        # near a jump of a force the error estimate may be too small: up to the time JUMP_END, multiply it by JUMP_RATIO
         error_factor = control[at.JUMP_RATIO] if t < clock[at.JUMP_END] else 1.0
         accepted = code == DONE and error * error_factor <= 1.0
         if accepted and not reaches_goal and ends_near_singular(f, w, control, clock):
@@ -325,7 +329,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the method has computed `factor` without regard to `error_factor`
+        elif error_factor > 1.0 and error > 0.0:  # the method does not know `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
@@ -357,12 +361,12 @@ def advance(
             out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
-        # a step that was shortened, for example to end at an output time, must not limit the size of the next step
+        # if a step was shortened, for example to end at an output time, the next step may be as long as intended here
         clock[at.H_NEXT] = max(proposed_size, h) if shortened else proposed_size
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
-            clock[at.FAILURE_CODE] = DONE  # the last failure no longer explains short steps
+            clock[at.FAILURE_CODE] = DONE  # forget the last failure: it no longer explains short steps
         if at_output and _pass_output_time(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
         if fixed_size and not at_output:

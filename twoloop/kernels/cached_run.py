@@ -1,12 +1,13 @@
 """Start a run and take its first steps in one compiled call, which stores all results in one array.
 
-`start_and_advance` checks the start, keeps the independent rows and dependent coordinates of the previous run, takes
-steps, and fills one array (`f` is the kit, `w` the workspace; `b` has the other arrays, see RUN_ARRAYS):
+`start_and_advance` checks the start, takes steps with the independent rows and dependent coordinates of the previous
+run, and fills one array, `report`. Common arguments: `f`: kit; `w`: workspace; `b`: all other arrays, see RUN_ARRAYS.
 
     unused | report: N_REPORT numbers, counters | times | steps | states | unused
                                                                 ^ a fixed index
-`advance` writes the states, which begin at the fixed index. The other parts, whose length depends on the number of
-steps, are copied to the places before it. Python copies the used part as one slice, and splits it when it is read.
+`advance` writes the states, which begin at the fixed index. The number of steps, and so the length of the other parts,
+is known only afterwards: they are copied to the places before the fixed index. Python copies all used parts as one
+slice, and splits this slice when a field of the result is read.
 """
 
 import math
@@ -35,15 +36,15 @@ from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNT
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 from twoloop.kernels.linalg.dense import copy
 
-ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate: no smaller corrections are made
+ROUNDING = 1e-15  # corrections of positions below this, relative to the largest coordinate, count as rounding errors
 
 
 @merged
 def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     """Reset the workspace `w` in place before a run that starts at the position q (n_q).
 
-    `numbers`, `integers`: the parts of `w` that keep data from step to step; `pattern`: copied to w.pattern;
-    `accuracy`: the new w.gamma_required; `reuse`: lower limit of the new w.reuse (see data/indices.py).
+    `numbers`, `integers`: arrays of `w` that keep data from step to step; set to zero here. `pattern`: new w.pattern.
+    `accuracy`: new w.gamma_required. `reuse`: new w.reuse, if this is above the rounding error of q (data/indices.py).
     """
     for k in range(numbers.size):
         numbers[k] = 0.0
@@ -65,22 +66,22 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
 def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Call `prepare_work`; Python can call this function, but not `prepare_work`, which is merged into its callers."""
+    """Call `prepare_work` for Python, which cannot call functions that are merged into their callers."""
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
-FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
+FIRST_STEP = 0.01  # first step size over the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-GAP_RATIO = 10  # GAP / DEFECT_GAP (see `tolerances`) if forces may change suddenly with position or velocity
+GAP_RATIO = 10  # tolerances[GAP] / tolerances[DEFECT_GAP] if forces may change suddenly with position or velocity
 
 
 @exact
 def _first_step_size(state, n, t, span, smallest):
-    """Return the first step size (s): FIRST_STEP times the time in which a coordinate changes by max|q|.
+    """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion that starts from `state`.
 
-    `smallest`: lower bound of max|q|. The size is at most FIRST_STEP times the duration `span` (s) of the run,
-    and at least MIN_FIRST_STEP spacings of floating-point numbers at t.
+    The time scales are the duration `span` (s) of the run, and the times in which q changes by max|q|, and v by max|v|.
+    `smallest` replaces max|q| if it is larger. The size is at least MIN_FIRST_STEP floating-point spacings at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -91,7 +92,7 @@ def _first_step_size(state, n, t, span, smallest):
         time_scale = min(time_scale, distance / speed)
     if acceleration > 0.0:
         time_scale = min(time_scale, math.sqrt(distance / acceleration))
-    # the time in which velocities change by max|v| is also a time scale, unless the start is almost at rest
+    # omit the time in which v changes by max|v| if it is very short: the mechanism starts almost at rest
     if speed > 0.0 and acceleration > 0.0 and speed / acceleration > FIRST_STEP * time_scale:
         time_scale = min(time_scale, speed / acceleration)
     return max(FIRST_STEP * time_scale, MIN_FIRST_STEP * np.spacing(abs(t)))
@@ -99,10 +100,10 @@ def _first_step_size(state, n, t, span, smallest):
 
 @exact
 def _set_step_limits(control, tolerances, span, longest, within):
-    """Store GAP and DEFECT_GAP in `tolerances`, and MAX_STEP, TIME_SPACING and SPACING in `control`.
+    """Limit the time between two evaluations of the equations to MAX_GAP_RATIO times `span`, the run's duration (s).
 
-    These limits keep the time between two evaluations of the equations below MAX_GAP_RATIO times the duration `span`
-    (s) of the run. If a method evaluates the equations within steps (`within`), only `longest` (s) limits step sizes.
+    The limits are GAP and DEFECT_GAP in `tolerances`, and MAX_STEP, TIME_SPACING and SPACING in `control`. If a method
+    evaluates the equations within steps (`within`), the step size is limited only by `longest` (s).
     """
     max_gap = MAX_GAP_RATIO * span
     tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
@@ -113,7 +114,7 @@ def _set_step_limits(control, tolerances, span, longest, within):
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
 def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longest, within):
-    """Return the first step size (s), see _first_step_size; if `longest` > 0, also call `_set_step_limits`."""
+    """Return the result of `_first_step_size` (s); if `longest` > 0, also call `_set_step_limits`."""
     if longest > 0.0:
         _set_step_limits(control, tolerances, t1 - t, longest, within)
     return _first_step_size(state, n, t, t1 - t, smallest)
@@ -121,7 +122,7 @@ def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longes
 
 @merged
 def _is_within_bounds(t, rows, bounds):
-    """Return whether all states [t[k], rows[k]] are between the states bounds[0] and bounds[1], number by number."""
+    """Return True if, at all times t[k], each number of [t[k], rows[k]] is between those in bounds[0] and bounds[1]."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -133,10 +134,13 @@ def _is_within_bounds(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Store step sizes (s) in `h`, increases of `counts` in each step in `changes`, and whether a step used Newton.
+    """Split the records of steps, `steps` (rows of out_steps, see loop_state.py), into three arrays.
 
-    `steps`: rows of out_steps, see loop_state.py. `counts`: numbers of rejections by the error test, failures and
-    partitions since the start of the run; on entry before the first of these steps, on return after the last.
+    - h: step sizes (s)
+    - changes: numbers of rejections by the error test, failures, and new partitions in each step
+    - used_newton: True for a step by Newton's method
+
+    `counts`: these three numbers since the start of the run; the values before the first step are updated in place.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -146,19 +150,20 @@ def split_steps(steps, counts, h, changes, used_newton):
 
 
 # codes that `start_and_advance` returns in place of a number of steps
-# - REFUSED: the independent rows or dependent coordinates of the previous run do not suit this start
-# - IN_DOUBT: the start may violate the constraints; Python must check it
+# - REFUSED: no steps were taken; Python must set up the run anew, or report what is wrong with the start
+# - IN_DOUBT: no steps were taken, because the start may violate the constraints; Python must check it
 # - UNUSUAL: steps were taken, but Python must read the report, and may have to continue the run
-# - UNCHOSEN: Python must check whether code was generated for the rows that are chosen at this start
+# - UNCHOSEN: no steps were taken, because Python must check whether the generated code suits this start
 REFUSED, IN_DOUBT, UNUSUAL, UNCHOSEN = -1, -2, -3, -4
-# what Python has checked of a start: nothing; that it satisfies the constraints; also that the code suits it
+# values of `checks`: Python has checked nothing; that the start satisfies the constraints; also that the generated code
+# suits the start
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
-# arrays for the checks of a start, the choice of rows, and the steps, which successive runs reuse. Among them are
-# - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
-# - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
-# - `last_start`: the last start, see START; `start_rows`: indices of the independent rows at the last start
-# - `saved`, `saved_integers`: data right after a start that was repeated; later runs from this start restore them
+# arrays for the checks of a start, for the choice of rows and for steps; successive runs reuse them. Among them are
+# - `numbers`: array whose parts are clock, control and tolerances; `start_numbers`: values of `numbers` at a start
+# - `start_memory`: values at a start of the method's `memory`, at the indices `memory_places`; other entries are then 0
+# - `last_start`: t, t1, q and v of the last start; `start_rows`: indices of the independent constraint rows there
+# - `saved`, `saved_integers`: all data computed at a start; if more runs begin at this start, they restore these data
 RUN_ARRAYS = Reference(
     "RunArrays",
     {
@@ -180,32 +185,34 @@ RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INT
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# indices in `constants`
+# indices in `constants`, settings of a run; G: the constraint rows, C_q and then A of non-holonomic constraints
 # - ACCURACY, REUSE, NEARLY_SINGULAR, EQUATION_FORM: initial w.gamma_required, w.reuse, w.nearly_singular and f.form
-# - HAS_ALL_ENTRIES: 1 if `kinds` shows all nonzero entries of the constraint rows
-# - RANK_LIMIT, WEAK_LIMIT: arguments of `choose`: below these relative sizes, pivots and eigenvalues of M count as zero
-# - ADDED_SCALE: factor s with which the code adds rows G to a singular M, as M + s G^T G
-# - CONTRADICTS: a redundant row contradicts the others if its residual, relative to its terms, exceeds this
-# - MASS_FLAG: DEFINITE or INDEFINITE, as M has to be at the start; 0: M is constant
-# - LEAST_PIVOT: smallest pivot of a start that is accepted without checks in Python
-# - NEAR_PIVOT: Python must check a run whose smallest pivot at an output time is below this
+# - HAS_ALL_ENTRIES: 1 if the array `kinds` shows all entries of G that may be nonzero
+# - RANK_LIMIT: a row of G with a smaller relative pivot counts as dependent on other rows
+# - WEAK_LIMIT: M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
+# - ADDED_SCALE: if M is singular, generated code replaces it by M + s g^T g with some rows g of G and this factor s
+# - CONTRADICTS: if the residual of a redundant row, relative to its terms, exceeds this, the start is refused
+# - MASS_FLAG: DEFINITE or INDEFINITE, whichever M must be at the start; 0: M is constant, and not checked
+# - LEAST_PIVOT: if the smallest pivot of G at the start is below this, the start is refused
+# - NEAR_PIVOT: Python must check a run whose smallest pivot of G at an output time is below this
 # - FIRST_SIZE: first step size (s) that the user has chosen, or 0; LEAST_DISTANCE: `smallest` of _first_step_size
-# - LONGEST, EVALUATES_WITHIN: arguments of _set_step_limits
-# - MAX_CHANGE_RATIO: velocities jumped if they change by more than this multiple of what accelerations explain
-# - MIN_SAMPLES: Python must check a run with two sudden changes closer than this number of spacings of samples
+# - LONGEST, EVALUATES_WITHIN: `longest` and `within` of _set_step_limits
+# - MAX_CHANGE_RATIO: velocities jump in a step if they change by more than this times the step size times |a|
+# - MIN_SAMPLES: Python must check a run in which a force, C_t or b changes twice within this number of sample spacings
 ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK_LIMIT, WEAK_LIMIT, ADDED_SCALE, CONTRADICTS = range(8)
 MASS_FLAG, LEAST_PIVOT, EQUATION_FORM, FIRST_SIZE, LEAST_DISTANCE, LONGEST, EVALUATES_WITHIN = range(8, 15)
 NEAR_PIVOT, MAX_CHANGE_RATIO, MIN_SAMPLES = range(15, 18)
-# indices in `expected`, the choice of rows for which code was generated (empty without generated code). BOUND: the
-# result that `choose` has to return, or OF_PYTHON if only Python can make this choice. N_ROWS, N_ADDED: number of
-# independent rows, and of rows added to M. FIRST_ROW: where the list of the independent rows, then of the added, begins
+# indices in `expected`, the choice of constraint rows for which code was generated (empty without generated code)
+# - BOUND: the result that `choose` must return for this choice; OF_PYTHON: only Python can make the choice
+# - N_ROWS, N_ADDED: number of independent rows, and number of rows added to a singular M
+# - FIRST_ROW: index of the first entry of two lists, one after the other: the independent rows, and the added rows
 BOUND, N_ROWS, N_ADDED, FIRST_ROW = range(4)
 OF_PYTHON = 100
 
 
 @merged
 def _has_choices_of_code(b):
-    """Choose rows and dependent coordinates at a start; return whether the code was generated for these choices."""
+    """Choose independent rows and dependent coordinates; return True if the code was generated for these choices."""
     b.scratch[0] = 0.0
     limits = b.constants[RANK_LIMIT], b.constants[WEAK_LIMIT]
     first_bound = b.choose(b.mass, b.rows, *limits, b.bounds, b.scratch, b.chosen)
@@ -231,7 +238,7 @@ def _has_choices_of_code(b):
 
 @merged
 def _has_consistent_rows(w, b, n):
-    """Return whether the accelerations a in b.state satisfy all rows of G a = Gamma, also the redundant ones."""
+    """Return True if the accelerations a in b.state satisfy all rows of G a = Gamma, also the redundant ones."""
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
@@ -246,7 +253,7 @@ def _has_consistent_rows(w, b, n):
 
 @merged
 def _evaluate_start(checked_kit, b, t, q, v, records, shifts):
-    """Evaluate all callbacks at a start, store values in `b`; return flags such as CONSISTENT, see `evaluate_start`."""
+    """Evaluate all callbacks at the start (t, q, v); store M, C_q etc. in `b`. For the result see `evaluate_start`."""
     for k in range(b.start_values.size):
         b.start_values[k] = 0.0
     return b.evaluate_start(
@@ -256,9 +263,10 @@ def _evaluate_start(checked_kit, b, t, q, v, records, shifts):
 
 @merged
 def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
-    """Prepare a run from t to t1 with the rows and coordinates of the last run; return 0 or a code, such as REFUSED.
+    """Prepare a run from t to t1 with the setup of the last run; return 0, or REFUSED, IN_DOUBT or UNCHOSEN.
 
-    `checked_kit`: kit with the callbacks for the check of the start; `checks`: which checks Python has already made.
+    `checked_kit`: kit whose callbacks check the start; `checks`: what Python has already checked, for example
+    STATE_CHECKED; `records`: see `evaluate_start`.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -318,14 +326,15 @@ def _restore_start(b):
     copy(b.saved_integers, b.lasting_integers)
 
 
-# indices in `last_start`. N_EQUAL: number of successive runs from this start, at most 2. START: index of [t, t1, q, v]
+# indices in `last_start`. N_EQUAL: number of successive runs from the last start, at most 2. START: index of the first
+# number of the last start, [t, t1, q, v]
 N_EQUAL, START = 0, 1
-NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run has succeeded in starting; a second run has saved its data
+NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run could start at the last start; `saved` contains its data
 
 
 @exact
 def _equals_last_start(last_start, t, t1, q, v):
-    """Return whether (t, t1, q, v) equals `last_start` bit for bit, and store this start in `last_start`."""
+    """Return True if the start (t, t1, q, v) equals the last one bit for bit; store it in `last_start`."""
     n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -335,13 +344,13 @@ def _equals_last_start(last_start, t, t1, q, v):
     return is_same
 
 
-# indices in the report; N_REPORT: index of the first counter
-# - N_STATES, N_STEPS: number of states, including the first, and of steps
-# - NOTHING_TO_CHECK: 1 if Python need not check the run; IS_NEW: 1 if the start differs from the previous start
-# - JUMPED: 1 if velocities changed suddenly in the last step; END_CODE: code that `advance` returned
-# - IN_CHECKED_REGION: 1 if all states are in the region in which callbacks were compared with their traces
-# - DEFECT_KNOWN: 1 if the defect was evaluated in every step; DEFECT: largest defect
-# - LONGEST_GAP: longest time (s) between two evaluations
+# indices in the report of a run; flags are 1 (true) or 0. N_REPORT: index of the first counter
+# - N_STATES: number of states, including the first; N_STEPS: number of steps
+# - NOTHING_TO_CHECK: flag, Python need not check this run; IS_NEW: flag, the start differs from the previous one
+# - JUMPED: flag, velocities jumped in the last step (see MAX_CHANGE_RATIO); END_CODE: code that `advance` returned
+# - IN_CHECKED_REGION: flag, all states are in the region in which callbacks agreed with their traces
+# - DEFECT_KNOWN: flag, the defect was evaluated in every step; DEFECT: largest defect, over its tolerance
+# - LONGEST_GAP: longest time (s) between two evaluations of the equations
 N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
 N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
@@ -349,7 +358,7 @@ N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
 
 @merged
 def _has_velocity_jump(b, k, n):
-    """Return whether velocities jump between states k - 1 and k, see MAX_CHANGE_RATIO; n: number of coordinates."""
+    """Return True if velocities jump between states k - 1 and k, see MAX_CHANGE_RATIO; n: number of coordinates."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
         change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
@@ -361,7 +370,8 @@ def _has_velocity_jump(b, k, n):
 def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     """Store the report, times and steps of a run in b.report; return n_steps, or UNUSUAL if Python must read b.report.
 
-    The run has n_rows states after the first, and n_steps steps; `region` contains the bounds for IN_CHECKED_REGION.
+    n_rows: number of states after the first. code: end code of `advance`. is_new: value of IS_NEW. region: two rows,
+    the least and the greatest [t, q, v] at which callbacks were checked.
     """
     has_jumped = n_rows > 0 and _has_velocity_jump(b, n_rows, w.Q.size)
     is_inside = region.shape[1] > 0 and _is_within_bounds(b.t[: 1 + n_rows], b.states, region)
@@ -388,8 +398,8 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
 def start_and_advance(f, checked_kit, w, b, t, t1, q, v, records, region, checks):
     """Start a run from t to t1, and take the first steps; return the number of steps, or a code such as REFUSED.
 
-    If a start is repeated bit for bit, the second run checks it again, and saves the data that a start computes. Later
-    runs from it restore these data, without a check. For the arguments see _start_run and _write_report.
+    If successive runs begin at the same start, the second one checks it again, and saves all data computed there. Later
+    runs restore these data without a check. For the arguments see _start_run and _write_report.
     """
     f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
     is_repeated, n_equal = _equals_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]

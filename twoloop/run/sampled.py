@@ -1,4 +1,4 @@
-"""Integrate from sample to sample of a controller; parameters of forces may change at samples."""
+"""Integrate between the sampling times of a digital controller, at which parameters of forces may change."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
-MAX_ATTEMPTS = 1024  # number of attempted steps to the next sample, after which `IntegrationLoop` continues
-FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # callbacks that may depend on parameters that change at samples
-CHANGED_PARAMETERS = "the parameters changed at samples"  # value of the field `changes` of the result
+MAX_ATTEMPTS = 1024  # number of attempted integration steps after which `IntegrationLoop` takes over from `advance`
+FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # only these callbacks may depend on parameters that change
+CHANGED_PARAMETERS = "the parameters changed at samples"  # text in the field `changes` of all results of SampledRun
 
 
 class SampledState(NamedTuple):
-    """State at a sample: time t (s), q, v, a (n_q,) and lam (n_c + n_a,); the arrays are read-only.
+    """State at a sampling time t (s): q, v, a (n_q,), and multipliers lam (n_c + n_a,); the arrays are read-only.
 
     Examples
     --------
@@ -61,10 +61,10 @@ class SampledState(NamedTuple):
 
 
 class SampledRun:
-    """Integration from sample to sample, with parameters of the forces that may change at samples.
+    """Integrate step by step between sampling times; the parameters of forces may change at these times.
 
-    `set_parameters` changes the parameters of `system`, so nothing else may use this object. Raise TypeError or
-    ValueError if the start is refused, or the method is a Taylor series, whose code is valid for fixed parameters only.
+    `set_parameters` overwrites parameters of `system`, so `system` must not be used elsewhere. Raise TypeError or
+    ValueError if the start is invalid; also if the method is Taylor or Lobatto16: their code needs fixed parameters.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class SampledRun:
         if self.run.start_warning:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
-        self._force_parameters: set[int] = set()  # indices of parameters that were found to affect forces only
+        self._force_parameters: set[int] = set()  # indices of parameters that affect forces only, as checks have shown
         self._parameters_changed = self._step_failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = (
@@ -108,11 +108,11 @@ class SampledRun:
             np.empty((MAX_ATTEMPTS, self.run.a.N_STEP_COLUMNS)),
         )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); longest allowed time between evaluations (s)
+        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); upper limit (s) of the spacing of force samples
         self._store_sample(t0)
 
     def _create_run(self, t: float, q: Array, v: Array) -> Run:
-        """Return a run that starts at a state; raise ValueError if the position is singular."""
+        """Return a run that starts at time t from (q, v); raise ValueError if q is a singular position."""
         run = Run(self._derived_system, self._plan.fresh(), t, q, v, *self._tolerances, None)
         allowed = self._tolerances[1] + self._tolerances[0] * np.abs(v).max()
         if run.fixed_order is None and branch_at(self._derived_system, t, run.state, run.rank, allowed) is not None:
@@ -121,18 +121,18 @@ class SampledRun:
                 f"have lost rank there ({dependent_rows(self._derived_system, t, q)}), but not beside it. Start a "
                 "little before that position, or beyond; run and solve_dae may start there"
             )
-        run.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
+        run.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels keep the known ranks
         run.set_step_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
 
     @property
     def t(self) -> float:
-        """Time of the last sample (s)."""
+        """Time (s) of the last stored state."""
         return self.times[-1]
 
     def set_parameters(self, inputs: Any) -> None:
-        """Change parameters; `inputs`: a mapping from indices to numbers, or an array of all parameters."""
+        """Set parameters of forces; `inputs`: a mapping from parameter indices to values, or an array of all values."""
         if not self.p.size:
             raise ValueError(f"inputs are parameters, of which {self.system.name!r} has none: make it with parameters=")
         if isinstance(inputs, Mapping):
@@ -156,7 +156,7 @@ class SampledRun:
             self._write_parameter(index, float(values[index]))
 
     def step(self, dt: float) -> SampledState:
-        """Integrate for a time dt (s) from the last sample; store the final state as a new sample, and return it."""
+        """Integrate for a time dt (s) from the last stored state; store the final state, and return it."""
         if self._step_failed:
             self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
@@ -168,12 +168,12 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate from the last sample to `end`; repeat this with more evaluations if short changes may be missed."""
+        """Integrate to time `end`; repeat with more force samples if short changes of forces may have been missed."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # warn: steps to earlier samples are not repeated, and may have missed changes
+            if len(self.times) > 1:  # earlier calls of `step` may have missed changes of forces, but are not repeated
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -181,10 +181,10 @@ class SampledRun:
         warn_of_missed_changes(self.run)
 
     def _integrate_to(self, end: float) -> None:
-        """Integrate from the last sample to the time `end`, without repetitions."""
+        """Integrate once from the last stored state to the time `end`."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
-        # Python functions may read global variables that have changed since the last sample
+        # a callback called in Python may read global variables that have changed since the last call of `step`
         if self._parameters_changed or self.system.called_in_python:
             self._restart(t)
         run.choose_first_step(self.t0, end, run.state, run.max_step)
@@ -200,7 +200,7 @@ class SampledRun:
 
     @property
     def state(self) -> SampledState:
-        """State at the last sample."""
+        """Last stored state."""
         row, n = self.rows[-1], self.run.system.n_q
         return SampledState(self.times[-1], row[:n], row[n : 2 * n], row[2 * n : 3 * n], row[3 * n :])
 
@@ -212,7 +212,7 @@ class SampledRun:
         self._n_steps, self._step_failed = len(self.steps), False
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields of a result that contains the states at all samples so far."""
+        """Return the fields of a `Result` with all stored states, one for each sampling time so far."""
         run, a = self.run, self.run.a
         steps = np.concatenate([np.empty((0, a.N_STEP_COLUMNS)), *self.steps[: self._n_steps]])
         fields: dict[str, Any] = {"h": steps[:, a.H], "untested": steps[:, a.JACOBIANS] > 0.0}
@@ -227,11 +227,11 @@ class SampledRun:
         return DEFAULTS | fields | {"widest_gap": float(run.work.notes[indices.WIDEST_GAP])}
 
     def _restart(self, t: float) -> None:
-        """Compute the accelerations at t with the new parameters, and restart the method without past steps."""
+        """Compute the accelerations at t with the new parameters; make the method forget all steps before t."""
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # a pair of methods: keep the part of `memory` that tells which one is active
+        if run.plan.first is not None:  # a pair of methods: keep the entries of `memory` that choose between the two
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q
@@ -245,7 +245,7 @@ class SampledRun:
         self._parameters_changed = False
 
     def _return_to_sample(self) -> None:
-        """Replace the run, which failed or has to be repeated, by a new run that starts from the last sample."""
+        """Replace the run, which failed or has to be repeated, by a new run from the last stored state."""
         old_run, n = self.run, self.system.n_q
         try:
             self.run = self._create_run(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
@@ -256,7 +256,7 @@ class SampledRun:
         self._parameters_changed = False
 
     def _finish_by_loop(self, end: float) -> None:
-        """Integrate to `end` by IntegrationLoop (after many steps, or at a jump); raise RuntimeError if that fails."""
+        """Let IntegrationLoop integrate to `end`: `advance` stopped earlier; raise RuntimeError if this fails."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
         interrupts = Interrupts().install_handlers()
@@ -279,7 +279,7 @@ class SampledRun:
         self._parameters_changed = True
 
     def _check_enters_forces_only(self, index: int, value: float) -> None:
-        """Raise ValueError if a parameter affects other callbacks than forces: the state would jump if it changed."""
+        """Raise ValueError if `value` for a parameter changes other callbacks than forces: the state would jump."""
         old_value, n = float(self.p[index]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         state = {"q": row[:n], "v": row[n : 2 * n]}

@@ -1,6 +1,6 @@
-"""Propagate the exceptions of a user's signal handlers unchanged, although signals arrive during machine code."""
+"""Pass on exceptions of the user's signal handlers unchanged, even if a signal arrives while machine code runs."""
 
-# module `signal` tries to convert each handler to an enum member, which takes 8 microseconds; `_signal` does not
+# `_signal` is faster than `signal`, whose functions take 8 microseconds to convert each handler to an enum member
 import _signal  # type: ignore[import-not-found]
 import signal
 import threading
@@ -12,7 +12,7 @@ from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.events import Event
 from twoloop.problem.system import ConstrainedSystem
 
-# code objects of the functions of twoloop that call functions of the user
+# code objects of the two functions of twoloop that call the user's callbacks and event functions
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
 COMPILERS = ("numba", "llvmlite")  # packages that break if an exception is raised between two of their instructions
 # signals whose handlers are replaced; not all of them exist on Windows
@@ -21,13 +21,13 @@ SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr
 
 
 class SignalHandlers:
-    """Replacement of the user's signal handlers: calls them at safe points, and raises their exceptions again.
+    """Replace the user's signal handlers; call the originals at safe points, so that their exceptions are not lost.
 
-    Python calls a handler before its next instruction, which may belong to numba. If the handler raises an exception,
-    this breaks numba for the rest of the process during compilation, and becomes a `SystemError` in Python code that
-    machine code called. So the call of a handler is delayed while a compiler runs. Elsewhere the handler is called at
-    once; `call_delayed` (between chunks of steps) and `restore` raise its exception again, if others have caught it.
-    `ctrl_c`: whether to replace Python's own handler of Ctrl-C, too, as `Interrupts` does during integrations.
+    Python may call a handler anywhere. An exception that a handler raises while numba compiles breaks numba for the
+    rest of the process. So, while a compiler runs, handlers are not called but recorded for later calls. Elsewhere a
+    handler is called at once. If machine code has called the Python function that runs then, the exception becomes a
+    `SystemError`. So `call_delayed`, called between chunks of steps, and `restore` raise the original exception again.
+    `ctrl_c`: True replaces Python's own handler of Ctrl-C, too, as `Interrupts` does during integrations.
     """
 
     def __init__(self, ctrl_c: bool = False) -> None:
@@ -38,7 +38,7 @@ class SignalHandlers:
             handler = _signal.getsignal(number)
             if callable(handler) and (ctrl_c or handler is not signal.default_int_handler):
                 if threading.current_thread() is not threading.main_thread():
-                    break  # other threads get no signals
+                    break  # Python calls signal handlers in the main thread only
                 self._user_handlers[number] = handler
                 _signal.signal(number, self._receive)
 
@@ -56,14 +56,14 @@ class SignalHandlers:
             raise
 
     def call_delayed(self) -> None:
-        """Call the delayed handlers; raise the exception of a handler, if there was one."""
+        """Call the handlers whose calls were delayed; if a handler has raised an exception, raise it again."""
         while self._delayed_calls and self._handler_error is None:
             self._call_handler(*self._delayed_calls.pop(0))
-        if self._handler_error is not None:  # kept for `restore`, because the caller may catch a KeyboardInterrupt
+        if self._handler_error is not None:  # not reset here: `restore` raises it again if the caller catches it
             raise self._handler_error from None
 
     def restore(self) -> None:
-        """Restore the user's handlers, unless the user has set other ones meanwhile; then call delayed handlers."""
+        """Restore the handlers that the user has not replaced meanwhile; then call `call_delayed`."""
         for number, handler in self._user_handlers.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)
@@ -74,17 +74,17 @@ class SignalHandlers:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if error is not None and error is self._handler_error:
-            self._handler_error = None  # `error` is this exception or replaces it: `restore` must not raise it again
+            self._handler_error = None  # `error` propagates anyway: `restore` must not raise it a second time
         self.restore()
 
 
 def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
-    """Return a context for machine code that may call functions of the system in Python, see `SignalHandlers`."""
+    """Return the context in which to run machine code: `SignalHandlers` if it calls Python callbacks, else none."""
     return SignalHandlers(ctrl_c=True) if system.called_in_python else nullcontext()
 
 
 def is_in_user_function(frame: FrameType | None) -> bool:
-    """Return whether a frame belongs to a call of a user's function by machine code or by the search for events."""
+    """Return True if a frame of the call stack is within a user's callback or event function."""
     while frame is not None:
         if frame.f_code in CALLERS_OF_USER_CODE:
             return True
@@ -93,7 +93,7 @@ def is_in_user_function(frame: FrameType | None) -> bool:
 
 
 def is_in_compiler(frame: FrameType | None) -> bool:
-    """Return whether a frame belongs to a running compiler, and not to a user's function that the compiler called."""
+    """Return True if a frame of the call stack is within numba or llvmlite, but not within a user's function there."""
     while frame is not None and frame.f_code not in CALLERS_OF_USER_CODE:
         if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
             return True
@@ -102,8 +102,8 @@ def is_in_compiler(frame: FrameType | None) -> bool:
 
 
 def raised_by_handler(error: BaseException) -> bool:
-    """Return whether an error was raised by a signal handler, according to its traceback."""
-    # a handler is a function, a method, a partial function, or an object with a method `__call__`
+    """Return True if the traceback of an error contains a signal handler, which therefore raised the error."""
+    # find the Python code of each handler: a function, a method, a partial function, or an object with `__call__`
     callables = [_signal.getsignal(number) for number in SIGNAL_NUMBERS]
     functions = [getattr(each, "__func__", getattr(each, "func", each)) for each in callables if callable(each)]
     codes = {getattr(each, "__code__", getattr(type(each).__call__, "__code__", None)) for each in functions} - {None}
@@ -114,7 +114,7 @@ def raised_by_handler(error: BaseException) -> bool:
 
 
 def is_keyboard_interrupt(error: BaseException) -> bool:
-    """Return whether an error, such as a `SystemError` of machine code, is or was caused by a KeyboardInterrupt."""
+    """Return True if an error is a KeyboardInterrupt, or has one in its chain of causes, as a `SystemError` may."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__

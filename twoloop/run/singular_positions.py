@@ -1,8 +1,9 @@
 """Describe singular positions: where steps crossed them, and how uncertain the motion is near them.
 
-Let s be the smallest singular value of the constraint Jacobian, and d its right singular vector. With rounding errors
-eps, the constraints determine q along d only to eps / s. This uncertainty of q changes the Jacobian, so that velocities
-along d have errors of about eps / s^2. "Rows" are the rows of the Jacobian, [C_q; A].
+"Rows" are the rows of the constraint Jacobian: C_q, then A of the non-holonomic constraints A v + b = 0. Let s be the
+smallest singular value of this matrix, and d the right singular vector of s. If constraints have rounding errors eps,
+they determine q along d only to eps / s. This uncertainty of q changes the rows, so that velocities along d have errors
+of about eps / s^2.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,26 +18,29 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 TimedState = tuple[float, Array]  # time and state [q, v, ...]
-Crossings = list[list[TimedState]]  # for each crossed singular position: the states before and after it
+# for each crossed singular position: the state before it and, if the crossing was completed, the state after it
+Crossings = list[list[TimedState]]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
-LOST_RANK_RATIO = 1e-2  # messages say that constraints lose rank if a ratio of singular values is smaller than this
-N_POSITIONS = 33  # number of positions between two states at which a ratio of singular values is evaluated
+# messages say that constraints lose rank if their Jacobian has a smaller ratio of smallest to largest singular value
+LOST_RANK_RATIO = 1e-2
+N_POSITIONS = 33  # number of positions between two states at which singular values of the Jacobian are computed
 MAX_SHOWN = 3  # largest number of singular positions in a message
-# displacement for finite differences (of gamma, and of the rows), relative to the largest coordinate
+# displacement of q in finite differences of constraint equations and their Jacobian, relative to the largest coordinate
 DISPLACEMENT = 1e-6
-# a row is divided by its norm, or by MIN_ROW_NORM times the norm expected from its derivative if this is larger
+# rows of the Jacobian are divided by their norms; a row that is small at this position only is divided by MIN_ROW_NORM
+# times its typical norm, which follows from its derivative
 MIN_ROW_NORM = 0.1
-# velocities have jumped if their change is larger than JUMP_RATIO times the change that accelerations explain, and
-# larger than MIN_JUMP times the tolerances
+# velocities count as discontinuous if they change in a step by more than JUMP_RATIO times the step size times the
+# acceleration, and by more than MIN_JUMP times the tolerances
 JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 
 
 def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int) -> str:
-    """Return sentences about the singular positions that steps crossed.
+    """Return sentences about the singular positions that steps crossed, for the message of a result.
 
     `crossings`: for each position the states before and after it. If the run ended before the crossing was complete,
-    its last state, `end_state`, replaces the missing state after the position.
+    the state after it is missing; then the last state of the run, `end_state`, replaces it. `rank`: rank of [C_q; A].
     """
     ratios = {
         ends[0][0]: _least_ratio_between(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]
@@ -59,17 +63,17 @@ def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_stat
 
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the `rank`-th largest singular value of the rows, relative to the largest one; 1 if there are no rows."""
+    """Return the `rank`-th largest singular value of the Jacobian [C_q; A] over the largest one; 1: no constraints."""
     return _singular_value_ratio(system.rows(t, q), rank)
 
 
 def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return `singular_ratio` for rows scaled by `scaled_to_unit_masses`, so that it does not depend on units."""
+    """Return `singular_ratio` of the scaled Jacobian (see `scaled_to_unit_masses`), which does not depend on units."""
     return _singular_value_ratio(scaled_to_unit_masses(system, t, q)[1], rank)
 
 
 def _singular_value_ratio(rows: Array, rank: int) -> float:
-    """Return the `rank`-th largest singular value, relative to the largest one; 1 if there are no rows."""
+    """Return the `rank`-th largest singular value of a matrix, relative to the largest one; 1 if it has no rows."""
     values = np.linalg.svd(rows, compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
@@ -77,7 +81,7 @@ def _singular_value_ratio(rows: Array, rank: int) -> float:
 def _least_ratio_between(
     system: ConstrainedSystem, before: TimedState, after: TimedState, rank: int, ratio: Ratio = singular_ratio
 ) -> float:
-    """Return the smallest value of `ratio` at N_POSITIONS positions of a cubic interpolation between two states."""
+    """Return the least value of the function `ratio` at N_POSITIONS positions, interpolated between two states."""
     n, (t0, first), (t1, last) = system.n_q, before, after
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
@@ -90,9 +94,10 @@ def _least_ratio_between(
 def describe_velocity_jump(
     system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int, rtol: float, atol: Array
 ) -> str:
-    """Describe where velocities changed by more than accelerations explain; return "" if they did not.
+    """Return a message about the first singular position where velocities jumped, "" if they did nowhere.
 
-    There, other branches of the motion are within the tolerances, and the steps may have switched to one of them.
+    A jump is a change larger than accelerations explain. Near such a position the tolerances do not distinguish the
+    branches of the motion, and steps may have switched to another branch.
     """
     n = system.n_q
     of_q, of_v = slice(n), slice(n, 2 * n)
@@ -105,7 +110,7 @@ def describe_velocity_jump(
         threshold = (
             min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / largest_q)) if largest_q > 0.0 else LOST_RANK_RATIO
         )
-        # the run's own steps across the position may have left the branch: use the ratio at the last state only
+        # ordinary steps (`across` False) may have switched branches: then no interpolation between the states is valid
         here, there = (t0, first), (t1, last)
         ratio = _least_ratio_between(system, here if across else there, there, rank, unit_free_ratio)
         if ratio >= threshold:
@@ -126,8 +131,8 @@ def describe_velocity_jump(
 
 
 def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
-    """Return whether velocities changed in the last step by more than accelerations explain; `rows`: [q, v, a]."""
-    largest = np.maximum.reduce  # array.max() makes three calls, which would slow down short repeated runs
+    """Return True if v jumped in the last step, see JUMP_RATIO; `rows`: states [q, v, a] at `times`; n: size of q."""
+    largest = np.maximum.reduce  # faster than array.max(), because short runs call this function often
     if times.size < 2:
         return False
     change = largest(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
@@ -136,7 +141,7 @@ def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
 
 
 def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
-    """Yield, for each crossed singular position, the states before and after, and whether crossing steps were taken."""
+    """Yield the states before and after a singular position, and True for crossing steps, False for ordinary ones."""
     before: TimedState | None = None
     for first, *after in crossings:
         before = first if before is None else before
@@ -148,7 +153,7 @@ def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tupl
 
 
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
-    """Return max|a_j|, computed without singular values of the rows below `min_ratio` times the largest one."""
+    """Return max|a_j| without the constraints whose singular value is below `min_ratio` times the largest one."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     is_kept = values > min_ratio * values[0]
@@ -161,9 +166,10 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return M scaled to unit masses, the rows scaled to unit norms, divisors of the rows, and units of coordinates.
+    """Return the scaled M, the scaled constraint Jacobian [C_q; A], divisors of its rows, and units of coordinates.
 
-    The divisor of a row is its norm, or at least MIN_ROW_NORM times the norm expected from its derivative.
+    The units of coordinates make the diagonal entries of M 1, and the divisors give rows the norm 1. If a row is small
+    at this position only, its divisor is larger, see MIN_ROW_NORM.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
@@ -190,22 +196,22 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-# rounding errors are estimated along singular vectors with singular values up to this fraction of the largest one
+# rounding errors of velocities are estimated only if a singular value is at most this fraction of the largest one
 WEAK_RATIO = 1e-2
-# rounding errors are always estimated if the ratio of the smallest pivot to the largest is below SMALL_PIVOT. The ratio
-# is typically PIVOT_FACTOR times the ratio of singular values
+# rounding errors of velocities are estimated, whatever the tolerances, if the smallest pivot of the Jacobian over the
+# largest is below SMALL_PIVOT. This ratio of pivots is typically PIVOT_FACTOR times the ratio of singular values
 SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return a limit of smallest pivot / largest pivot: below it, rounding may change velocities by more than rtol."""
+    """Return the ratio of smallest to largest pivot below which rounding may change v by REPORTED_ERROR times rtol."""
     return min(
         WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
     )
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
-    """Return estimated errors (n_q,) of velocities caused by rounding of positions; NaN if callbacks fail near q."""
+    """Estimate the errors (n_q,) of velocities due to rounding of positions; return NaN if callbacks fail near q."""
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
@@ -221,7 +227,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # a row may be small at this position only: rounding errors of the constraints follow from rows nearby
+        # entries of the Jacobian, to which rounding errors of constraints are proportional, may be small here by chance
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(
@@ -231,7 +237,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
-    """Return a warning for a start that the tolerances do not distinguish from a singular position, else ""."""
+    """Return a warning if the start q is, within the tolerances, a singular position, else ""; `rank`: of [C_q; A]."""
     if rank == 0 or certainly_exceed(WEAK_RATIO, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)
@@ -249,9 +255,10 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
 
 
 def _displacement_to_singular_position(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
-    """Return an estimated displacement (n_q,) to the nearest singular position, to first order; not finite if unknown.
+    """Estimate the displacement (n_q,) from q to the nearest singular position; return NaN or infinity if unknown.
 
-    It points where the smallest singular value changes most, among the directions that the other constraints allow.
+    It is a Newton step towards a zero of the smallest singular value of the Jacobian. Its direction is the gradient of
+    this value, without components along the other right singular vectors, which would violate constraints.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, other_directions = left[:, rank - 1], right[rank - 1], right[: rank - 1]

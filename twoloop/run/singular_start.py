@@ -1,12 +1,12 @@
 """Start in a singular position, where C_q loses rank, if the velocities there belong to one branch of the motion only.
 
-Let u be the vectors with u^T C_q = 0 at the start. Along the motion, u^T (C_q v + C_t) has a zero first derivative if v
-belongs to a branch; its second derivative determines the accelerations, in addition to C_q a = gamma:
+There, C_q a = gamma does not contain all conditions on the accelerations a. Let u be the vectors with u^T C_q = 0.
+Along a motion, C_q v + C_t stays zero; u^T times its second derivative yields the missing equations
 
-    3 u^T (dC_q/dt) a = -u^T d^2/dt^2 (C_q v + C_t), with constant velocities on the right.
+    3 u^T (dC_q/dt) a = -u^T d^2/dt^2 (C_q v + C_t), with constant velocities v on the right-hand side.
 
-If the rows u^T dC_q/dt raise the rank to the rank beside the position, this branch is the only one with velocities v.
-Constraint forces may act along these rows, too: then the multipliers grow without limit towards the position.
+If C_q and the rows u^T dC_q/dt together have the rank that C_q has beside the start, only one branch of the motion has
+the velocities v. Constraint forces may act along these rows, too: then multipliers tend to infinity at the start.
 """
 
 from typing import NamedTuple
@@ -21,28 +21,31 @@ from twoloop.run.singular_positions import DISPLACEMENT, scaled_to_unit_masses
 
 Array = NDArray[np.float64]
 
-CHANGE_PER_SAMPLE = 3e-3  # relative change of the rows of C_q between two samples of a finite difference
-# finite differences: weights of five samples, at a spacing of 1, in the first and the second derivative
+CHANGE_PER_SAMPLE = 3e-3  # relative change of C_q between two successive samples of a finite difference in time
+# weights of five samples, one unit of time apart, in finite differences for the first (row 0) and second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# assumed relative error of derivatives by finite differences; smaller derivatives, relative to the rows, count as 0
+# assumed relative error of finite differences: a derivative of C_q below this fraction of C_q counts as 0
 MAX_DIFFERENCE_ERROR = 1e-8
-# the rank of C_q rises if the derivative of a zero singular value exceeds this, relative to the derivative of C_q
+# at the start, some singular values of C_q are zero. The rank of C_q rises along the motion if the time derivative of
+# such a singular value, divided by the norm of dC_q/dt, exceeds this
 MIN_RANK_DERIVATIVE = 1e-6
-# the derivative of a zero singular value counts as nonzero if it exceeds this multiple of its uncertainty, which is the
-# norm of the derivative of the rows along a velocity as large as the tolerances
+# the derivative of a singular value that is zero at the start is certainly nonzero if it exceeds MIN_CLARITY times its
+# uncertainty: the norm of dC_q/dt for a velocity as large as the tolerances
 MIN_CLARITY = 10.0
-# relative change of the rows of C_q from the start to a state beside it, and in the first step that is tried
+# BESIDE_CHANGE: relative change of C_q from the singular start to the nearby state from which the run starts;
+# STEP_CHANGE: relative change of C_q in the first step
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
-# N_BESIDE states beside the start are tried; one is accepted if projecting it onto the constraints moves it by at most
-# MAX_CORRECTION times its displacement from the start
+# up to N_BESIDE states near the singular start are tried, each half as far away as the one before; one is accepted if
+# its projection onto the constraints moves it by at most MAX_CORRECTION times its distance from the start
 N_BESIDE, MAX_CORRECTION = 6, 0.2
-MAX_RESIDUAL = 1e-6  # largest residual of the equations for the accelerations, relative to the right-hand side
+MAX_RESIDUAL = 1e-6  # largest residual allowed in the equations for the accelerations, relative to the right-hand side
 
 
 class Branch(NamedTuple):
-    """Branch of the motion through a singular position: accelerations there, and a nearby state on the branch.
+    """Branch of the motion through a singular position.
 
-    `rank`: rank of C_q near the position, on the branch. `first_size`: first step size (s) to try.
+    `a`: accelerations (n_q,) there. `q`, `v`: a nearby state on the branch; `rank`: rank of C_q at this state.
+    `first_size`: first step size (s) to try.
     """
 
     a: Array
@@ -53,10 +56,11 @@ class Branch(NamedTuple):
 
 
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
-    """Find the branch of the motion through a state [q, v, a] at which C_q has the rank `rank`.
+    """Return the branch of the motion through the singular position of `state` = [q, v, a]; `rank`: rank of C_q there.
 
-    Return None if the rank does not rise along the motion: then the position is not singular, or the motion stays in
-    it. Return False if the rank rises, but another branch has velocities within the tolerances `allowed` (n_q,) of v.
+    Return None if no rise of the rank along the motion is found: q is not singular, or the motion stays in singular
+    positions, or C depends on t, or n_a > 0. Return False if the branch is not certain: another one may have velocities
+    closer to v than the tolerances `allowed` (n_q,), or no state on the branch was found.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None
@@ -67,14 +71,14 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
 
 
 def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
-    """Return the result of `branch_at`, or raise the exception of a callback."""
+    """Return what `branch_at` returns; do not catch exceptions of callbacks."""
     q, v, a = np.split(state[: 3 * system.n_q], 3)
     direction = v if v.any() else a
     if not direction.any():
         return None
     mass, rows, divisors, units = scaled_to_unit_masses(system, t, q)
     left, _, right = np.linalg.svd(rows)
-    lost, free = left[:, rank:].T, right[rank:].T  # rows u^T with u^T C_q = 0; columns: null space of C_q
+    lost, free = left[:, rank:].T, right[rank:].T  # lost: rows u^T with u^T C_q = 0; free: columns x with C_q x = 0
 
     def derivative_of_rows(direction: Array, step: float) -> Array:
         samples = [system.rows(t, q + s * direction) * units for s in step * np.array([-2.0, -1.0, 1.0, 2.0])]
@@ -86,15 +90,15 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
     norm = float(np.linalg.norm(rows))
     step = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(direction).max()
-    speed = float(np.linalg.norm(derivative_of_rows(direction, step))) / norm  # relative rate of change of C_q, 1/s
+    speed = float(np.linalg.norm(derivative_of_rows(direction, step))) / norm  # |dC_q/dt| / |C_q|, 1/s
     if not step * speed > MAX_DIFFERENCE_ERROR * DISPLACEMENT:
         return None
     step = CHANGE_PER_SAMPLE / speed
     added_rows = lost @ derivative_of_rows(direction, step) / speed
-    slopes = np.linalg.svd(added_rows @ free, compute_uv=False)  # derivatives of zero singular values
+    slopes = np.linalg.svd(added_rows @ free, compute_uv=False)  # derivatives of the singular values that are zero
     if slopes.max() <= MIN_RANK_DERIVATIVE * norm:
         return None
-    distance = step * float(np.abs(direction).max())  # largest displacement of a finite difference
+    distance = step * float(np.abs(direction).max())  # largest change of a coordinate between two samples
     uncertainty = np.linalg.norm(derivative_of_rows(allowed * signs(len(q)), distance / float(allowed.max())))
     is_certain = slopes > max(MIN_CLARITY * float(uncertainty) / speed, MIN_RANK_DERIVATIVE * norm)
     if not v.any() or slopes[~is_certain].max(initial=0.0) > MIN_RANK_DERIVATIVE * norm:
@@ -109,7 +113,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
     force = null_space.T @ (units * system.force(t, q, v) - mass @ a)
     a += null_space @ np.linalg.solve(null_space.T @ mass @ null_space, force)
     a *= units
-    acceleration = 0.0  # second derivative of C_q along the motion, relative to its norm, 1/s^2
+    acceleration = 0.0  # part of d^2 C_q/dt^2 due to a, divided by the norm of C_q, 1/s^2
     if a.any():
         acceleration = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / norm
     for change in BESIDE_CHANGE * 0.5 ** np.arange(N_BESIDE):
@@ -125,5 +129,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time (s) in which rows change by `change`, given their relative rates `speed` and `acceleration`."""
+    """Return the time (s) of a relative change of C_q, given its relative first and second time derivative."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

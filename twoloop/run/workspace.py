@@ -40,9 +40,10 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# to find which forces depend on a coordinate or velocity x, x is displaced by this fraction of max(1, |x|)
+# to find out which forces depend on a coordinate or velocity x, x is changed by this fraction of max(1, |x|)
 DISPLACEMENT = 1e-3
-# Newton's matrix gets sparse factors if its entries and operations are at most this fraction of those of dense factors
+# the matrix of Newton's method in implicit steps is factorized as a sparse matrix if at most this fraction of entries
+# is nonzero, and if this takes at most this fraction of the operations that a dense matrix takes
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -55,10 +56,11 @@ def newton_form(
     bodies: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Return the program that factorizes Newton's matrix (see sparse_lu.py), and the number of groups of its columns.
+    """Return the program that factorizes the matrix of Newton's method (sparse_lu.py), and the number of column groups.
 
-    One finite difference of forces yields all columns of a group, which have no common row. `mass`, `jacobian`: indices
-    of nonzero entries. `bodies`: coordinates of each body. `stiff`: see `_stiff_rows`. None: sparse factors do not pay.
+    Columns of a group have no nonzero entries in the same row, so that one finite difference of forces yields them all.
+    `mass`, `jacobian`: indices of nonzero entries of M and C_q. `bodies`: coordinates of each body. `stiff`: result of
+    `_stiff_rows`. Return None if sparse factors would not be much faster than dense ones.
     """
     entries: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
@@ -68,7 +70,7 @@ def newton_form(
         q = q0 + scale * magnitude * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
-        except Exception:  # callbacks are not defined at q; entries that are missed here are found during the run
+        except Exception:  # callbacks fail at q: skip it; a run finds the entries missed here later
             continue
         if len(entries) > max_entries:
             return None
@@ -83,9 +85,9 @@ def newton_form(
 def _derivative_entries(
     system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, max_entries: float
 ) -> set[tuple[int, int]]:
-    """Return the indices of nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and of their transposes.
+    """Return the indices (i, j) of entries that are nonzero in d(Q - C_q^T lam)/dq or dQ/dv, or in their transposes.
 
-    The search goes column by column, and stops when the count of entries exceeds `max_entries`.
+    Find them column by column; stop once they are more than `max_entries`.
     """
 
     def reaction(q: Array) -> Array:
@@ -109,35 +111,37 @@ def _derivative_entries(
     return entries
 
 
-# a body has no mass along an eigenvector of its block of M if the eigenvalue is at most this fraction of the largest
+# an eigenvector of a body's diagonal block of M counts as massless if its eigenvalue is at most this fraction of the
+# block's largest eigenvalue
 MASSLESS_RATIO = 1e-10
-# a row g may be added (as g g^T) to a singular M if its component along massless directions is at least this fraction
+# if M is singular, g g^T may be added to M for a row g of C_q whose component along massless directions is longer than
+# this fraction of g
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # Newton's matrix may get sparse factors if n_q is at least this multiple of LARGE (callbacks.py)
-MAX_SHARE = 0.05  # sparse factors pay if their entries and operations are at most this fraction of those of dense ones
+MIN_SIZE_NEWTON = 1.6  # n_q / LARGE above which the matrix of Newton's method may be factorized as a sparse matrix
+MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they take at most this fraction of the dense operations
 
 
 class FixedOrderForm(NamedTuple):
-    """Sparse factorization of a large system, in an order of elimination chosen once, and data for its workspaces."""
+    """Program that factorizes a large sparse system in an order of elimination chosen once; data for workspaces."""
 
     program: NDArray[np.int32]
     sizes: FixedOrderSizes  # sizes of the arrays in its workspaces
     mass: Entries  # row and column indices of the nonzero entries of M
-    # (n_c, n_q), 1 where C_q may be nonzero, else 0; (0, n_q) if a callback computes only the entries of C_q
+    # (n_c, n_q), 1 where C_q may be nonzero, else 0; shape (0, n_q) if callback `jacobian_values` gives nonzero entries
     pattern: Array
-    # (n_q, n_q), 1 where M may be nonzero, else 0; (0, 0) if M is constant, or if a callback computes only its entries
+    # (n_q, n_q), 1 where M may be nonzero, else 0; shape (0, 0) if M is constant or `mass_values` gives its entries
     mass_pattern: Array
-    newton_arguments: tuple[Any, ...]  # arguments of `newton_form` that follow t0 and q0
-    newton_program: NDArray[np.int32] | None = None  # factorizes Newton's matrix; None until a plan needs it
-    n_groups: int = 0  # number of groups of columns of Newton's matrix; one finite difference of forces yields a group
+    newton_arguments: tuple[Any, ...]  # arguments `mass`, `jacobian`, `bodies`, `stiff` of `newton_form`
+    newton_program: NDArray[np.int32] | None = None  # for the matrix of Newton's method; None: not yet needed
+    n_groups: int = 0  # number of column groups of this matrix, see `newton_form`: finite differences of forces for it
 
     def matrix_cost(self) -> float:
-        """Return the estimated cost of Newton's matrix and its factors, in units of one evaluation of accelerations."""
+        """Return the estimated cost of Newton's matrix with its factors; unit: one evaluation of accelerations."""
         assert self.newton_program is not None
         return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def newton_matrices_size(self, matrices: int) -> int:
-        """Return the number of floats in the sparse matrices that replace a plan's `matrices` dense Newton matrices."""
+        """Return the number of floats of the sparse matrices that replace `matrices` dense matrices of a plan."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -148,7 +152,7 @@ class FixedOrderForm(NamedTuple):
 
 
 def fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> FixedOrderForm | None:
-    """Return the fixed-order form of a system for runs with `plans`; None if a plan cannot use it or it is slower."""
+    """Return the fixed-order form of a system for `plans`; None if a plan cannot use it, or if it would be slower."""
     if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
         return None
     has_gamma = "gamma" in system.given or system.functions.gamma_program.size > 0
@@ -163,7 +167,7 @@ def fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Pl
 
 
 def add_newton_program(system: ConstrainedSystem, t0: float, q0: Array, form: FixedOrderForm) -> FixedOrderForm | None:
-    """Return a copy of `form` with the program of Newton's matrix; None if sparse factors of this matrix do not pay."""
+    """Return a copy of `form` with the program for Newton's matrix; None if dense factors of this matrix are faster."""
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
     cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
@@ -190,7 +194,7 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
     bodies = _coordinates_of_bodies(system, mass)
     stiff_rows = _stiff_rows(system, t0, q0, mass, jacobian, bodies)
     program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff_rows)
-    # approximate number of multiplications that one evaluation takes with a dense Schur complement
+    # approximate number of multiplications in one evaluation of accelerations with dense matrices
     dense_cost = 0.5 * system.n_c * system.n_c * (system.n_q + system.n_c / 3.0)
     if program is None or program[N_UPDATES] > MAX_SHARE * dense_cost:
         return None
@@ -200,9 +204,10 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body that `system.joints` name; of all bodies, if each has seven coordinates.
+    """Return the coordinates of each body, as far as `system.joints` names them.
 
-    A joint in this list names only one of its two bodies: bodies at the ends of chains may be missing in the list.
+    A joint names one of its two bodies, so that bodies at the ends of chains may be missing. None is missing if all
+    bodies have seven coordinates in a row (position and Euler parameters).
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - body[0] for j in body) for body in coordinates_by_joint}
@@ -216,10 +221,10 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, bodies: list[tuple[int, ...]]
 ) -> list[int]:
-    """Return the indices of rows g of C_q to add to a singular M, as g g^T, so that no direction stays without mass.
+    """Return the indices of rows g of C_q for which g g^T is added to a singular M to make it invertible.
 
-    See sparse_ldl.py. Such a row belongs to one body (the norm of its Euler parameters, for example), and g g^T has
-    entries only where M has. No more rows than necessary are returned; other rows are treated like rows of joints.
+    See sparse_ldl.py. Only rows that concern one body, such as the norm of its Euler parameters, may be chosen: where M
+    is zero, g g^T must be zero, too. No more rows than necessary are chosen.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, bodies))
@@ -254,7 +259,7 @@ def _stiff_rows(
 
 
 def _massless_directions(block: Array) -> Array:
-    """Return the eigenvectors, as rows, along which a body has no mass; `block`: the body's diagonal block of M."""
+    """Return, as rows, the massless eigenvectors of a body's diagonal block of M; unit vectors if it is not finite."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)
@@ -262,7 +267,7 @@ def _massless_directions(block: Array) -> Array:
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
-    """Return whether a matrix has so few entries that it pays to search for an order of elimination."""
+    """Return True if a matrix has so few nonzero entries that sparse factors may be faster than dense ones."""
     return n_entries <= MAX_SHARE * n_q * n_q + 24 * n_q
 
 
@@ -272,21 +277,21 @@ def _nonzero_entries(pattern: Array) -> Entries:
 
 
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return a matrix with 1 at the entries of M that are nonzero at q0 (or, if M varies, at a nearby position)."""
+    """Return a matrix with 1 where M is nonzero at one of several positions near q0, else 0."""
     pattern = np.zeros((system.n_q, system.n_q))
     magnitudes = np.maximum(np.abs(q0), np.abs(q0).max())
     directions = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
     for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
             mass = system.mass(t0, q0 + scale * magnitudes * direction)
-        except Exception:  # callbacks are not defined at q; entries that are missed here are found during the run
+        except Exception:  # callbacks fail at this position: skip it; a run finds the entries missed here later
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return pattern
 
 
-GAMMA_ACCURACY = 1e-11  # smallest relative error that can be required of a gamma by differences of C_q and C_t
-MAX_KITS = 16  # largest number of kits in the cache of a system
+GAMMA_ACCURACY = 1e-11  # smallest relative error that finite differences of C_q and C_t can achieve for gamma
+MAX_KITS = 16  # largest number of kits in a system's cache; the oldest kit is removed first
 
 
 def make_kit(
@@ -313,7 +318,7 @@ def _make_fixed_order_kit(system: ConstrainedSystem, plan: Plan | None, form: Fi
 
 
 def _flags_for_start(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return the flags that choose the linear algebra for a start at q0; the cached array must not be changed."""
+    """Return the flags that choose the linear algebra for runs from q0; the caller must not change this array."""
     definite = has_definite_mass(system, t0, q0)
     key = ("flags", system.functions.flags.tobytes(), definite)
     flags, sparse = system.remembered(key, lambda: _dense_flags(system, t0, q0, definite))
@@ -327,7 +332,7 @@ def _flags_for_start(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
 
 
 def _dense_flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
-    """Return new flags that choose dense or banded algebra, and whether sparse factors would be faster."""
+    """Return new flags that choose dense or banded linear algebra, and True if sparse factors would be faster."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
         flags[DIAGONAL_MASS] = is_diagonal(system.mass(t0, q0))
@@ -341,7 +346,7 @@ def _dense_flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
-    """Return whether sparse factors would be faster than dense ones, if M is definite on the allowed velocities."""
+    """Return True if sparse factors would be faster than dense ones. They need an M definite on allowed velocities."""
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
@@ -351,11 +356,11 @@ def is_diagonal(mass: Array) -> bool:
 
 
 def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> Kit:
-    """Return the kit with these flags and the steps of a plan from the system's cache, to which a new kit is added."""
+    """Return the kit with given flags and the step functions of a plan from the system's cache, or a new kit."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
-    # ids are safe keys here: a cached kit keeps the objects alive, so that no other object gets their ids
+    # `id` is a safe key here: cached kits refer to these objects, so that no other object can have the same id
     key: tuple[Any, ...] = id(system.functions), flags.tobytes()
     if plan is not None:
         key += (plan.inner, plan.step, plan.first, plan.second, len(LOADED_STEPS))
@@ -372,17 +377,17 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
         if len(kits) == MAX_KITS:
             del kits[next(iter(kits))]
         entry = kits[key] = Kit(functions, inner, *steps), system.functions
-    # a run in the augmented form may change its flags, and gets a copy of them
+    # a run in the augmented form may change the flags of its kit: give it a copy, not the cached kit
     return _copy_with_flags(entry[0]) if flags[FORM] == AUGMENTED else entry[0]
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return a plan's step, and the two steps of a pair of methods; the second one only if it is already loaded."""
+    """Return the step function of a plan, and both of a pair of methods (the second one only if already loaded)."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 
 def _copy_with_flags(kit: Kit) -> Kit:
-    """Return a copy of a kit whose flags a run may change; to make a new kit would take ten times as long."""
+    """Return a copy of a kit with its own flags, which a run may change; a new kit would take ten times as long."""
     new_kit, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.offsets["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
@@ -401,9 +406,11 @@ def workspace(
     form: FixedOrderForm | None = None,
     matrices: int = 0,
 ) -> common.Work:
-    """Return a new workspace for a run from q0; `ranks`: ranks of C_q and of [C_q; A], None for full ranks.
+    """Return a new workspace for a run from q0.
 
-    `pattern`: 1 where [C_q; A] may be nonzero, else 0. `matrices`: number of dense matrices that the plan needs.
+    `pattern`: 1 where the constraint Jacobian (C_q, then A of non-holonomic constraints) may be nonzero, else 0.
+    `ranks`: rank of C_q, and rank of the whole Jacobian; None: full rank. `matrices`: number of n_q x n_q matrices that
+    the plan needs. `reuse`: see REUSE in data/indices.py.
     """
     flags = kit.flags
     uses_null_space, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
@@ -428,10 +435,10 @@ def prepare_workspace(
     reuse: float,
     form: FixedOrderForm | None = None,
 ) -> common.Work:
-    """Reset a workspace, which another run may have used, for a run from q0; return the workspace."""
+    """Reset a workspace for a run from q0, as another run may have used it; return the workspace."""
     arrays = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting_arrays(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
-    if form is not None:  # in the fixed-order form, these arrays stay constant during a run
+    if form is not None:  # kernels of the fixed-order form never change these arrays
         work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
         work.dependent[:] = work.independent[:] = np.arange(system.n_q)
         work.is_independent[:] = 1.0

@@ -1,24 +1,25 @@
 """Detect sudden changes of forces, C_t and b ahead of a step, such as gusts, blows and switches.
 
-A step evaluates the equations at its stages only, and may miss a force that acts between two stages. So forces, C_t and
-b are sampled ahead of the step (`f`: kit, `w`: workspace), which costs less than evaluations of the equations.
+C_t is the time derivative of the constraints C; b belongs to non-holonomic constraints A v + b = 0. A step evaluates
+the equations at its stages only, and may miss a force that acts between two stages. So forces, C_t and b are sampled
+ahead of the step (`f`: kit, `w`: workspace), which costs less than evaluations of the equations.
 
-- A force, C_t or b is smooth if the second differences of its samples are small relative to the range of the samples
-  (after the straight line from the first to the last sample is subtracted). A change within one or two samples makes
-  second differences as large as the range. The step then ends at the change; also where a value is not finite.
-- If forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples
-  follow the motion, on a parabola with the present position, velocity and acceleration. One set of samples is taken for
-  one long step, or for all short steps that end within MIN_TIME_AHEAD spacings.
-- All other samples are taken at a fixed state, the state where the step begins. Their spacing is also limited to a
+- First, the straight line from the first to the last sample is subtracted. A force, C_t or b is smooth if the second
+  differences of its samples are then small relative to the range of the samples. A change within one or two samples
+  makes second differences as large as the range. The step must end at such a change, or where a value is not finite.
+- If forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples are
+  taken along the motion, extrapolated by a parabola from the present position, velocity and acceleration. One set of
+  samples serves one long step, or all short steps that end within MIN_TIME_AHEAD spacings.
+- All other samples are taken with q and v fixed, as they are where the step begins. Their spacing is also limited to a
   fraction of the step size.
 - The shortest time between two changes, and the shortest duration of a change within a short step, are recorded. If the
   spacing of samples is not much smaller than this, other changes as short may have been missed: a message says so.
 
 A jump of C_t or b, for example at the end of a ramp in a drive, changes velocities as an impulse does. Methods that
-restore the dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So if
-velocities change in a step by more than accelerations explain, C_t and b are sampled at thirteen times in the step. The
-twelfth difference of these samples is almost zero if C_t and b are smooth on the scale of the step, and falls by 2^12
-when the interval is halved. If C_t or b jumps, the difference stays as large as the jump in one half of the interval.
+correct only dependent velocities after the jump would violate the balance of momentum. So, if velocities change in a
+step by more than accelerations explain, C_t and b are sampled at thirteen times in the step. If they are smooth on the
+scale of the step, the twelfth difference of these samples is almost zero, and falls by 2^12 if the interval is halved.
+If C_t or b jumps, the difference is as large as the jump, also in that half of the interval that contains the jump.
 """
 
 import numpy as np
@@ -31,33 +32,33 @@ from twoloop.kernels.evaluation.constraints import constraint_rates, representab
 from twoloop.kernels.linalg.dense import largest_of
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
-N_PARTS = 12  # number of equal parts into which an interval is divided; C_t and b are sampled at the ends of the parts
-# coefficients of the twelfth difference
+N_PARTS = 12  # C_t and b are sampled at the ends of this number of equal parts of an interval
+# coefficients of the thirteen samples in the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
-RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
-TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, divided by np.spacing(t) and the mean slope
-STEEPNESS = 4.0  # a part of a step is a ramp if the slope of C_t or b there exceeds this multiple of the mean slope
-MAX_RAMP_SHARE = 0.125  # a step has to end at a ramp if the ramp takes at most this fraction of the step
-MIN_SPACINGS = 8.0  # bisection ends at an interval of this length, in spacings of floating-point numbers
+RATE_ROUNDING = 1e-11  # error of the twelfth difference due to rounding of samples, over the largest sample of C_t or b
+TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, over np.spacing(t) times the mean slope
+STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this number of times steeper there than in the whole step
+MAX_RAMP_SHARE = 0.125  # a step must end at a ramp of C_t or b that takes at most this fraction of the step
+MIN_SPACINGS = 8.0  # bisection ends at an interval of this number of spacings of floating-point numbers
 SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in an interval
 
 
 @compiled
 def _sample_rates(f, w, t, q, velocity, begin, end):
-    """Store C_t and b at thirteen times from `begin` to `end`, at the positions q + velocity (time - t), in w.rates."""
+    """Store C_t and b (of A v + b = 0) at 13 times from `begin` to `end`, at q + velocity (time - t), in w.rates."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * velocity[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
-        if not finite_vector(w.rates[k]):  # such as the derivative of |t| at 0: sample at the next floating-point time
+        if not finite_vector(w.rates[k]):  # such as d|t|/dt at t = 0: take the next floating-point time
             constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
 
 
 @compiled
 def _twelfth_difference(w, row):
-    """Return the absolute value of the twelfth difference of the samples w.rates[:, row]."""
+    """Return |twelfth difference| of component `row` of (C_t, b), from its samples w.rates[:, row]."""
     total = 0.0
     for k in range(N_PARTS + 1):
         total += BINOMIAL[k] * w.rates[k, row]
@@ -66,7 +67,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean absolute slope (per s) and the largest |value| of w.rates[:, row], sampled over `length` s."""
+    """Return the mean |slope| (per s) and the largest |value| of the samples w.rates[:, row], taken over `length` s."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -77,7 +78,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the error of (G x)[row] that the tolerances of x (n_q) allow: the largest |G[row, j]| tolerance[j]."""
+    """Return the allowed error of (G x)[row]: the largest |G[row, j]| tolerance[j] over all j; G: C_q, then A."""
     largest = 0.0
     if f.form == FIXED_ORDER:
         rows, columns, _ = jacobian_entries_of(f.ldl_program)
@@ -94,7 +95,7 @@ def _allowed_error(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest difference, in tolerances, between a velocity change and h times the mean acceleration."""
+    """Return the largest difference, in tolerances, between a change of velocity and h times the mean acceleration."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -105,11 +106,11 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 @compiled
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
-    """Return SMOOTH, RAMP or JUMP for the least smooth row of C_t and b from t to `end`, and two times (s).
+    """Return SMOOTH, RAMP or JUMP for the least smooth component of (C_t, b) from t to `end`, and two times (s).
 
-    The times are the ends of the jump or ramp, or t and `end` if the row is smooth. If a ramp fills the step, they are
-    the ends of its first half: accelerations may be zero at both ends of a ramp, so that a method that evaluates only
-    there would miss it. (q, v) is the state at t; positions are extrapolated by `velocity`.
+    The times are the ends of the jump or ramp; t and `end` if all is smooth. If a ramp fills the step, they are the
+    ends of the first half of the step: a method that evaluates accelerations only at the ends of a ramp, where they may
+    be zero, would miss the ramp. (q, v): state at t. C_t and b are sampled at positions q + velocity (time - t).
     """
     begin = t
     h = end - t
@@ -117,7 +118,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     row, limit, mean, largest = -1, 0.0, 0.0, 1.0
     for i in range(w.Rate.size):
         difference = _twelfth_difference(w, i)
-        if difference == 0.0:  # the row does not depend on time
+        if difference == 0.0:  # this component does not depend on time
             continue
         slope, size = _slope_and_size(w, i, h)
         error_limit = max(
@@ -152,40 +153,41 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
             return JUMP, begin, end
     if steepest > STEEPNESS * mean:
         return RAMP, low, high
-    if end - begin < h:  # one half of the step is not smooth either: a ramp fills the step, or C_t or b has a kink
+    if end - begin < h:  # also half of the step is not smooth: a ramp fills the step, or C_t or b has a kink
         return RAMP, t, t + 0.5 * h
     return SMOOTH, t, t + h
 
 
-N_SAMPLES = 20  # number of intervals between the samples of one set
-MIN_TIME_AHEAD = 12.0  # shortest time ahead over which the motion is sampled, in units of the setting SPACING
-SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of samples
-# changes of a component are ignored unless the range of its samples exceeds two limits: LEAST_RANGE rtol times the
-# largest value so far; and LEAST_VALUE, because squares of smaller values underflow
+N_SAMPLES = 20  # number of intervals between the samples of one set, which therefore has 21 samples
+MIN_TIME_AHEAD = 12.0  # shortest time over which the motion is sampled ahead, in units of control[SPACING]
+SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of the samples
+# changes of a force, C_t or b are ignored if the range of the samples is at most LEAST_RANGE rtol times the largest
+# value so far, or at most LEAST_VALUE, because squares of smaller values underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
 MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: all stages may miss a force that lasts a quarter of it
-RESAMPLE_BELOW = 0.25  # times ahead are sampled again if the spacing has to fall below this fraction of the last one
+RESAMPLE_BELOW = 0.25  # sample a time again if the spacing must be below this fraction of the spacing used before
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers at t
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
-EQUAL_CHANGES = 1e-5  # two changes count as one if their distance is at most this fraction of the widest spacing so far
-# changes are recorded only later than this time after the start, in units of tolerances[GAP]: before that, rounding
-# errors make forces that begin at zero, such as 1 - cos(t), look sudden
+EQUAL_CHANGES = 1e-5  # two changes count as one if they are at most this fraction of the widest sample spacing apart
+# changes are not recorded until this time after the start, in units of tolerances[GAP]: just after the start, rounding
+# errors make a force that begins at zero, such as 1 - cos(t), seem to change suddenly
 MIN_RECORDED_TIME = 5e-5
-MIN_STEEPNESS_RATIO = 2.0  # a sudden change exceeds this multiple of the changes next to it; a smooth slope does not
-SHORT_STEP = 0.5  # a step below this fraction of the longest of the last steps may be due to a discontinuity
+MIN_STEEPNESS_RATIO = 2.0  # a change between two samples is sudden if it exceeds this times the changes next to it
+SHORT_STEP = 0.5  # steps below this fraction of the longest of the last steps may be short because of a discontinuity
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
-# accelerations decay (see _acceleration_lasts) if one changes by more than this fraction of the largest acceleration
-# while a velocity changes by its tolerance
+# accelerations do not last (see _acceleration_lasts) if one of them changes by more than this fraction of the largest
+# when velocities change by their tolerances
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # a change counts as passed up to this time (in spacings of samples) after a step begins
-LARGEST_ROW = N_SAMPLES + 1  # row of w.changes, after the samples, that stores the largest |value| of each column
-MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes that stores values between two samples
-N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
+CHANGE_MARGIN = 0.01  # a change counts as passed if a step begins less than this number of sample spacings before it
+# rows of w.changes, whose columns are the forces, C_t and b: rows 0 to N_SAMPLES are the samples of one set
+LARGEST_ROW = N_SAMPLES + 1  # largest |value| of each column so far
+MIDDLE_ROW = N_SAMPLES + 2  # values at a time between two samples
+N_CHANGES = N_SAMPLES + 3  # number of rows
 
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b at `time` in `values`, for the state that (q, v) reaches in `elapsed` s at constant a."""
+    """Store forces, C_t and b at `time` in `values`, at the state reached from (q, v) in `elapsed` s at constant a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -196,14 +198,14 @@ def _sample_forces(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _least_ranges(tolerances, largest, n):
-    """Return the ranges of samples up to which changes are ignored: for the n forces, and for C_t and b."""
+    """Return the largest ranges of samples for which changes are ignored: one for the n forces, one for C_t and b."""
     least = LEAST_RANGE * tolerances[RTOL]
     return max(LEAST_VALUE, least * largest_of(largest[:n])), max(LEAST_VALUE, least * largest_of(largest[n:]))
 
 
 @compiled
 def _is_smooth_bend(values, k, n):
-    """Return whether n + 1 values bend at k like a smooth curve: second differences at k and beside k are similar."""
+    """Return True if values[0] to values[n] have similar second differences at k and beside k, like a smooth curve."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -214,10 +216,11 @@ def _is_smooth_bend(values, k, n):
 
 @compiled
 def _find_sudden_bend(values, n, slope, min_range, strict):
-    """Return the index of the first sudden bend of n + 1 values (0: none), and the limit of second differences.
+    """Return the index of the first sudden bend of n + 1 values (0: no sudden bend), and a limit.
 
-    The limit is SUDDEN_RATIO times the range of the values after a line of slope `slope` (per sample) is subtracted. If
-    this range is at most `min_range`, return index 0. `strict`: ignore bends of a smooth curve, see `_is_smooth_bend`.
+    At a sudden bend, the second difference exceeds the limit: SUDDEN_RATIO times the range of the values after a line
+    of slope `slope` (per sample) is subtracted. If this range is at most `min_range`, no bend counts as sudden. If
+    `strict`, neither do bends of a smooth curve, see `_is_smooth_bend`.
     """
     low = high = 0.0
     for k in range(1, n + 1):
@@ -234,10 +237,10 @@ def _find_sudden_bend(values, n, slope, min_range, strict):
 
 @compiled
 def _first_sudden_bend(values, n, detrends, min_range):
-    """Return the index of the first sudden bend of n + 1 samples (0: none), and the limit of its second difference.
+    """Search n + 1 samples by `_find_sudden_bend`; return the index of the first sudden bend (0: none), and the limit.
 
-    After a bend is found, the values before it are searched again, until no earlier bend is found. If `detrends` is 1,
-    each search subtracts the straight line from the first to the last value. `min_range`: see `_find_sudden_bend`.
+    After a bend is found, search the samples before it, until there is no earlier bend. If `detrends` is 1, subtract
+    the straight line from the first to the last sample in each search; if it is 0, subtract nothing.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
     while index > 1:  # strict = True, because a few samples of a smooth curve may bend as much as a jump
@@ -251,7 +254,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return whether two successive samples differ by more than `limit`, and much more than the pairs beside them."""
+    """Return True if two successive samples differ by more than `limit`, and much more than from their neighbours."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     neighbouring_change = max(sign * (first_value - previous), sign * (following - second_value))
@@ -260,7 +263,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time right after component j changes, between sample k (at time `low`) and k + 1 (at time `high`)."""
+    """Return the time (s) just after column j of w.changes changes between samples k (at `low`) and k + 1 (`high`)."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):
@@ -276,17 +279,17 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 
 @compiled
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
-    """Update LAST_CHANGE and SHORTEST_CHANGE in `clock` by sudden changes next to the bend at sample `index`.
+    """Record sudden changes on both sides of sample `index`, where column `column` of w.changes has a sudden bend.
 
-    Sample k, from 0 to n, is at the time begin + k * spacing. `column`: index of the component that bends. `limit`:
-    largest difference of two samples that is not a sudden change.
+    Store the time of the last change in clock[LAST_CHANGE], and the shortest time between two changes in
+    clock[SHORTEST_CHANGE]. Sample k (0 to n) is at begin + k spacing. Differences up to `limit` are not sudden.
     """
     values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
     first_recorded_time = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
     for k in range(index - 1, index + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
         is_recorded = low - margin <= clock[at.LAST_CHANGE] <= high + margin
-        if is_recorded or k + 2 > n or low - spacing < first_recorded_time:  # a change needs samples on both sides
+        if is_recorded or k + 2 > n or low - spacing < first_recorded_time:  # no sample beside it
             continue
         if k == 0:
             _sample_forces(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE_ROW])
@@ -299,10 +302,10 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 
 @compiled
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
-    """Take a set of samples; return the time of the first sudden change (or infinity), and the time of the last sample.
+    """Take a set of samples of forces, C_t and b; return the times of the first sudden change and the last sample.
 
-    (q, v, a) is the state at t. The first sample is at `begin`, the last one at `last` or earlier. Samples follow the
-    motion if `follows_motion` is 1, and are taken at the fixed state (q, v) if it is 0.
+    If there is no sudden change, its time is infinite. (q, v, a): state at t. The first sample is at `begin`, the
+    last one not after `last`. follows_motion: 1: samples along the extrapolated motion; 0: at the fixed state (q, v).
     """
     changes, n, t_first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -335,7 +338,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Update SHORTEST_CHANGE in `clock` by changes within a short step that the samples ahead of it have missed."""
+    """Update clock[SHORTEST_CHANGE] by changes within a short step which the samples ahead of it have missed."""
     changes, spacing, begin, end = w.changes, control[at.TIME_SPACING], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
@@ -359,10 +362,10 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
-    """Return whether accelerations last, which means: changes of velocities by their tolerances hardly change them.
+    """Return True if accelerations hardly change when velocities change by their tolerances.
 
-    If stiff friction keeps a body at rest, accelerations do not last: they are rounding errors of balanced forces, and
-    a parabola with these accelerations would lead far from the state of rest. (Q, V, A) is scratch.
+    They change much if stiff friction holds a body: the accelerations are then rounding errors of balanced forces, and
+    extrapolating the motion with them would lead far from rest. (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
     for m in range(n):
@@ -382,9 +385,9 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Store the time of the next sudden change along the motion in `clock`.
+    """Sample forces, C_t and b along the motion; store the time of the next sudden change in `clock`.
 
-    The motion is sampled over the step size, or over MIN_TIME_AHEAD spacings of samples if that is longer.
+    The samples extend over the step size, or over MIN_TIME_AHEAD times `spacing` if that is longer.
     """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
@@ -399,7 +402,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # dense samples along the motion replace samples at a fixed state, unless the last of these is at a change
+    # close samples along the motion replace samples at a fixed state, unless the last sample of these is at a change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -412,15 +415,16 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
-    """Sample the forces ahead at constant (q, v); return the time of the first sudden change, at most `next_change`."""
+    """Sample forces, C_t and b ahead at fixed q and v; return the time of the first sudden change, or `next_change`."""
     max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
-    # sample known times again, if more closely, except for multistep methods (JUMP_RATIO = 1), whose error estimates
-    # show a jump, and if C_t or b may jump (MAY_JUMP = 1), because then each step is checked for jumps
+    # times that have been sampled before are sampled again if samples must be closer now. This is not necessary for
+    # multistep methods (JUMP_RATIO = 1), whose error estimates show a jump; nor if C_t or b may jump (MAY_JUMP = 1):
+    # then each step is checked for jumps
     may_resample = control[at.JUMP_RATIO] > 1.0 and control[at.MAY_JUMP] == 0.0
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # then the next samples must be as close, to show it
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # then only samples as close as before show it again
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)
@@ -432,9 +436,9 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return the size (s) of the step from t: `size`, or less if it must end at a sudden change of a force or drive.
+    """Return the size (s) of the step from t: `size`, or less if the step must end at a sudden change.
 
-    Forces, C_t and b are sampled ahead of t, at most until `last`. `new_state` is scratch.
+    To find sudden changes of forces, C_t and b, sample these ahead of t, but not after `last`. `new_state` is scratch.
     """
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -446,7 +450,8 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     next_change = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > t_near else np.inf
     next_change_of_motion = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > t_near else np.inf
     is_at_change = next_change == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
-    # do not sample again if a step as short as a spacing begins at the change: ever shorter sets would show it again
+    # if a step begins at a change and is as short as one spacing, do not sample again: closer and closer samples would
+    # show this change again and again
     if control[at.BY_TIME] == 1.0 and not (is_at_change and size <= (1.0 + CHANGE_MARGIN) * clock[at.SAMPLED_EVERY]):
         next_change = _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = next_change
