@@ -275,7 +275,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     flags = _evaluate_start(checked_kit, b, t, q, v, records, b.shifts[: 0 if has_all_entries else len(b.shifts)])
     if has_all_entries:
         pattern = b.pattern.reshape(b.pattern.size)
-        for k in range(b.kinds.size):  # according to b.kinds, some entries are not always zero
+        for k in range(b.kinds.size):  # kind 0: the entry of the constraint rows is always zero
             pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
     if flags & WELL_FORMED == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
