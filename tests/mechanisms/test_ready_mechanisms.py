@@ -3,7 +3,7 @@
 import math
 import pickle
 import warnings
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from twoloop import ConstraintWarning, mechanisms
 from twoloop.bodies.rotation import euler_parameters, euler_rates
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.mechanisms import four_bar
-from twoloop.mechanisms.spatial import Momentum
+from twoloop.mechanisms.spatial import angular_momentum
 
 COMPUTED, CLOSED = known_motions(), closed_forms()
 PROBLEMS = {name: problem for name, (problem, *_) in {**COMPUTED, **CLOSED}.items()}
@@ -277,7 +277,7 @@ def test_momentum_of_a_free_body():
     q, v = np.append([0.1, 0.2, 0.3], e), np.append([1.0, -2.0, 0.5], euler_rates(e, spin))
     point, axis = np.array([0.5, 0.0, -1.0]), np.array([0.0, 0.6, 0.8])
     moment = 2.0 * np.cross(q[:3] - point, v[:3]) + R @ (moments * (R.T @ spin))
-    momentum = Momentum(np.array([[2.0, *moments]]), point, axis)
+    momentum = partial(angular_momentum, np.array([[2.0, *moments]]), point, axis)
     assert momentum(0.0, q, v) == pytest.approx(axis @ moment)
     assert momentum(0.0, np.array([q, q]).T, np.array([v, v]).T) == pytest.approx([axis @ moment] * 2)
 

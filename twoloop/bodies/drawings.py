@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from twoloop.bodies.frames import BodyPoints
+from twoloop.bodies.frames import body_points
 from twoloop.bodies.parameter_layout import SPRING, ZERO_LENGTH_SPRING
 from twoloop.checks.arguments import Array
 from twoloop.problem.description import Drawing
@@ -80,7 +81,8 @@ class Sketch:
     @property
     def drawing(self) -> Drawing:
         """Return the drawing."""
-        return Drawing(BodyPoints(tuple(self.bodies), np.array(self.points)), tuple(self.bars), tuple(self.traces))
+        points = partial(body_points, tuple(self.bodies), np.array(self.points))
+        return Drawing(points, tuple(self.bars), tuple(self.traces))
 
 
 def drawing_of(tables: Tables) -> Drawing:

@@ -15,21 +15,13 @@ from twoloop.checks.arguments import Array, check_columns
 ROTORS = layout.HINGE_ROTOR, layout.SLIDE_ROTOR
 
 
-@dataclass(frozen=True, eq=False)
-class PlanarEnergy:
-    """Evaluate kinetic energy and potential of gravity of planar bodies, J, for one state or many."""
-
-    masses: Array
-    inertias: Array
-    gravity: float
-
-    def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Evaluate for one state, or for many given as columns."""
-        q, v = np.asarray(q), np.asarray(v)
-        check_columns("q", q, 3 * len(self.masses))
-        check_columns("v", v, 3 * len(self.masses))
-        kinetic = 0.5 * (self.masses @ (v[0::3] ** 2 + v[1::3] ** 2) + self.inertias @ v[2::3] ** 2)
-        return kinetic + self.gravity * (self.masses @ q[1::3])
+def planar_energy(masses: Array, inertias: Array, gravity: float, t: Any, q: Array, v: Array) -> Any:
+    """Return kinetic energy and potential of gravity of planar bodies, J, at one state, or at many given as columns."""
+    q, v = np.asarray(q), np.asarray(v)
+    check_columns("q", q, 3 * len(masses))
+    check_columns("v", v, 3 * len(masses))
+    kinetic = 0.5 * (masses @ (v[0::3] ** 2 + v[1::3] ** 2) + inertias @ v[2::3] ** 2)
+    return kinetic + gravity * (masses @ q[1::3])
 
 
 @dataclass(frozen=True, eq=False)

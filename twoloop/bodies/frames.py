@@ -1,7 +1,6 @@
 """Transform vectors and points from body axes to space: for numbers, for columns of numbers, or for symbols."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,40 +33,27 @@ def angle_of(q: Any, body: int) -> Any:
     return 0.0 if body == GROUND else q[3 * body + 2]
 
 
-@dataclass(frozen=True, eq=False)
-class LinearPoints:
-    """Evaluate points that are linear in the coordinates.
+def linear_points(matrix: Array, constant: Array, q: Array) -> Any:
+    """Return points that are linear in the coordinates, at q (n_q,) or (n_q, n_t).
 
-    Attributes
+    Parameters
     ----------
     matrix : ndarray (n_points, 2 or 3, n_q)
     constant : ndarray (n_points, 2 or 3)
     """
-
-    matrix: Array
-    constant: Array
-
-    def __call__(self, q: Array) -> Any:
-        """Return the points at q (n_q,) or (n_q, n_t)."""
-        return np.tensordot(self.matrix, q, 1) + self.constant.reshape(*self.constant.shape, *(1,) * (q.ndim - 1))
+    return np.tensordot(matrix, q, 1) + constant.reshape(*constant.shape, *(1,) * (q.ndim - 1))
 
 
-@dataclass(frozen=True, eq=False)
-class BodyPoints:
-    """Evaluate points of bodies with coordinates x, y and an angle, or x, y, z and four Euler parameters.
+def body_points(bodies: Sequence[int], points: Array, q: Array) -> Any:
+    """Return points of bodies with coordinates x, y and an angle, or x, y, z and four Euler parameters.
 
-    Attributes
+    Parameters
     ----------
     bodies : sequence of int
         The body of each point; -1 is the ground.
     points : ndarray (n_points, 2 or 3)
         In body axes, relative to the centre of mass.
+    q : ndarray (n_q,) or (n_q, n_t)
     """
-
-    bodies: Sequence[int]
-    points: Array
-
-    def __call__(self, q: Array) -> Any:
-        """Return the points at q (n_q,) or (n_q, n_t)."""
-        points = [point_of(q, *each) for each in zip(self.bodies, self.points, strict=True)]
-        return np.array([[np.broadcast_to(x, q.shape[1:]) for x in point] for point in points])
+    positions = [point_of(q, *each) for each in zip(bodies, points, strict=True)]
+    return np.array([[np.broadcast_to(x, q.shape[1:]) for x in position] for position in positions])

@@ -4,6 +4,7 @@ import inspect
 import math
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import FunctionType
@@ -91,6 +92,8 @@ def check_call(name: str, call: str, function: Callable[..., Any], arguments: Se
 
 def _takes(function: Callable[..., Any], n: int) -> bool:
     """Return whether a plain function, or an object's __call__, takes exactly n positional arguments; a fast check."""
+    if isinstance(function, partial):
+        return not function.keywords and _takes(function.func, n + len(function.args))
     of_object = not isinstance(function, FunctionType)
     own = type(function).__call__ if of_object else function
     if not isinstance(own, FunctionType) or own.__code__.co_kwonlyargcount > 0:

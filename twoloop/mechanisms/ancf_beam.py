@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.bodies.frames import LinearPoints
+from twoloop.bodies.frames import linear_points
 from twoloop.checks.arguments import check_number, check_positive, check_size
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.kernels.data.common import compiled
@@ -405,7 +405,7 @@ def _centre_line(n_elements: int, l: float) -> Drawing:
         for place, shape in shapes.items():
             for axis in range(2):
                 matrix[k, axis, 6 * element + place + axis] = shape
-    points = LinearPoints(matrix, np.zeros(matrix.shape[:2]))
+    points = partial(linear_points, matrix, np.zeros(matrix.shape[:2]))
     return Drawing(points, tuple(pairwise(range(n + 1))), (n,))
 
 

@@ -6,12 +6,13 @@ axis along the chain. Eq. (35) of the paper is printed with the cosine of th3 in
 """
 
 import math
+from functools import partial
 from numbers import Real
 
 import numpy as np
 
-from twoloop.bodies.energy import PlanarEnergy
-from twoloop.bodies.frames import GROUND, BodyPoints
+from twoloop.bodies.energy import planar_energy
+from twoloop.bodies.frames import GROUND, body_points
 from twoloop.bodies.geometry import merged
 from twoloop.checks.arguments import check_finite, check_vector
 from twoloop.kernels.compile.callbacks import callback
@@ -169,9 +170,9 @@ def four_bar(
         q0=q0,
         v0=np.zeros(9),
         t_span=(0.0, 100.0),
-        energy=PlanarEnergy(masses, masses * lengths_array**2 / 12.0, GRAVITY),
+        energy=partial(planar_energy, masses, masses * lengths_array**2 / 12.0, GRAVITY),
         conserved=True,
-        drawing=Drawing(BodyPoints((GROUND, 0, 2, GROUND), points), ((0, 1), (1, 2), (2, 3)), (1, 2)),
+        drawing=Drawing(partial(body_points, (GROUND, 0, 2, GROUND), points), ((0, 1), (1, 2), (2, 3)), (1, 2)),
         parameters={
             "L1": L1,
             "L2": L2,

@@ -4,11 +4,12 @@ Bloch, Nonholonomic Mechanics and Control (2003), Sect. 1.6. x points down the s
 """
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.frames import BodyPoints
+from twoloop.bodies.frames import body_points
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import callbacks_in
 from twoloop.problem.description import Drawing, Joint
@@ -18,6 +19,7 @@ from twoloop.problem.system import ConstrainedSystem
 GRAVITY = 9.81
 MASS, INERTIA, SLOPE, SPIN = 1.3, 0.2, 0.4, 1.7  # kg, kg m^2, rad, rad/s
 PULL = GRAVITY * math.sin(SLOPE)
+BLADE = [[-0.3, 0.0], [0.3, 0.0], [0.0, 0.0]]  # its ends and its middle, m
 
 # p = [m, J, m g sin(slope)]
 
@@ -86,7 +88,7 @@ def knife_edge() -> Problem:
         t_span=(0.0, 10.0),
         energy=energy,
         conserved=True,
-        drawing=Drawing(BodyPoints((0, 0, 0), np.array([[-0.3, 0.0], [0.3, 0.0], [0.0, 0.0]])), ((0, 1),), (2,)),
+        drawing=Drawing(partial(body_points, (0, 0, 0), np.array(BLADE)), ((0, 1),), (2,)),
         parameters={"mass": MASS, "inertia": INERTIA, "slope": SLOPE, "spin": SPIN, "gravity": GRAVITY},
         note="Mass, inertia, slope and spin were chosen for this project.",
         reference=Reference(

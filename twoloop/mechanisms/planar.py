@@ -11,14 +11,15 @@ ground is body -1.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import count
 from typing import Any
 
 import numpy as np
 
 from twoloop.bodies.drawings import Sketch
-from twoloop.bodies.energy import PlanarEnergy
+from twoloop.bodies.energy import planar_energy
 from twoloop.bodies.geometry import merged
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
@@ -279,9 +280,9 @@ class PlanarBodies:
         return ConstrainedSystem(n_q=n_q, n_c=self.n_c, parameters=parameters, **callbacks, **options)
 
     @property
-    def energy(self) -> PlanarEnergy:
+    def energy(self) -> Callable[..., Any]:
         """Return the energy as a function of t, q and v."""
-        return PlanarEnergy(self.masses, self.inertias, self.gravity)
+        return partial(planar_energy, self.masses, self.inertias, self.gravity)
 
     @property
     def drawing(self) -> Drawing:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.frames import LinearPoints
+from twoloop.bodies.frames import linear_points
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import callbacks_in
@@ -199,7 +199,7 @@ class QuadraticSystem:
                 for i, coefficient in scalar.items():
                     if i is not None:
                         matrix[k, axis, i] = coefficient
-        return Drawing(LinearPoints(matrix, constant), bars, traces)
+        return Drawing(partial(linear_points, matrix, constant), bars, traces)
 
 
 def difference(a: Scalar, b: Scalar) -> Scalar:

@@ -1,7 +1,7 @@
 """Define spatial models by Euler parameters: heavy top, slider-crank, four-bar and governor."""
 
 import math
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,33 +14,26 @@ from twoloop.problem.problem import Array, Problem, Reference
 GRAVITY = 9.81  # m/s^2, along -z
 
 
-@dataclass(frozen=True, eq=False)
-class Momentum:
-    """Evaluate the angular momentum about an axis of space through a point, kg m^2/s, for one state or many.
+def angular_momentum(bodies: Array, point: Array, axis: Array, t: Any, q: Array, v: Array) -> Any:
+    """Return the angular momentum about an axis of space through a point, kg m^2/s, for one state or many.
 
-    Attributes
+    Parameters
     ----------
     bodies : ndarray (n, 4)
         Mass, kg, and principal moments of inertia, kg m^2, of each body.
     point, axis : ndarray (3,)
         m, and a unit vector.
+    q, v : ndarray (n_q,) or (n_q, n_t)
     """
-
-    bodies: Array
-    point: Array
-    axis: Array
-
-    def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Evaluate for one state, or for many given as columns."""
-        q, v = (np.asarray(x).reshape(-1, 7, *np.shape(x)[1:]) for x in (q, v))
-        total: Any = 0.0
-        for (mass, *inertia), state, rate in zip(self.bodies, q, v, strict=True):
-            spin = 2.0 * np.stack(half_spin.py_func(*state[3:], *rate[3:]))
-            arm = state[:3] - self.point.reshape(3, *(1,) * (state.ndim - 1))
-            spin_momentum = rotated.py_func(*state[3:], *(np.array(inertia) * spin.T).T)
-            moment = np.cross(arm, rate[:3], axis=0) * mass + np.array(spin_momentum)
-            total = total + np.tensordot(self.axis, moment, axes=1)
-        return total
+    q, v = (np.asarray(x).reshape(-1, 7, *np.shape(x)[1:]) for x in (q, v))
+    total: Any = 0.0
+    for (mass, *inertia), state, rate in zip(bodies, q, v, strict=True):
+        spin = 2.0 * np.stack(half_spin.py_func(*state[3:], *rate[3:]))
+        arm = state[:3] - point.reshape(3, *(1,) * (state.ndim - 1))
+        spin_momentum = rotated.py_func(*state[3:], *(np.array(inertia) * spin.T).T)
+        moment = np.cross(arm, rate[:3], axis=0) * mass + np.array(spin_momentum)
+        total = total + np.tensordot(axis, moment, axes=1)
+    return total
 
 
 def heavy_top() -> Problem:
@@ -60,7 +53,7 @@ def heavy_top() -> Problem:
     motion = {"velocity": np.cross(spin, position), "angular_velocity": spin}
     model.body("top", mass=mass, inertia=inertia, position=position, **motion)
     model.spherical("top", "ground", at=(0.0, 0.0, 0.0))
-    momentum = Momentum(np.array([[mass, *inertia]]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    momentum = partial(angular_momentum, np.array([[mass, *inertia]]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     return ready_model(
         *(model, 0.2),
         conserved=True,
@@ -278,5 +271,5 @@ def governor() -> Problem:
             "The angular momentum about the shaft is kept, and the energy never grows."
         ),
         conserved=False,
-        invariants={"angular momentum about the shaft (kg m^2/s)": Momentum(bodies, np.zeros(3), z)},
+        invariants={"angular momentum about the shaft (kg m^2/s)": partial(angular_momentum, bodies, np.zeros(3), z)},
     )

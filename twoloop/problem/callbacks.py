@@ -70,23 +70,17 @@ def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatche
     return compile_callback(kind, dense, digests_of(dense))
 
 
-@dataclass(frozen=True, eq=False)
-class DenseFunction:
-    """Plain function that returns a dense matrix; it calls the plain function `values`, which returns its entries."""
-
-    values: Callable[..., Any]
-    entries: Entries
-    shape: tuple[int, int]
-
-    def __call__(self, t: float, q: Any, *p: Any) -> Any:
-        """Return the matrix; its entries are symbols if `values` returns symbols."""
-        values = np.asarray(self.values(t, q, *p))
-        if values.shape != self.entries[0].shape:
-            return values  # `store` refuses this shape
-        matrix = np.zeros(self.shape, dtype=values.dtype if values.dtype == object else np.float64)
-        for i, j, value in zip(*(indices.tolist() for indices in self.entries), values, strict=True):
-            matrix[i, j] = matrix[i, j] + value
-        return matrix
+def dense_matrix(
+    function: Callable[..., Any], entries: Entries, shape: tuple[int, int], t: float, q: Any, *p: Any
+) -> Any:
+    """Return the dense matrix whose entries a plain function returns; they are symbols if it returns symbols."""
+    values = np.asarray(function(t, q, *p))
+    if values.shape != entries[0].shape:
+        return values  # `store` refuses this shape
+    matrix = np.zeros(shape, dtype=values.dtype if values.dtype == object else np.float64)
+    for i, j, value in zip(*(indices.tolist() for indices in entries), values, strict=True):
+        matrix[i, j] = matrix[i, j] + value
+    return matrix
 
 
 # first displacement h of a coordinate q, relative to max(1, |q|); a power of two, so that q + h is exact

@@ -8,6 +8,7 @@ import math
 import re
 import textwrap
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,12 +23,12 @@ from twoloop.kernels.data.common import PROGRAMS, Functions, Kit
 from twoloop.kernels.data.indices import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS
 from twoloop.problem.callbacks import (
     VALUES_OF,
-    DenseFunction,
     PythonFunctions,
     checked_entries,
     checked_parameters,
     compile_returning,
     dense_callback,
+    dense_matrix,
     given_callbacks,
     plain_functions,
     store,
@@ -374,7 +375,7 @@ class ConstrainedSystem:
         missing = [kind for kind in entries if kind not in functions]
         shapes = {"mass": (n_q, n_q), "jacobian": (n_c, n_q)}
         for kind in missing:
-            functions[kind] = DenseFunction(functions[VALUES_OF[kind]], entries[kind], shapes[kind])
+            functions[kind] = partial(dense_matrix, functions[VALUES_OF[kind]], entries[kind], shapes[kind])
         taking |= {kind for kind in missing if VALUES_OF[kind] in taking}
         python = PythonFunctions(name, functions, taking)
         wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
