@@ -1,8 +1,8 @@
 """Cache integrators: a call with the same options as an earlier call reuses the plan, code, arrays and checks.
 
-`CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and takes a first chunk of
-steps. If the chunk reaches the end of the run and nothing unusual happens, the fields of the result are computed when
-they are read. Otherwise `IntegrationLoop` continues the run.
+`CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and takes the first chunk
+of steps. A chunk is the steps of one call of compiled code. If the chunk reaches the end of the run, and Python has
+nothing to check, the fields of the result are computed when they are read. Otherwise `IntegrationLoop` continues.
 """
 
 import time
@@ -73,19 +73,19 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
 Array = NDArray[np.float64]
 
-MAX_IDLE = 4  # largest number of unused integrators kept for the same options: as many threads can integrate at once
-# the first call of compiled code takes this number of chunks, unless `StiffnessMonitor` needs states after each chunk.
-# With more chunks, the answer to Ctrl-C could take more than 0.1 s
+MAX_IDLE = 4  # largest number of unused integrators kept for equal options; each thread that integrates takes one
+# the first call of compiled code may attempt this number of chunks (`Run.chunk` steps each). Exception: one chunk if
+# `StiffnessMonitor` samples a state after each chunk. With more chunks, a run could ignore Ctrl-C for more than 0.1 s
 N_FIRST_CHUNKS = 4
-N_SKIPPED_CALLS = 16  # number of calls, after an exception in a callback, that do not use the cached integrator
+N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # CPU time (s); after a shorter run, elapsed time replaces CPU time, which takes longer to read
-HARMLESS = 0.01  # a v0 is accepted if its projection onto the constraints changes it by at most HARMLESS tolerances
+SHORT_RUN = 1e-3  # if the last run took less CPU time (s), elapsed time is measured, because it is read faster
+HARMLESS = 0.01  # v0 is accepted if projecting it onto the constraints changes it by at most this many tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
 
-STEPS = OutputRequest()  # output at the ends of all steps
+STEPS = OutputRequest()  # request for output at the ends of all steps, without dense output and events
 
 
 @dataclass(frozen=True)
@@ -118,29 +118,32 @@ class CachedIntegrator:
         self.parametric = None if shared is None else ParametricRun(shared, run)
         self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
-        # largest number of attempted steps in the first chunk, which adds at most one state for each attempt
+        # the first call of compiled code attempts at most `n_attempts` steps; each attempt stores at most one state
         n_attempts = max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, n_attempts
         checked = system if self.parametric is None else self.parametric.system
-        # skips: number of coming calls that will not use the integrator, because a callback raised an exception
+        # skips: number of next calls that will not use this integrator, because a callback has raised an exception
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # first indices in `arrays.block`: of the states, and of a shorter block for results that have one state only
+        # indices in `arrays.block`, in which the report comes before the states. states_begin: first number of the
+        # states. one_state_begin: first number of the report if there is one state and no step, else it begins earlier
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
         self.attributes_at_start = {key: getattr(run, key) for key in ("plan", "memory", "chunk", "kit")}
-        self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run (s)
+        # form of linear algebra at the start; CPU time of the last run (s), infinite before the first run
+        self.form, self.cpu_time = run.kit.flags[FORM], np.inf
         self.interpolation = OutputInterpolation(run)
-        self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # last entry: whether generated code is called
-        self.independent_rows = self.arrays.start_rows.tobytes()  # indices of the independent rows, as bytes
+        self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # last entry: whether steps call generated code
+        self.independent_rows = self.arrays.start_rows.tobytes()  # indices of independent constraint rows, as bytes
         self.redundancy = {self.independent_rows: (run.redundant, run.rows_warning)}
 
     @staticmethod
     def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
         """Return whether a cached integrator, which reuses its arrays, can provide the requested `output`."""
-        # `sol` and interpolated output must agree; and the arrays that `sol` uses must not get other parameters later
+        # interpolated output and `sol` must agree, but here each would have its own interpolator. If setup is shared,
+        # the next run overwrites the parameters that `sol` would use
         if output.dense and (output.interpolated_times is not None or shared is not None):
             return False
         return output.interpolated_times is None or not (
@@ -160,9 +163,9 @@ class CachedIntegrator:
     ) -> dict[str, Any] | RepeatRequest | None:
         """Integrate a system from a start; return the fields of the result, or a request to repeat the run.
 
-        If nothing unusual happens, the fields are `status` and `later`, a function that computes any other field when
-        it is read. Return None if the start needs more checks, or if a callback raised an exception: the caller then
-        calls `set_up`, which does these checks and describes the problem.
+        If `IntegrationLoop` is not needed, the fields are `status` and `later`, a function that computes the other
+        fields when they are read. Return None if the start needs more checks, or if a callback raised an exception:
+        the caller then calls `set_up`, which does these checks and describes the problem.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
         is_due = region.is_comparison_due()
@@ -194,7 +197,7 @@ class CachedIntegrator:
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, timed_states = n, None  # one row for each step, unless `_finish_run` is called
+        n_rows, timed_states = n, None  # n >= 0: number of steps (and of states after the start); n < 0: a code
         rows_differ = run.rows_warning != "" and (rows := arrays.start_rows.tobytes()) != self.independent_rows
         if rows_differ and n >= 0 and rows in self.redundancy:
             self._use_independent_rows(rows)
@@ -214,11 +217,11 @@ class CachedIntegrator:
         fields["later"] = partial(
             _deferred_field, data, timed_states, self.run_fields, self.cpu_time, system, t1, self.options
         )
-        region.count_run()  # if `IntegrationLoop` has continued a run, `check_callbacks_along_run` counts it instead
+        region.count_run()  # `IntegrationLoop` counts the runs that it continues
         return fields
 
     def _pivots_suit_start(self, t0: float, q0: Array) -> bool:
-        """Return whether the pivots of the generated code are large enough at (t0, q0); the arrays contain M and G."""
+        """Return whether code was generated for the pivots chosen at (t0, q0); `arrays` has M and constraint rows."""
         system, arrays = self.evaluation.system, self.arrays
         system.remember_at("mass and rows", (t0, q0.tobytes()), (arrays.mass.copy(), arrays.rows.copy()))
         return self.code is not None and self.code.is_valid_from(system, t0, q0)
@@ -235,11 +238,12 @@ class CachedIntegrator:
         is_due: bool,
         fields: dict[str, Any],
     ) -> dict[str, Any] | RepeatRequest | tuple[tuple[Array, Array] | None] | None:
-        """Check the first chunk of a run, and integrate to the end if this chunk does not reach it or is unusual.
+        """Check the first chunk of a run; let `IntegrationLoop` continue the run if it is incomplete or suspicious.
 
-        If the run is unusual, return what `integrate` has to return: fields, a request, or None (the start needs more
-        checks). Otherwise store `sol` in `fields` if it is requested, and return a tuple with one element: the pair
-        (output times, states), or None if all steps are output. `is_due`: see `check_callbacks_along_run`.
+        If the loop continued, or a check failed, return what `integrate` has to return: fields, a request, or None (the
+        start needs more checks). Otherwise store `sol` in `fields` if it is requested, and return a tuple with one
+        element: the pair (output times, states), or None if output is at the ends of all steps.
+        `is_due`: whether this run has to compare callbacks with their traces at all sampled states.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -281,7 +285,7 @@ class CachedIntegrator:
         return (timed_states,)
 
     def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
-        """Update the redundant rows of the run at a new start; return False if start or parameters need more checks."""
+        """Update the redundant rows at a new start; return False if the start or the parameters need more checks."""
         run = self.run
         if run.rows_warning:  # if rows depend on one another, rounding may decide which of them counts as redundant
             independent = self.arrays.start_rows.tobytes()
@@ -295,7 +299,7 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Store which rows of [C_q; A] are redundant, and the warning; `rows`: indices of the other rows, as bytes."""
+        """Set the redundant constraint rows and the warning about them; `rows`: indices of the other rows, as bytes."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows
@@ -304,7 +308,7 @@ class CachedIntegrator:
         """Restore the attributes of the run, other than arrays, that `IntegrationLoop` may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            # the plan has not changed, but `IntegrationLoop` may have added a loaded step to the kit: keep this kit
+            # the plan has not changed. The kit may have: if `IntegrationLoop` has loaded a step, the new kit calls it
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
@@ -315,7 +319,7 @@ class CachedIntegrator:
         def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            # also check extreme states: the region of checked states then contains all states if the run is repeated
+            # also check the states with extreme t, q or v: then the checked region contains a repetition of the run
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
         checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
@@ -325,11 +329,11 @@ class CachedIntegrator:
 def fields_of(
     record: Record, options: Options, system: ConstrainedSystem, compiled: bool, t_end: float
 ) -> dict[str, Any]:
-    """Return the fields of the result of a run, from the record of `IntegrationLoop`; `compiled`: see `Result`."""
+    """Return the fields of the result of a run, from its record; `compiled`: whether steps called generated code."""
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
     fields["t_end"] = t_end
-    if (own := options.own_tolerance) is not None:  # tolerance of Newmark for positions
-        error = own ** (2.0 / 3.0)  # error of the whole run if each step meets this tolerance
+    if (own := options.own_tolerance) is not None:  # error_tol of Newmark: tolerance of positions in each step
+        error = own ** (2.0 / 3.0)  # error of a whole run whose steps meet this tolerance
         fields |= {"rtol": error, "atol": np.full(system.n_q, error), "untested": np.ones(len(record.h), dtype=bool)}
     return fields
 
@@ -344,7 +348,7 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Compute the field `name` of a result when it is read; return a dict of this field and of all computed with it."""
+    """Compute the field `name` of a result when it is read; return a dict of it and of fields computed with it."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -361,7 +365,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # a start is not checked by `set_up` if its smallest pivot / the first start's is at least this
+RECHECK_PIVOT = 0.1  # `set_up` checks a start if its smallest pivot is below this fraction of that at the first start
 
 
 def arrays_of(
@@ -369,8 +373,8 @@ def arrays_of(
 ) -> SimpleNamespace:
     """Return new arrays for `start_and_advance` of kernels/cached_run.py, with space for `n_attempts` steps.
 
-    `run` must be at its start; its clock, control and tolerances are replaced by views of one array.
-    `evaluation.system` has the parameters of the call. For the other arguments see `CachedIntegrator`.
+    `run` must be at its start; its arrays `clock`, `control` and `tolerances` become views of one array.
+    `evaluation.system`: the system to integrate. For the other arguments see `CachedIntegrator`.
     """
     from twoloop.kernels.evaluation import checks as start_checks
     from twoloop.kernels.linalg import rank as pivots
@@ -432,17 +436,20 @@ def arrays_of(
 
 
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
-    """Return an array of integers that describes a choice of pivots to kernels, and the factor of rows added to M."""
+    """Return a choice of pivots as integers for kernels, and the factor s of the terms s g^T g that it adds to M.
+
+    g: constraint rows that make a singular M definite; s = 1 if none are needed.
+    """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # a refined choice compares which rows to add to M: there is no compiled code for this comparison
+    # OF_PYTHON: only Python can repeat a refined choice, for which it may try several ways to add rows to M
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
 
 
-# limits of a system's cache, as largest numbers of: sets of options (MAX_OPTIONS); floats in the workspace of a cached
-# run (MAX_WORKSPACE); entries with equal options whose different starts need different code (MAX_ENTRIES)
+# limits of a system's cache. MAX_OPTIONS: largest number of sets of options. MAX_WORKSPACE: a run with more floats in
+# its workspace is not cached. MAX_ENTRIES: limit of entries for equal options; their starts need different code
 MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
@@ -459,7 +466,7 @@ class CacheEntry(NamedTuple):
     shared: SharedSetup | None = None  # setup shared with systems that differ only in their parameters
 
 
-# cached data of a system: its last start, its entries (keys: options), and the id of code that the last run generated
+# empty cache of a system: last start, entries by options, id() of the last run's new code (None: no new code)
 EMPTY_CACHE: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 
@@ -514,7 +521,7 @@ def set_up(
 ) -> tuple[Run, CacheEntry | None]:
     """Return a run at its start (new, or a copy of a cached run), and the cache entry that this call added, or None.
 
-    A run is cached if twoloop provides the method, callbacks are compiled, and traces are trusted. Raise
+    A run is cached if twoloop provides the method, callbacks are compiled, and callbacks agree with their traces. Raise
     TypeError or ValueError if the start is refused, the method cannot run the system, or code cannot be generated.
     """
     if system.called_in_python:  # functions called in Python may depend on variables that change
@@ -557,19 +564,19 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
         run.fixed_order is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
     )
     start = t0, q0.tobytes(), v0.tobytes()
-    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # without checks in Python
+    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # in compiled code
     idle: list[CachedIntegrator] | None = [] if can_start else None
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of a system, from `trace_cache_of` or, if this is not the first call, from the system."""
+    """Return the TraceCache of a system; the first call finds it by `trace_cache_of`, later calls reuse it."""
     cache: TraceCache = system.remembered(("trace cache", trace_cache_of), lambda: trace_cache_of(system))
     return cache
 
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
-    """Cache a SharedSetup for systems that differ only in their parameters, when the second of them is integrated."""
+    """When a second system differs from the first only in its parameters, cache a SharedSetup for all such systems."""
     key, functions, cached = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
     if key not in cached:
         system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {key: functions}
@@ -587,7 +594,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a copy of a cached run at another start; None if it needs other code, or other linear algebra."""
+    """Return a copy of a cached run at another start; None if this start needs other code or linear algebra."""
     _check_start(system, t0, q0, v0, options)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None
@@ -607,16 +614,16 @@ def _new_run(
     first_value = first_force(system, t0, q0, v0)
     _check_start(system, t0, q0, v0, options)
 
-    def check(traced: CallbackTraces) -> None:
+    def check_traces(traced: CallbackTraces) -> None:
         traced.refuse_if_wrong(system, t0, t1, q0, v0)
 
-    system, derived = derive_callbacks(system, check)
-    run, code = _create_run(system, t0, q0, v0, options, derived, check)
+    system, derived = derive_callbacks(system, check_traces)
+    run, code = _create_run(system, t0, q0, v0, options, derived, check_traces)
     if run.fixed_order is None:
         branch = branch_at(system, t0, run.state, run.rank, options.atol + options.rtol * np.abs(v0).max())
         run.starts_singular = branch is not None
         if isinstance(branch, Branch) and not has_fixed_step:
-            neighbour, neighbour_code = _create_run(system, t0, branch.q, branch.v, options, derived, check)
+            neighbour, neighbour_code = _create_run(system, t0, branch.q, branch.v, options, derived, check_traces)
             if neighbour.rank == branch.rank and neighbour.fixed_order is None:
                 run, code = neighbour, neighbour_code
                 run.move_to_singular_start(t0, q0, v0, branch.a, branch.first_size)
@@ -641,12 +648,14 @@ def _create_run(
     v: Array,
     options: Options,
     derived: Sequence[CallbackTraces],
-    check: Callable[[CallbackTraces], None],
+    check_traces: Callable[[CallbackTraces], None],
 ) -> tuple[Run, GeneratedCode | None]:
-    """Return a new run that begins at a state, and the generated code that it calls."""
+    """Return a new run that begins at a state, and the generated code that it calls, or None if it calls none."""
     fixed = options.step_size is not None
-    code = code_for(system, options.method, fixed, options.compiled, t, q, check)
-    plan, interiors = plans_for(system, options.method, options.rtol, float(options.atol.min()), fixed, code, check)
+    code = code_for(system, options.method, fixed, options.compiled, t, q, check_traces)
+    plan, interiors = plans_for(
+        system, options.method, options.rtol, float(options.atol.min()), fixed, code, check_traces
+    )
     if derived:
         plan = plan.changed(traced=(*plan.traced, *derived))
     return Run(system, plan, t, q, v, options.rtol, options.atol, options.step_size, interiors), code
@@ -656,8 +665,8 @@ def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, opt
     """Check a start, unless the last check was of the same start; raise if the start is refused."""
     derivatives, harmless = options.check_derivatives, HARMLESS * (options.atol + options.rtol * np.abs(v0))
 
-    def check() -> None:
+    def check_values() -> None:
         exact = partial(has_exact_derivatives, system, t0, q0, v0)
         check_start(system, t0, q0, v0, derivatives=derivatives, exact=exact, harmless=harmless)
 
-    system.remembered_at(("start", derivatives), (t0, q0.tobytes(), v0.tobytes(), harmless.tobytes()), check)
+    system.remembered_at(("start", derivatives), (t0, q0.tobytes(), v0.tobytes(), harmless.tobytes()), check_values)

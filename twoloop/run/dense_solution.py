@@ -42,15 +42,15 @@ N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its r
 
 
 class StateTable(NamedTuple):
-    """States at the ends of accepted steps: n times, n rows [q, v, a], and the kinds of the n - 1 intervals."""
+    """States at the ends of accepted steps: n times, n rows [q, v, a], and the kinds of the n - 1 intervals between."""
 
     t: Array
     states: Array
-    kinds: NDArray[np.int64]  # kinds of intervals, see kernels/data/indices.py
+    kinds: NDArray[np.int64]  # codes of the data that their polynomials interpolate, see kernels/data/indices.py
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
-    """Return the rank of C_q and the rank of [C_q; A] at a state, for the argument `ranks` of `workspace`."""
+    """Return the rank of C_q and the rank of all constraint rows at a state, as `workspace` expects them."""
     from twoloop.kernels import advance
 
     kit = make_kit(system, t, q)
@@ -64,8 +64,9 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 class Interpolator:
     """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
-    `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: ranks of C_q and [C_q; A]. `plans`: keys are the
-    kinds of interval that are divided; the value is the plan whose method takes `plan.parts` equal steps in it.
+    `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: rank of C_q, and of all constraint rows. `plans`:
+    the keys are the kinds of intervals that must be divided. The value is the plan that divides such an interval into
+    `plan.parts` equal steps.
     """
 
     def __init__(
@@ -90,8 +91,8 @@ class Interpolator:
         self.fixed_order = fixed_order_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()
-        self.failures, self.warns = 0, True  # number of failures in the last call; whether to warn of failures
-        # keys of these dicts: times at which intervals begin. Interior states: (times, states), both ends included
+        self.failures, self.warns = 0, True  # number of states at which the last call failed; whether to warn of this
+        # keys of these two dicts: times at which intervals begin. Values here: (times, states), including both ends
         self.interior_states: dict[float, tuple[Array, Array]] = {}
         # arrays `memory` of crossing steps (steps across a singular position), which contain the polynomials there
         self.crossing_memories: dict[float, Array] = {}
@@ -104,7 +105,7 @@ class Interpolator:
         system, t0, row = self.arguments[:3]
         q0, form = row[: system.n_q], self.fixed_order
         for plan in self.plans.values():
-            load_step(plan.second)  # load the code now, because `result.sol` may take such a step at any time
+            load_step(plan.second)  # `result.sol` may need the second step of a pair of methods at any time: load it
         self.kits = {kind: make_kit(system, t0, q0, plan, form) for kind, plan in self.plans.items()}
         self.kit = make_kit(system, t0, q0, None, form)
         pattern = pattern_of(system, t0, q0) if form is None else np.zeros((0, 0))
@@ -116,7 +117,7 @@ class Interpolator:
         from twoloop.kernels import advance
 
         system, t0, row = self.arguments[:3]
-        self.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels keep the known ranks
+        self.work.notes[indices.GENERATION] = 1.0  # number of partitions so far: above 0, kernels keep the given ranks
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repair_plans: dict[bool, tuple[Plan, Any]] = {}
@@ -124,7 +125,7 @@ class Interpolator:
     def reset(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
         """Reset the interpolator for another run with the same compiled functions (kits).
 
-        `pattern`: 1 where [C_q; A] may be nonzero, else 0.
+        `pattern`: matrix with 1 where the constraint rows may be nonzero, else 0.
         """
         self.arguments = (system, t0, row.copy(), *self.arguments[3:])
         self.system, self.may_divide = system, True
@@ -177,7 +178,7 @@ class Interpolator:
         return out
 
     def row_function(self, table: StateTable, t: float) -> Callable[[float], Array]:
-        """Return the function time -> row [q, v] that is valid in the interval of `table` that contains t."""
+        """Return a function that computes the row [q, v] at any time in the interval of `table` that contains t."""
         intervals = _interval_rows(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         intervals[:, indices.END_TIME] = 1
         self._divide_inaccurate_intervals(table, intervals)
@@ -235,7 +236,7 @@ class Interpolator:
         errors = np.zeros(len(intervals))
         errors[is_divided] = self._estimate_residuals(divided, own_intervals)
         errors[~is_divided] = self._estimate_residuals(table, undivided)
-        # an interval of a kind that has to be divided is too long for one polynomial, also if the division failed
+        # intervals of the kinds in `plans` are too long for one polynomial: if division failed, the error is infinite
         errors[~is_divided & np.isin(intervals[:, indices.KIND], list(self.plans))] = np.inf
         is_accurate = errors <= np.where(intervals[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
         self.accurate_intervals.update(table.t[intervals[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
@@ -250,9 +251,9 @@ class Interpolator:
         return out
 
     def _repair_interval(self, table: StateTable, interval: Integers, smallest: float) -> None:
-        """Try other nodes for the polynomial of an interval; cache the best if its residual is below `smallest`.
+        """Try other nodes for the polynomial of an interval; cache those with the least residual, if below `smallest`.
 
-        Nodes to try: states in a crossing step, ends of N_REPAIR_STEPS steps, and the two ends of the interval only.
+        Nodes to try: states in a crossing step; the ends of N_REPAIR_STEPS steps; only the two ends of the interval.
         """
         i, kind = int(interval[indices.FIRST_OWN]), int(interval[indices.KIND])
         begin = float(table.t[i])
@@ -292,13 +293,13 @@ class Interpolator:
         return self._states_in_crossing_step(table, i, plan.memory) if succeeded else None
 
     def _states_in_crossing_step(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states in interval i: values of the polynomial that a crossing step stored in `memory`."""
+        """Return times and states in interval i, from the polynomial that a crossing step stored in `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
         times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
         states = np.array([state_at(memory, options, t) for t in times])
-        # the accelerations in the table are not copied, because rounding errors may dominate them
+        # at both ends, q and v are those of the table, but not the accelerations: rounding errors may dominate them
         states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]
         return times, states
 
@@ -339,9 +340,12 @@ class Interpolator:
     def _divide_intervals(
         self, table: StateTable, plan: Plan, kit: Any, numbers: Integers
     ) -> dict[float, tuple[Array, Array]]:
-        """Divide intervals into `plan.parts` steps, or fewer if steps fail; return interior states by first time."""
+        """Divide the intervals `numbers` (indices) into `plan.parts` steps, or fewer if steps fail.
+
+        Return a dict: the key is the time at which an interval begins, the value is its (times, states).
+        """
         n = self.system.n_q
-        tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
+        tolerances = np.zeros(ATOL + n)  # all 0; ESTIMATE = 0: steps do not estimate errors
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
         step_arrays = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
         interior_states = {}
@@ -386,7 +390,7 @@ class Interpolator:
         }
 
     def fill_accelerations(self, times: Array, states: Array, out: Array) -> None:
-        """Store [a, lam] in `out` for states on the constraints, given `times` and rows [q, v]; NaN on failure."""
+        """Store rows [a, lam] in `out`, given times and rows [q, v] that satisfy the constraints; NaN on failure."""
         fill, times, states = entry_point(self.kernels.fill_accelerations), *map(np.ascontiguousarray, (times, states))
         failures = fill(self.kit, self.work, times, states, out)
         if failures > 0 and self.fixed_order is not None:
@@ -409,7 +413,7 @@ def _blocks_of_intervals(rows: Integers) -> list[Integers]:
 
 
 def _interval_rows(table: StateTable, numbers: Integers) -> Integers:
-    """Return the table of intervals that kernels read (columns: see indices.py), still without output times."""
+    """Return a table of intervals (indices `numbers`) for kernels, without output times; columns: see indices.py."""
     rows = np.zeros((len(numbers), indices.N_COLUMNS), dtype=np.int64)
     rows[:, indices.FIRST_OWN], rows[:, indices.LAST_OWN] = numbers, numbers + 1
     rows[:, indices.KIND] = table.kinds[numbers]
@@ -464,7 +468,7 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.fill_accelerations(times, rows, a_and_lam)
-        if interpolator.fixed_order is not None or interpolator.repair_plans:  # another run may need another workspace
+        if interpolator.fixed_order is not None or interpolator.repair_plans:  # its workspace may not suit another run
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 
@@ -499,7 +503,7 @@ class DenseState:
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return `rows`, sorted by time, as columns in the order of `t`; for a single time, return a vector."""
+        """Return `rows` (in ascending order of time) as columns in the order of `t`; for a scalar t, as a vector."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]
@@ -530,16 +534,17 @@ class DenseSolution:
     Between accepted steps q and v are Hermite polynomials; the inner loop then restores the dependent coordinates, so
     that the constraints hold to rounding. At an accepted step the state is the stored one. The polynomials go through
     q, v and a of four neighbouring states (order 12). Where Newton's method solved the outer loop, they go through q
-    and v (order 8), because a contains the noise of vibrations that are stepped over. For `Lobatto16`, `BDF` and
-    `Newmark`, v has a polynomial of its own, through v and a (order 8).
+    and v (order 8), because accelerations contain the noise of vibrations that are faster than the steps. For
+    `Lobatto16`, `BDF` and `Newmark`, v has a polynomial of its own, through v and a (order 8).
 
     Some steps are too long for such polynomials: steps of `RungeKutta` of order 6 and more (with Newton's method, of
     order 7 and more), of `Taylor` and of `Lobatto16`, also within `auto`. Each such step is divided into 2 to 6 equal
-    steps of the method when a time within it is first evaluated; this costs about as much as the run. If the last node
-    of a polynomial changes it by more than the tolerances, the constraints and equations of motion are evaluated at two
-    times in the interval. Beside a singular position or a jump of a force, the polynomial may violate them. Then three
-    other polynomials are tried: through states of a step across the position, through ends of four steps of `DOP853`
-    (after Newton's method: of a Radau method), and through the ends of the interval. These evaluations are not counted.
+    steps of the method when a time within it is first evaluated; to divide all steps costs about as much as the run. If
+    leaving out the last node changes a polynomial by more than the tolerances, the constraints and equations of motion
+    are evaluated at two times in the interval. The polynomial may violate them beside a singular position or a jump of
+    a force. Then three other polynomials are tried: through states of a step across the position, through ends of four
+    steps of `DOP853` (after Newton's method: of a Radau method), and through the ends of the interval. The statistics
+    of the run do not count these evaluations.
 
     The solution takes 8 (2 + 3 n_q) bytes of memory per step.
 

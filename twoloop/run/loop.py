@@ -101,10 +101,13 @@ class Interrupts:
         return self
 
     def returns_result(self, error: BaseException) -> bool:
-        """Return whether a run that Ctrl-C ended returns a result; it does not if a signal handler raised `error`."""
+        """Return whether the run returns a result after Ctrl-C has ended it by `error`.
+
+        If a user's handler raised `error`, or after more than MAX_STORED_SIGNALS signals, there is no result.
+        """
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # may raise: if the user has a handler, it stays in place; `_on_signal` may raise, too
+        self.install_handlers()  # a signal may arrive here: then a user's handler, or `_on_signal`, may raise
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:
@@ -142,12 +145,12 @@ def interrupted_fields(system: ConstrainedSystem, t0: float, events: list[Any] |
 BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
 BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
 CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, because steps beyond the event are wasted
-# chunks do not grow further once a chunk takes more than this CPU time (s), so that Ctrl-C is noticed soon
+# chunks grow until one takes this CPU time (s); with longer chunks, Ctrl-C would be noticed late
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-# the base of a crossing step is one of the last N_RECENT states, or one of the last N_RECENT ends of long steps in the
-# last N_LAST_STATES: near a singular position, many steps may be short
+# a crossing step (across a singular position) begins its polynomial at a past state: one of the last N_RECENT states,
+# or of the last N_RECENT ends of long steps. It searches N_LAST_STATES states, because many steps may be short there
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
@@ -160,9 +163,9 @@ class IntegrationLoop:
     """Loop that integrates a run to its end, and records it.
 
     The run is at its start, or a first chunk of steps was taken: then `start` is the row [q, v, a, lam] at the start,
-    and `add_first_chunk` has to be called. `system`: the system of the result, if the arrays of the run's own system
-    will be overwritten. After each chunk, `report` is called with the time reached. `is_final_attempt`: whether a run
-    that may have missed short changes of forces warns; otherwise the caller repeats such a run.
+    and `add_first_chunk` has to be called. `system`: system for the result, needed if later runs will overwrite arrays
+    of `run.system`. After each chunk (call of compiled code), `report` is called with the time reached. If
+    `is_final_attempt`, warn if the run may have missed short changes of forces; else the caller repeats such a run.
     """
 
     def __init__(
@@ -198,11 +201,11 @@ class IntegrationLoop:
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
         self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last chunks, see _last_states
-        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, and rows of steps to be stored
         if self.request.store.append_only:
             self._store_step_fields()
         self.n_filled = np.zeros(2, dtype=np.int64)
-        may_end_before_t1 = has_terminal_event or time_limit is not None  # users of such runs may choose a very late t1
+        may_end_before_t1 = has_terminal_event or time_limit is not None  # then t1 may be far too late
         self.stall_detector = StallDetector(run.t0, np.inf if may_end_before_t1 else MAX_STEPS_LEFT)
         self.stiffness_monitor = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
@@ -225,7 +228,7 @@ class IntegrationLoop:
             self._choose_method(False, 0)
         buffers, is_copied = self._next_buffers(), True
         while self.code == a.PAUSED:
-            across, over_jump = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
+            in_crossing, over_jump = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
             began = time.process_time()
             self._take_chunk(buffers)
             n_rows, n_steps = self.n_filled.tolist()
@@ -233,14 +236,14 @@ class IntegrationLoop:
             is_copied = 2 * n_rows < len(buffers[0])  # a copy of a buffer that is less than half full saves memory
             if is_copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
-            if across and n_steps and self.request.between_steps:
+            if in_crossing and n_steps and self.request.between_steps:
                 self.recorder.store_crossing(self.plan.memory)
-            self._store_chunk(t, rows, steps, self._interval_kinds(steps, across, over_jump))
+            self._store_chunk(t, rows, steps, self._interval_kinds(steps, in_crossing, over_jump))
             chunk_time = time.process_time() - began
             self.cpu_time += chunk_time
             if recorder.end_event is not None:
                 break
-            self._handle_code(steps, across, chunk_time)
+            self._handle_code(steps, in_crossing, chunk_time)
             if not is_copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
                 buffers = self._next_buffers()
         if is_copied and buffers[1].size <= MAX_SPARE_FLOATS:
@@ -255,15 +258,18 @@ class IntegrationLoop:
             raise self.callback_error
         return self._build_record(check_derivatives)
 
-    def _handle_code(self, steps: Array, across: bool, chunk_time: float) -> None:
-        """Act on `self.code`; set this code to PAUSED if the run goes on. `chunk_time`: CPU time of the chunk (s)."""
+    def _handle_code(self, steps: Array, in_crossing: bool, chunk_time: float) -> None:
+        """Act on `self.code`, the end code of a chunk; set it to PAUSED if the run goes on.
+
+        `in_crossing`: whether the chunk tried to cross a singular position. `chunk_time`: its CPU time (s).
+        """
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness_monitor.samples:
                 self.stiffness_monitor.add_steps(steps[:, self.run.a.H])
             self.report(self.t1)
             return
-        self._check_progress(steps, across, chunk_time)
-        self._choose_method(across, len(steps))
+        self._check_progress(steps, in_crossing, chunk_time)
+        self._choose_method(in_crossing, len(steps))
         self.report(self.run.clock[self.run.a.T])
 
     def _take_chunk(self, buffers: Buffers) -> None:
@@ -281,12 +287,13 @@ class IntegrationLoop:
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:
-            # A callback raised the exception. If forces were sampled ahead, perhaps at a state that the motion never
-            # reaches, continue without such samples. Else raise it again at the end, unless an event has ended the run
+            # A callback raised the exception. If it was called to sample forces ahead of a step, perhaps at a state
+            # that no motion reaches, continue without samples. Else end the run, and raise the exception again unless
+            # an event has ended the run before
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
-                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # a node may be at a position that no motion reaches
+                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # the attempt fails; its positions may be unreachable
             else:
                 self.code, self.callback_error = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:
@@ -328,12 +335,12 @@ class IntegrationLoop:
                 self.latest_chunks.pop(0)
 
     def _store_step_fields(self) -> None:
-        """Add the fields with one row per step to the store, for steps that are not stored yet."""
+        """Store the fields with one row per step (STEP_ARRAYS) of all steps whose fields are not stored yet."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
         for name, values in step_fields(steps, self.counts).items():
             self.request.store.add(name, values)
 
-    def _check_progress(self, steps: Array, across: bool, chunk_time: float) -> None:
+    def _check_progress(self, steps: Array, in_crossing: bool, chunk_time: float) -> None:
         """Choose how many steps the next chunk attempts; change `self.code` if the run stalls, or has to stop."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
@@ -342,7 +349,7 @@ class IntegrationLoop:
         if self.code == a.PAUSED and run.n_attempts() >= self.next_check:
             self.check_interval = min(2 * self.check_interval, self.largest_chunk)
             self.next_check = run.n_attempts() + self.check_interval
-            if not across:
+            if not in_crossing:
                 self.stiffness_monitor.sample_state(float(run.clock[a.T]), run.state, run.system.n_q)
             if self.stall_detector.is_stalled(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
                 self.code = STAGNATED
@@ -354,7 +361,7 @@ class IntegrationLoop:
         if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and (self.interrupts.n_signals or self.recorder.interrupted):
             self.code = INTERRUPTED
 
-    def _choose_method(self, across: bool, n_steps: int) -> None:
+    def _choose_method(self, in_crossing: bool, n_steps: int) -> None:
         """Change plan, controls or kit for the next steps if `self.code` requires it; then set the code to PAUSED."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
@@ -364,18 +371,18 @@ class IntegrationLoop:
             self.plan, self.control = cross_singularity(run, self._last_states())
             self.kit = crossing_kit(run.kit)
             self.code = a.PAUSED
-        elif self.code == a.SWITCH_METHOD or self._is_stalled(across):
+        elif self.code == a.SWITCH_METHOD or self._needs_substitute(in_crossing):
             switch_method(run)
             if self.code == a.STEP_TOO_SMALL:
                 run.clock[a.H_NEXT] = run.choose_first_step(float(run.clock[a.T]), self.t1, run.state)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.NEEDS_COMPILATION:
             began = time.monotonic()
-            load_step(run.plan.second)  # compile, or load from disk, the second step of a pair of methods
+            load_step(run.plan.second)  # compile it, or load it from disk: the second step of a pair of methods
             renew_kit(run)
             self.deadline += time.monotonic() - began  # compilation does not count against time_limit
             self.kit, self.code = run.kit, a.PAUSED
-        elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
+        elif self.code == a.AT_DISCONTINUITY and not in_crossing and apply_jump(run, self.t1):
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
             had_pieces = bool(run.piece_ends)
@@ -386,7 +393,7 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _last_states(self) -> list[TimedState]:
-        """Return states (time, row) from which the base of a crossing step is chosen; [] if not all are recorded."""
+        """Return past states at which the polynomial of a crossing step may begin; [] if states are not recorded."""
         if not self.request.every_step:
             return []
         states: list[TimedState] = [(self.run.t0, self.start)]
@@ -397,18 +404,18 @@ class IntegrationLoop:
         return ends[-N_RECENT:] + states[-N_RECENT:]
 
     def _correct_last_state(self) -> None:
-        """Replace [q, v, a] of the last recorded state by the run's state, which is on the crossing's polynomial."""
+        """Replace [q, v, a] of the last recorded state by those of the run, which are on a crossing's polynomial."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)
         if self.latest_chunks and len(self.latest_chunks[-1][0]) and self.latest_chunks[-1][0][-1] == t:
             self.latest_chunks[-1][1][-1, : len(row)] = row
 
-    def _is_stalled(self, across: bool) -> bool:
+    def _needs_substitute(self, in_crossing: bool) -> bool:
         """Return whether steps became too small away from singular positions, and the plan has a substitute."""
         run, a = self.run, self.run.a
         is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
-        return is_too_small and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
+        return is_too_small and not in_crossing and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
 
     def _build_record(self, check_derivatives: bool) -> Record:
         """Return the record of the finished run, without data after the interruption or the event that ended it."""
@@ -477,7 +484,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """If the run passed near a singular position, return the states at the prescribed ends of steps; else []."""
+        """If the run passed near a singular position, return the states (if steps had to end at them); else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (
@@ -503,13 +510,13 @@ class IntegrationLoop:
         max_spacing = float(run.tolerances[indices.DEFECT_GAP]) if run.short_forces.by_state else spacing
         return Recorder(self.request, interpolator, n, run.t0, self.start, max_spacing)
 
-    def _interval_kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:
-        """Return, for each accepted step, the kind of its interval in the dense solution."""
+    def _interval_kinds(self, steps: Array, in_crossing: bool, over_jump: bool) -> NDArray[np.int64]:
+        """Return, for dense output, the kind of the interval of each accepted step (row of `steps`)."""
         run = self.run
         if not self.request.between_steps:
             return NO_KINDS
         if over_jump:
             return np.full(len(steps), indices.JUMP)
-        if across:
+        if in_crossing:
             return np.full(len(steps), indices.ACROSS)
         return interval_kinds(run, steps)

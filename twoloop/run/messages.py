@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of the end of a run, in addition to those of `advance`
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # end codes of a run, in addition to those that `advance` returns
 STAGNATION_STEPS = 20_000  # smallest number of accepted steps over which the mean step size is computed
 # A run stalls if its mean step size is below STAGNATION_PACE times its largest step and the rest of the run would take
 # more than STAGNATION_LEFT steps, or if the rest would take more than MAX_STEPS_LEFT steps (days of computing)
@@ -47,7 +47,8 @@ STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
 class StallDetector:
     """Monitor of the sizes of accepted steps, to detect a run that makes no progress.
 
-    A run is stalled if the rest of it, with the mean size of the last steps, takes more than `max_steps_left` steps.
+    A run is stalled if the rest of it, with the mean size of the last steps, takes more than `max_steps_left` steps. If
+    steps were much longer before, the limit is STAGNATION_LEFT steps.
     """
 
     def __init__(self, t0: float, max_steps_left: float):
@@ -96,8 +97,8 @@ class StiffnessSample(NamedTuple):
     v: Array
     a: Array
     h: float  # step size before the state (s)
-    vibration: float  # largest stable h times the angular frequency of a vibration
-    decay: float  # largest stable h times the rate of a decay
+    vibration: float  # the method is stable up to this product of step size and angular frequency of a vibration
+    decay: float  # the method is stable up to this product of step size and rate of a decay
 
 
 class StiffnessMonitor:
@@ -170,9 +171,10 @@ def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: lis
 def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, independent: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Return the magnitude of the dominant eigenvalue of dF/dq or (`by_v`) dF/dv, and whether it is negative.
+    """Return the magnitude of the dominant eigenvalue of dF/dq (`by_v`: dF/dv), and whether it is negative.
 
-    The power iteration, in the coordinates `independent`, begins with `direction` and overwrites it by the eigenvector.
+    F: accelerations of the independent coordinates, whose indices are `independent`. The power iteration begins with
+    `direction`, and overwrites it by the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 
@@ -195,12 +197,13 @@ def _dominant_eigenvalue(
     return eigenvalue, is_negative
 
 
-# messages call C_q (or M) singular if the ratio of its smallest to its largest singular value is at most this
+# messages call C_q nearly singular if its smallest singular value is at most this fraction of its largest one, and
+# mention missing inertia if this holds for the eigenvalues of M on the velocities that the constraints allow
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not trusted if rounding errors of velocities (or accelerations) exceed this multiple of the tolerances
 MAX_LASTING_ERROR = 100.0
-# the run warns if the ratio of the smallest to the largest singular value of the constraint rows at its end is at most
-# this: then the constraints do not determine the velocities there
+# the run warns if, at its end, the smallest singular value of the constraint rows is at most this fraction of the
+# largest: then the constraints do not determine the velocities there
 MAX_RATIO_AT_END = 1e-6
 # advice if no step leads across a singular position; loose tolerances help, because rounding errors are large near it
 _REMEDIES = (
@@ -241,9 +244,9 @@ def reject_velocity_jumps(
 ) -> tuple[Status, str]:
     """Check whether rounding, or a change of branch, has changed velocities near a singular position.
 
-    If velocities have changed, return RANK_LOST and the reason, else return `status` and `message`.
-
-    `last_step`: [state before the last step] if velocities jumped in it. `output_states`: states at output times.
+    If so, return RANK_LOST and a message with the reason, else return `status` and `message`. `last_step`: [state
+    before the last step] if velocities jumped in this step, else []. `output_states`: other states to check. Only
+    states before `end` are checked.
     """
     end_state, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(state for ends in crossings for state in ends), *output_states], end)
@@ -256,11 +259,14 @@ def reject_velocity_jumps(
 
 
 def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
-    """Return a sentence about the first of `states` before `end` in which rounding changed v; "" if there is none."""
+    """Describe the earliest of `states` whose v has a rounding error of more than MAX_LASTING_ERROR tolerances.
+
+    Return a sentence; "" if there is no such state. Only states before the time `end` are checked.
+    """
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
-        at_singular_start = t == run.t0 and run.starts_singular  # velocities there are given, not computed
+        at_singular_start = t == run.t0 and run.starts_singular  # v is given there, not computed
         if t >= end or at_singular_start or certainly_exceed(run.near_threshold, system.rows(t, q), run.rank):
             continue
         error_ratio = _velocity_error_ratio(run, t, q, v)
@@ -274,12 +280,15 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
 
 
 def describe_arrival(t: float, fixed: bool) -> str:
-    """Return the first sentence of the message of a run that reached its end."""
+    """Return the first sentence of the message of a run that reached its end; `fixed`: its step size was constant."""
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 
 def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Status, str]:
-    """Return the status and the message of a run that ended with `code`: a code of `advance`, or of this module."""
+    """Return the status and the message of a run that ended with `code`.
+
+    `code`: an end code of `advance` (see loop_state.py), or INTERRUPTED, STAGNATED or OUT_OF_TIME.
+    """
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
         text = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
@@ -408,7 +417,7 @@ def warn_of_singular_end(run: "Run") -> str:
 
 
 def warn_of_inaccurate_crossing(run: "Run") -> str:
-    """Warn if ordinary steps may have passed a singular position inaccurately; return the warning as a sentence."""
+    """Warn if ordinary steps may have passed a singular position inaccurately; return the warning, or "" if none."""
     ratio = float(run.clock[run.a.PIVOT_PASSED])
     if ratio == 0.0:
         return ""
@@ -424,7 +433,7 @@ def warn_of_inaccurate_crossing(run: "Run") -> str:
 
 
 def warn_user(text: str) -> str:
-    """Issue a ConstraintWarning at the line of user code that called twoloop; return it as a sentence for a message."""
+    """Issue a ConstraintWarning at the line of user code that called twoloop; return its text as a sentence."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("twoloop."):
         frame, level = frame.f_back, level + 1
@@ -444,7 +453,7 @@ def _ratio_text(run: "Run", t: float, q: Array) -> str:
 
 
 def _describe_near_end(run: "Run", t1: float) -> str:
-    """If the run stopped so near t1 that a crossing step would evaluate beyond t1, return a sentence on it; else ""."""
+    """Return a sentence if the run stopped so near t1 that t1 may have prevented a crossing; else ""."""
     time_left = t1 - float(run.clock[run.a.T])
     if time_left > max(NEAR_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""

@@ -51,18 +51,18 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; if the method tests the error of all steps, also `untested`: None."""
+        """Fields `method` and `rtol` of a result; also `untested` = None if all steps test the errors of q and v."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_step_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
-        run.work.notes[indices.NEXT_JUMP] = t1  # the time of the next known jump of C_t or b: none before t1
+        run.work.notes[indices.NEXT_JUMP] = t1  # no jump of the velocities is known before t1
         if self.step_size is None:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # stands for the arguments and options of the last call before there was a call
+NO_OPTIONS: Any = (None,) * 12, None  # last arguments and options, if there was no call before
 
 
 def options_of(
@@ -86,7 +86,7 @@ def options_of(
     """
     last_arguments, options = system.shared.get("options", NO_OPTIONS)
     m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last_arguments
-    # compare the arguments one by one: a loop over them would take a tenth of the time of a short repeated call
+    # compare without a loop, which would take a tenth of the time of a short repeated call
     same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
     same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
     if same and checks is check_derivatives and code is compiled:
@@ -120,7 +120,7 @@ def options_of(
         check_positive("time_limit", time_limit)
     step_options = first_step, float(max_step), max_steps, step_size
     options = Options(method_object, float(rtol), tolerances, *step_options, generates, bool(check_derivatives))
-    if type(atol) is float and is_preset(method):  # the caller may change objects of other types between calls
+    if type(atol) is float and is_preset(method):  # other objects may change between calls: do not store them
         arguments = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress
         system.shared["options"] = (*arguments, time_limit, check_derivatives, compiled), options
     return options

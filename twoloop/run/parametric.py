@@ -1,8 +1,8 @@
 """Use one run for many systems that differ only in their parameters.
 
 All numbers that depend on parameters are in arrays, which are filled anew for the next system. Then choices that depend
-on the numbers, such as pivots, are checked again, and callbacks are compared with their traces near the start. Along
-the run, they are compared where states or parameters are outside the region in which earlier runs compared them.
+on these numbers, such as pivots, are checked again, and callbacks are compared with their traces near the start. After
+the run, callbacks and traces are compared where states or parameters are outside the region of earlier comparisons.
 """
 
 import copy
@@ -74,7 +74,7 @@ class ParametricRun:
     """Run that integrates one system after another: `use_parameters_of` writes a system's parameters to its arrays.
 
     `run`: a copy of the run in `shared`, at its start. `current_system`: the system whose parameters the arrays contain
-    now. `system`: a copy of it that uses these arrays, and has a cache of its own.
+    now. `system`: a copy of `current_system` that uses these arrays, and has a cache of its own.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
@@ -124,12 +124,12 @@ class ParametricRun:
             if with_derivatives:
                 check_derivatives(system, t0, q, lambda: has_exact_derivatives(system, t0, q, v))
             refuse_wrong_traces(run.traced, system, t0, t1, q, v)
-        except Exception:  # such as an exception of a callback, which `set_up` will report
+        except Exception:  # for example an exception of a callback, which `set_up` will report
             return False
         return self._mass_agrees
 
     def _replace_arrays(self, plan: Plan) -> Plan:
-        """Return a copy of a plan in which arrays of numbers (see `_fill_arrays`) replace arrays of expressions."""
+        """Return a copy of a plan whose arrays of expressions are replaced by arrays of their values (numbers)."""
         array, values = self._expression_arrays.array, vars(plan)
         changes: dict[str, Any] = {name: array(values[name]) for name in NUMBER_FIELDS if values[name] is not None}
         changes |= {name: self._replace_arrays(values[name]) for name in PLAN_FIELDS if values[name] is not None}
@@ -149,5 +149,5 @@ def _values_of_plan(plan: Plan) -> Iterator[Any]:
             yield from _values_of_plan(value)
         elif name == "traced":
             yield [part.tobytes() for each in value for part in each.program[:-1]]
-        elif name != "stable_to":  # a lambda, which differs even between equal plans
+        elif name != "stable_to":  # `stable_to` is a lambda: it differs even between equal plans
             yield value.tobytes() if isinstance(value, np.ndarray) else value

@@ -32,7 +32,9 @@ Array = NDArray[np.float64]
 MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle between a row of C_q and the other rows is below this
 # MAX_CORRECTIONS: largest number of Newton iterations; they end when a correction is at most ROUNDING times max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-MAX_NONLINEARITY = 0.5  # largest error of a prediction by C_q, relative to the displacement, on the same assembly
+# a displaced guess leads to the same assembly if the position predicted by C_q, to first order, differs from its
+# projection by at most this fraction of the displacement
+MAX_NONLINEARITY = 0.5
 
 
 class _SparseProjection:
@@ -62,9 +64,9 @@ class _SparseProjection:
         return displacement - change
 
     def project_nearby(self, q: Array) -> Array | None:
-        """Return q projected by the independent rows of C_q; None on failure, or if other constraints are violated.
+        """Return q projected by the independent rows of C_q; None on failure, or if the other constraints are violated.
 
-        The independent rows are not chosen anew: off the constraints, the other rows are only nearly dependent.
+        The independent rows are those of the last choice: off the constraints, the other rows are not quite dependent.
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
         for _ in range(MAX_CORRECTIONS):
@@ -85,7 +87,7 @@ class _SparseProjection:
         if self.run_task(tasks.RESTORE, q, discarded) != indices.DONE:
             return None
         v = v.copy()  # until the positions are final, only a copy of the velocities is projected
-        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # a second RESTORE, down to rounding errors
+        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # two RESTORE: down to rounding errors
             if self.run_task(task, q, v) != indices.DONE:
                 return None
         self.position = q
@@ -131,7 +133,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
 def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
-    """Return (q, v) projected by sparse factors; None if the result or its assembly is in doubt."""
+    """Return (q, v) projected by sparse factors; None on failure, or if another assembly may be as near."""
     form = fixed_order_form(system, t, q)
     if form is None:
         return None
@@ -180,7 +182,9 @@ def _nearby_guesses_match(projection: _SparseProjection, position: Array, change
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-CONVERGED_VIOLATION = 1e-2  # the iteration ends below this violation, relative to the violation allowed at a start
+# below this violation, relative to the violation that is allowed at a start, the iteration ends when a step no longer
+# halves the violation
+CONVERGED_VIOLATION = 1e-2
 # singular values count as zero if they are below this fraction of the largest one: RANK_CUTOFF for ranks, LSTSQ_CUTOFF
 # for least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
@@ -334,7 +338,7 @@ class _LargeState(ConsistentState):
 def _projected_position(
     system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int], check_assembly: bool
 ) -> Array:
-    """Project a guess by changing its `free` coordinates; raise if that fails, or if the assembly is in doubt."""
+    """Project a guess by changing its `free` coordinates; raise if that fails, or another assembly may be as near."""
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
@@ -425,7 +429,7 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = LSTSQ_CUTOFF
 ) -> tuple[Array | None, float, int]:
-    """Return the projected q (None: diverged), violation / allowed violation at q, and the number of iterations."""
+    """Return the projected q (None: diverged), violation / allowed violation there, and the number of iterations."""
     least_excess, best_q, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
@@ -438,13 +442,13 @@ def _gauss_newton(
         scales = scales_of(system, t, q, jacobian)
         excess = Violation.measure_q(system, t, q, jacobian, scales).excess
         if excess == 0.0 or (excess <= CONVERGED_VIOLATION and excess >= 0.5 * least_excess):
-            return q, excess, iteration  # rounding prevents a smaller violation
+            return q, excess, iteration  # converged: rounding prevents a smaller violation
         if excess < least_excess:
             least_excess, best_q = excess, q
         q = q + step
         if not (np.abs(q - guess) <= MAX_CHANGE * scales.columns).all():  # also true for NaN
             return None, np.inf, iteration
-    # rounding may keep the excess above CONVERGED_VIOLATION
+    # no convergence, perhaps because of rounding: the best position may still satisfy the constraints (excess <= 1)
     return best_q if least_excess <= 1.0 else q, least_excess, MAX_ITERATIONS
 
 
@@ -458,7 +462,7 @@ def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cutoff
 
 
 def _rank(scaled: Array) -> int:
-    """Return the number of singular values above RANK_CUTOFF times the largest one."""
+    """Return the number of singular values of the scaled C_q above RANK_CUTOFF times the largest one."""
     values = np.linalg.svd(scaled, compute_uv=False)
     return int((values > RANK_CUTOFF * max(float(values.max(initial=0.0)), 1e-300)).sum())
 
@@ -478,7 +482,7 @@ def _identify_assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int
 
 
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
-    """Return the right singular vector (n_q,) of the smallest nonzero singular value, scaled to max|x| = 1."""
+    """Return the right singular vector x (n_q,) of the scaled C_q to its least nonzero singular value; max|x| = 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
     nonzero = values > RANK_CUTOFF * values.max()
     direction = np.zeros(scaled.shape[1])
@@ -487,7 +491,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """If C_q nearly loses rank, with scaled rows and columns and without scaling, return a sentence on it; else ""."""
+    """Return a sentence if C_q nearly loses rank, both as it is and with scaled rows and columns; else ""."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]
@@ -504,7 +508,7 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
 def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
-    """Return the message for a projection that fails because the `free` columns lack rank; `why`: what failed."""
+    """Return the message for a projection that fails because the columns of the `free` coordinates lack rank."""
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
     name = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:

@@ -116,14 +116,14 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING_STATES = 1024  # largest number of new states before they are searched for events, and interpolated
+MAX_PENDING_STATES = 1024  # when more states than this wait, their intervals are searched for events and output times
 
 
 class OutputRequest(NamedTuple):
     """Requested output of a run."""
 
     times: Array | None = None  # output times; None: the ends of all accepted steps
-    ends_at_outputs: bool = False  # whether steps end at all output times: then no states need be interpolated
+    ends_at_outputs: bool = False  # whether steps end at all output times, so that output needs no interpolation
     dense: bool = False  # whether dense output, `result.sol`, is requested
     events: list[Event] | None = None  # events to be searched for; None: no events were requested
     store: Any = None  # `MemoryStore` or `FileStore` to which the output is added; None: a new MemoryStore
@@ -206,7 +206,7 @@ class Recorder:
         request, store = self.request, self.request.store
         if request.times is None:
             self._store_states(t, rows)
-        elif request.ends_at_outputs:  # steps also end at other times, such as the end of the run
+        elif request.ends_at_outputs:  # steps may also end at other times, such as the end of the run
             is_output = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
             self._store_states(t[is_output], rows[is_output])
         if request.dense:
@@ -215,7 +215,7 @@ class Recorder:
             store.add("sol_kinds", kinds)
 
     def _store_states(self, t: Array, rows: Array) -> None:
-        """Store times and rows [q, v, a, lam] or [q, v]; [a, lam] are added to short rows, now or after the run."""
+        """Store times and rows [q, v, a, lam], or rows [q, v], to which `_complete_rows` adds [a, lam] now or later."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._complete_rows(t, rows) if self.request.store.append_only else rows)
 
@@ -238,7 +238,7 @@ class Recorder:
         return None if self.search is None else self.search.ended
 
     def search_intervals(self, end: int | None = None) -> None:
-        """Search the intervals before state number `end` for events, and store states at output times in them."""
+        """Search intervals up to the state with index `end` (None: last) for events; store states at output times."""
         end = len(self._t) - 1 if end is None else end
         interpolator = self.interpolator
         if interpolator is None or self.end_event is not None or self.interrupted:
@@ -362,19 +362,19 @@ class Statistics:
     Attributes
     ----------
     n_accepted, n_rejected_error, n_rejected_convergence : int or None
-        Steps accepted, steps that failed the error test, steps whose loops did not converge.
+        Steps accepted, steps that failed the error test, steps whose outer or inner loop did not converge.
     n_outer : int or None
         Iterations of the outer loop (each evaluates every stage once).
     n_inner : int or None
         Newton iterations of the inner loop.
     n_evaluations : int or None
-        Solutions of eq. (6) for accelerations and multipliers, and evaluations of the forces alone, for the derivatives
-        of a banded system.
+        Solutions of the linear equations (6) of the paper for accelerations and multipliers; also evaluations of the
+        forces alone, for the derivatives of a banded system.
     n_partitions : int or None
         Coordinate partitionings, the first included.
     n_factorizations : int or None
-        Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, of the partitionings,
-        and for Newton's method in the outer loop.
+        Matrix factorisations: of C_qd (the dependent columns of C_q), of C_q M^-1 C_q^T, of M where it is not constant,
+        of the partitionings, and for Newton's method in the outer loop.
     n_jacobians : int or None
         Evaluations of the derivatives of the right-hand side for Newton's method in the outer loop.
     cpu_time : float
@@ -514,7 +514,7 @@ class _Deferred:
     def __get__(self, record: Any, owner: Any = None) -> Any:
         values = {} if record is None else vars(record)
         if "later" not in values:
-            raise AttributeError(self.name)  # read from the class, or no function computes missing fields
+            raise AttributeError(self.name)  # the field is read from the class, or the record has no function `later`
         values.update(values["later"](self.name) | values)
         return values[self.name]
 
@@ -528,12 +528,13 @@ Integers = NDArray[np.int64]
 
 COUNT_NAMES = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 GET_COUNTS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
-# counts before the first step: rejections by the error test, rejections for lack of convergence, partitions
+# totals before the first step: steps rejected by the error test, steps rejected because an iteration did not converge,
+# and partitions (the first one is chosen at the start)
 INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return fields of a record with one row per step; update `counts` (see INITIAL_COUNTS) in place."""
+    """Return the fields with one row per step; `counts`: totals before these steps, on return after these steps."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -552,7 +553,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return, for each row of `steps` (taken with the run's plan), the kind of its interval in the dense solution."""
+    """Return, for dense output, the kind of the interval of each of `steps` (rows of steps by the run's own plan)."""
     if run.plan.separate:
         return np.full(len(steps), indices.SEPARATE)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS

@@ -27,12 +27,12 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-FIRST_FORCE = "first force"  # key in the system's cache of the force at the start, if it is compiled and not traced
+FIRST_FORCE = "first force"  # key in `system.derived`: force at the start, if the callback is compiled but not traced
 N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
 
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
-    """Return the region of states where runs of the system have already compared its callbacks with the same traces."""
+    """Return the region of states where earlier runs of the system compared its callbacks with this run's traces."""
     if run.region is not None:
         return run.region
     key = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
@@ -51,11 +51,13 @@ def check_callbacks_along_run(
 ) -> tuple[Status, str]:
     """Compare callbacks with their traces at states of a run that ended at `end`; return a status and a message.
 
-    Return `status` and `message` unchanged if all callbacks are right; else the message begins with the difference. If
-    `check_derivatives`, compare derivatives with exact ones, or with finite differences. Call Python forces twice: they
-    must return the same value. `states(all_states)` returns states [t, q, v], latest first. States inside the region of
-    earlier comparisons (`CheckedRegion`) are skipped, unless `is_due`: some runs repeat all comparisons. `is_inside`:
-    the whole run is in this region.
+    If all callbacks are right, return `status` and `message`; else another status, and a message that begins with the
+    difference. Python forces are called twice, and must return the same value. If `check_derivatives`, derivatives are
+    compared with exact ones, or with finite differences.
+
+    `states(all_states)`: function that returns states [t, q, v], latest first; argument: whether all will be compared.
+    `is_due`: True: compare at all of these states; False: skip states in the region of earlier comparisons, see
+    `CheckedRegion`. `is_inside`: whether the whole run is in this region.
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
@@ -88,8 +90,8 @@ def check_callbacks_along_run(
 def _check_derivatives(run: Run, states: Array, first_state: Array, status: Status, message: str) -> tuple[Status, str]:
     """Compare derivatives with exact ones, or finite differences, at states of a run; return a status and a message.
 
-    M, `kinematics` and callbacks for entries of sparse matrices are checked, too. `first_state`: first [t, q, v] of the
-    run. If all are right, return `status` and `message`; else WRONG_DERIVATIVE and a message with the mistake.
+    M, `kinematics` and callbacks for entries of sparse matrices are checked, too. If all are right, return `status` and
+    `message`; else WRONG_DERIVATIVE and a message with the mistake. `first_state`: first state [t, q, v] of the run.
     """
     n = run.system.n_q
     chosen_states = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
@@ -132,7 +134,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return (arguments, value) of a compiled force at the start; of Python functions, delete earlier samples."""
+    """Return ((t0, q0, v0), force there) if the force is compiled; else discard the force samples of earlier runs."""
     if functions := python_functions(system):
         functions.restart()
         return None
@@ -144,7 +146,7 @@ def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> t
 def describe_changed_force(run: Run) -> str | None:
     """Describe the error if the force now differs from an earlier value for equal arguments; None: no error.
 
-    Two calls after the run do not reveal a force that changes slowly (with the clock) or once (after 1000 calls).
+    Two calls after the run would not reveal a force that changes slowly (with the clock) or once (after 1000 calls).
     """
     system, functions = run.system, python_functions(run.system)
     if functions is None:
@@ -178,12 +180,12 @@ def _change_text(name: str, t: float, entry: int, first_value: float, second_val
 
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
-FIRST_FRACTION = 0.1  # first step size in a piece, relative to its duration, unless the last piece proposed a step size
+FIRST_FRACTION = 0.1  # first step size / duration of a piece, unless the piece before has proposed a step size
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
 
 
 class RerunPiece(NamedTuple):
-    """Result of a rerun of a piece: rows [q, v] at the requested times, largest step size (s), and number of steps."""
+    """Rerun of a piece of a run: rows [q, v] at the requested times, largest step size (s), and number of steps."""
 
     states: Array
     longest: float
@@ -218,14 +220,14 @@ class IndependentRerun:
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.MAY_CROSS], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK_ATTEMPTS
-        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the checked run has tested gamma by differences already
+        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # no test of gamma: the checked run has tested it
         n_rows = max(2, min(CHUNK_ATTEMPTS, MAX_BUFFER_SIZE // len(self.run.state)))
         rows = (np.empty(n_rows), np.empty((n_rows, len(self.run.state))))
         self.buffers, self.n_filled = (*rows, np.empty((CHUNK_ATTEMPTS, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
 
     def integrate(self, t0: float, state: Array, times: Array, max_attempts: int) -> RerunPiece | None:
-        """Integrate from a state [q, v] at t0 to all `times`; return None on failure or after about `max_attempts`."""
+        """Integrate from a state [q, v] at t0 to all `times`; None: failure, or no end after about `max_attempts`."""
         run, a, n = self.run, self.run.a, len(state)
         proposed_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:

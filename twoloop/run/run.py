@@ -40,13 +40,15 @@ from twoloop.run.workspace import add_newton_program, fixed_order_form, kit_for_
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
 
-# largest number of attempted steps in the first chunk of a small system; checks after each chunk take 0.2 ms in Python
+# largest number of attempted steps in the first chunk (call of compiled code) of a small system. With fewer, the checks
+# after each chunk cost more: they take 0.2 ms in Python
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # the same number if callbacks are Python functions, which are slow
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
-TRIAL_STEPS = 10  # a method that pays only with long steps is replaced if one of its first TRIAL_STEPS steps is short
-NO_PATTERN = np.zeros((0, 0))  # empty pattern of nonzero entries, for sparse factors in fixed order, which need none
-CONTRADICTION = 1e-6  # a row of C_q a = gamma contradicts other rows if its residual exceeds this fraction of its terms
+TRIAL_STEPS = 10  # a method that is fast only with long steps is replaced if one of its first TRIAL_STEPS is short
+NO_PATTERN = np.zeros((0, 0))  # the fixed-order form needs no pattern of the nonzero entries of constraint rows
+# a row of C_q a = gamma contradicts the other rows if its residual exceeds this fraction of the sum of |terms|
+CONTRADICTION = 1e-6
 
 
 class Run:
@@ -81,7 +83,7 @@ class Run:
         self.kit = make_kit(system, t0, q0, plan, self.fixed_order)
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # the ranks at this start are not known yet: make the workspace for the ranks at the last start
+        # ranks of constraint rows at this start are not known yet: make the workspace for the ranks at the last start
         self.work = self._make_workspace(*(system.derived.get("ranks", ()) if self.fixed_order is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -94,15 +96,15 @@ class Run:
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
         self.control[loop_state.MAY_CROSS], self.control[loop_state.SAMPLE_MOTION] = self.fixed_order is None, 1.0
-        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # without them, C_t is zero
+        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # else C_t = 0, b = 0
         self.control[loop_state.MAY_JUMP] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # largest number of attempts in a chunk
         self.clock = np.zeros(loop_state.N_CLOCK)
         self._reset_clock(t0)
         self.write_step_control(plan)
-        self.substituted = False  # whether the substitute plan has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # a smaller ratio of pivots means: a singular position is near
+        self.substituted = False  # whether `plan.substitute` has replaced the first plan
+        self.near_threshold = singular_threshold(rtol)  # near a singular position, smallest / largest pivot is below it
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced),
@@ -113,23 +115,23 @@ class Run:
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
         self.forces_may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
-        # steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # size (s) of a step that begins and ends equally far from the position
+        # data of steps across a singular position, see fallbacks.py
+        self.mirrored_size = 0.0  # size (s) of a step that begins and ends equally far from the singular position
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
-        self.sizes_to_try: list[float] = []  # step sizes (s) that are still to be tried
+        self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.piece_ends: list[float] = []  # ends (s) of the next steps along the polynomial across the position
-        self.origins: list[Any] = []  # the `Origin` of each polynomial across the position that is still to be tried
+        self.piece_ends: list[float] = []  # times (s) at which the next steps along a crossing's polynomial end
+        self.origins: list[Any] = []  # `Origin` of each polynomial still to be tried across a singular position
         self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
-        self.branch_known = False  # whether the branch of the motion that leaves such a start is known
-        self.jumps: list[float] = []  # times at which C_t or b, and therefore the velocities, jumped
-        self.compared_until = [-np.inf]  # callbacks were compared with traces up to this time; copies share the list
-        self.region: CheckedRegion | None = None  # region where callbacks were compared; integrators share it
-        self.varied_parameters: Array | None = None  # array of parameters, if several systems use the run in turn
+        self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
+        self.jumps: list[float] = []  # times (s) at which velocities jumped with C_t or b of A v + b = 0
+        self.compared_until = [-np.inf]  # callbacks and traces were compared up to this time; copies share the list
+        self.region: CheckedRegion | None = None  # where callbacks and traces were compared; integrators share it
+        self.varied_parameters: Array | None = None  # parameters, if systems that differ in them share this run
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
-        self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings; the keys are the redundant rows
+        self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings; the keys are indices of redundant rows
         self.redundant, self.rows_warning = self.find_redundant_rows()
         self.start_warning = self._start_warning()
 
@@ -154,7 +156,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to the state q, v at t, discard past steps, compute accelerations; return a code (0: done)."""
+        """Set the run to the state q, v at t, forget past steps, compute accelerations; return DONE or an error."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -187,9 +189,9 @@ class Run:
     def advance(
         self, outputs: Array, buffers: Buffers, filled: NDArray[np.int64], active: tuple[Plan, Array, Kit] | None = None
     ) -> int:
-        """Take compiled steps to the last of `outputs`, or until Python must act; return a code (why they ended).
+        """Take compiled steps to the last of `outputs`, or until Python must act; return the end code (loop_state.py).
 
-        Steps end at all times in `outputs`. `filled` becomes the numbers of states and of steps in the buffers.
+        Steps end at all times in `outputs`. The numbers of states and steps in `buffers` are written to `filled`.
         `active`: plan, controls and kit for this call, if they differ from the attributes of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
@@ -236,7 +238,7 @@ class Run:
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _make_workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
-        """Return a new workspace for the ranks of C_q (`rank`) and [C_q; A] (`rank_v`); None: full rank."""
+        """Return a new workspace for the ranks of C_q (`rank`) and all constraint rows (`rank_v`); None: full rank."""
         q0 = self.state[: self.system.n_q]
         pattern = pattern_of(self.system, self.t0, q0) if self.fixed_order is None else NO_PATTERN
         ranks = rank, rank_v
@@ -247,7 +249,7 @@ class Run:
         return work
 
     def may_succeed_in_other_form(self, code: int) -> bool:
-        """Return whether steps failed with sparse factors in fixed order, but may succeed with dense ones."""
+        """Return whether steps that ended with `code` failed with sparse factors, but may succeed in another form."""
         failure_codes = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.fixed_order is not None
@@ -258,7 +260,7 @@ class Run:
     def change_form(self) -> None:
         """Change the form of linear algebra at the current state, and replace the run's kit and workspace.
 
-        If the fixed-order form has no program for Newton's matrix yet, add it; else take a form of saddle_point.py.
+        If the fixed-order form lacks the program for Newton's matrix, add it; else take a dense form (saddle_point.py).
         """
         n = self.system.n_q
         old_work, largest_pivot = self.work, float(self.clock[self.a.LARGEST_PIVOT])
@@ -281,10 +283,10 @@ class Run:
             clock[a.FAILURE_CODE] = indices.DONE
         state = self.state.copy()
         code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if code == indices.RANK_DIFFERS:  # rows that were dependent at the start may be independent now
+        if code == indices.RANK_DIFFERS:  # keep the rank of the start: rows dependent there may be independent here
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # the new form scales pivots in another way
+        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # convert it to the new form's scale of pivots
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
@@ -333,7 +335,7 @@ class Run:
         )
 
     def find_redundant_rows(self) -> tuple[NDArray[np.int64], str]:
-        """Return the indices of redundant rows of [C_q; A] at the start, and a warning; raise if rows are violated."""
+        """Return the indices of redundant constraint rows at the start, and a warning; raise if a row is violated."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -366,11 +368,11 @@ class Run:
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def violated_rows(self, rows: Rows) -> NDArray[np.int64]:
-        """Return the indices of the rows of [C_q; A] whose equation the accelerations at the start violate."""
+        """Return the indices of the constraint rows that the accelerations at the start violate; `rows`: all rows."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
-        if residual.max() <= CONTRADICTION:  # the tolerance of a row, below, is at least CONTRADICTION
+        if residual.max() <= CONTRADICTION:  # the limit of a row's residual, below, is at least CONTRADICTION
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTION * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
@@ -382,7 +384,7 @@ class Run:
         if self.fixed_order is None or set(rows) & set(independent_rows):
             return describe_dependence(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
-        for row, factor in zip(rows, factors, strict=False):  # row = factor @ independent rows
+        for row, factor in zip(rows, factors, strict=False):  # find `factor`: row = factor @ independent rows
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
         return describe_equations(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
 
@@ -398,14 +400,15 @@ class Run:
     def limit_steps(self) -> None:
         """Set the largest step size so that the time between evaluations is at most a hundredth of the run.
 
-        If forces may be steep, the whole step is at most a hundredth of the run: one stage may not reveal such a force.
+        If forces may be steep, the whole step is at most a hundredth of the run, because a single stage may not reveal
+        a steep force.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the size (s) of the first step from a state; if `longest` (max_step) > 0, limit later sizes, too."""
+        """Return the size (s) of the first step from a state; if `longest` (max_step) > 0, also limit later sizes."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size
@@ -417,8 +420,11 @@ class Run:
         return float(notes[indices.LARGEST_DEFECT]) if is_checked else None
 
     def passed_near_singular(self) -> bool:
-        """Return whether a step ended so near a singular position that rounding may have changed its velocities."""
-        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT  # fixed-order pivots vary more
+        """Return whether the run passed near a singular position at an output time, or at the end of a fixed step.
+
+        Rounding may have changed velocities there.
+        """
+        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT  # pivots of this form vary more
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 
     def n_attempts(self) -> int:
