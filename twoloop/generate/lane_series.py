@@ -1,11 +1,10 @@
-"""Write code for SIMD lanes, where every number is a vector, and for the recurrences of a Taylor series in lanes.
+"""Write code in which each value is a vector with one number for each SIMD lane, and code for Taylor series in lanes.
 
-The recurrences compute the coefficients of one order from coefficients of lower orders: coefficient k of a product of
-two series X and Y is the sum of X[j] Y[k - j] over 0 <= j <= k. The coefficients of such factors X, Y are stored in
-rows, one row for each order; a factor that several products share is stored once.
+A Taylor series is computed order by order, with recurrences: coefficient k of a product of two series X and Y is the
+sum of X[j] Y[k - j] over 0 <= j <= k. The series X and Y are called factors. Their coefficients are stored in rows: the
+row of order k contains coefficient k of every factor. A factor that several products share is stored once.
 
-Usually each lane has its own run. In collocation steps, each lane has a stage of one run; for such vectors, the indices
-of `load_lanes` and `store_lanes` count numbers, not vectors.
+Usually each lane has its own run. In collocation steps, each lane has one stage of the same run.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,15 +29,16 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.kernels.lanes.layout import LANES
 
-# coefficients, lowest power first, of polynomials for log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at
-# Chebyshev points. Their errors, 2e-06 and 1e-07, are small enough for step sizes
+# coefficients, lowest power first, of two polynomials: for log2 x on [1, 2], with an error of 2e-06, and for 2^x on
+# [-1/2, 1/2], with an error of 1e-07; both were fitted by least squares. Step-size control needs no better accuracy
 LOG2_COEFFICIENTS = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
 EXP2_COEFFICIENTS = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
-MAX_EXPONENT, MIN_ARGUMENT = 1000.0, 1e-300  # limits that prevent overflow: of |x| in 2^x, and of arguments of log2
+# to avoid overflow, `exponential` limits x to +-MAX_EXPONENT, and `logarithm` raises smaller x to MIN_ARGUMENT
+MAX_EXPONENT, MIN_ARGUMENT = 1000.0, 1e-300
 
 
 class LaneEmitter(Emitter):
-    """Emitter of operations on vectors with one number for each lane, with functions and coefficients of lanes."""
+    """Emitter that writes operations on vectors, with one number for each SIMD lane, to an LLVM function."""
 
     constants: Value  # pointer to the coefficients that have the same value in all lanes
 
@@ -46,14 +46,14 @@ class LaneEmitter(Emitter):
         super().__init__(builder, lanes)
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal, or a Coefficient loaded from memory: one number for all lanes, unless it varies."""
+        """Return `number` in all lanes; a Coefficient that varies with parameters has its own value in each lane."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
         return self.broadcast(self.builder.load(pointer, constant=True))
 
     def function(self, name: str, x: Value) -> Value:
-        """Return f(x) in each lane, by one LLVM intrinsic for all lanes, or by a function of libm lane by lane."""
+        """Return f(x) in each lane: by one LLVM intrinsic for all lanes, or else by a call of libm for each lane."""
         if name in INTRINSICS:
             return super().function(name, x)
         result, scalar = undefined(self.double_type), Emitter(self.builder)
@@ -62,7 +62,7 @@ class LaneEmitter(Emitter):
         return result
 
     def max_over_lanes(self, x: Value) -> Value:
-        """Return the largest number in all lanes; LLVM's own reduction would be sequential, to treat NaN exactly."""
+        """Return the largest of the numbers in the lanes of x; LLVM's own reduction would compare them one by one."""
         width = self.lanes
         while width > 2:
             width //= 2
@@ -101,17 +101,17 @@ class LaneEmitter(Emitter):
 
 
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
-    """Return the vector of STAGES numbers, one for each stage, that begins at base[index] (`index` counts numbers)."""
+    """Return the vector base[index : index + STAGES]: one number for each stage of a collocation step."""
     return Emitter(emit.builder).load_vector(base, index, STAGES)
 
 
 def store_lanes(emit: LaneEmitter, value: Value, base: Value, index: int = 0) -> None:
-    """Store a vector of STAGES numbers, one for each stage, that begins at base[index] (`index` counts numbers)."""
+    """Store a vector in base[index : index + STAGES]: one number for each stage of a collocation step."""
     Emitter(emit.builder).store_vector(value, base, index)
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """Return the sum of the elements of a and the sum of the elements of b, computed by the same instructions."""
+    """Return two numbers, the sum of the elements of a and that of b; the same instructions compute both."""
     builder, half = emit.builder, STAGES // 2
     lower_half, upper_half = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
     total = builder.shuffle(a, b, lower_half) + builder.shuffle(a, b, upper_half)
@@ -136,7 +136,7 @@ def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value
 def loop_over_coordinates(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Return a context for a loop over `coordinates`: it yields k, coordinates[k], and the lists of `Emitter.loop`."""
+    """Return a context for a loop over k; it yields k, coordinates[k], carried values, and a list for new values."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.add_table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
@@ -144,13 +144,13 @@ def loop_over_coordinates(
         yield k, i, values, new
 
 
-ZERO_ROW = -1  # order of the row of zeros, which is stored before the row of order 0
-# largest number of sums in one loop: their totals must fit into 32 registers of eight doubles, or 16 of four doubles
+ZERO_ROW = -1  # index of a row of zeros; in memory, the rows with coefficients of order 0, 1, ... follow it
+# largest number of sums that one loop adds up: each needs a register, and there are 32 of eight doubles, or 16 of four
 MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
 class Operation(NamedTuple):
-    """Operation in the program of a series; sine and cosine of an angle are one operation with two results."""
+    """Operation in the program of a Taylor series; sine and cosine of an angle are one operation with two results."""
 
     kind: int
     results: tuple[int, ...]  # indices of the quantities that are the results
@@ -161,9 +161,10 @@ class Operation(NamedTuple):
 class LaneSeries:
     """Generator of the code for the recurrences of a SeriesProgram.
 
-    `scratch` contains, as vectors: the factors and the right-hand side r of the linear equations; the reciprocal
-    divisors in recurrences of roots, logarithms and arctangents; sums that were computed for the next order (see
-    `_shared_sums`); a row of zeros; and rows with the coefficients of all factors of products, one for each order.
+    `scratch` is an array of vectors. Its parts: the factored matrix of the linear equations for accelerations and
+    multipliers; r, the upper part of their right-hand side; the reciprocal divisors in recurrences of roots, logarithms
+    and arctangents; sums computed for the next order (see `_shared_sums`); a row of zeros; and, for each order, a row
+    with the coefficients of all factors of products.
     """
 
     def __init__(
@@ -177,7 +178,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # result of `_shared_sums`; first an empty dict, because `_shared_sums` calls `_factors`, which reads it
+        # result of `_shared_sums`; until then an empty dict, because `_shared_sums` calls `_factors`, which reads it
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -198,11 +199,11 @@ class LaneSeries:
 
     @property
     def structure(self) -> list[Any]:
-        """Return the data that the code depends on, for a digest."""
+        """Return the data that determine the code; their hash identifies code that has been compiled before."""
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return terms and constant of each expression in `sums`; `rows`: numbers of the expressions in `sums.row`."""
+        """Return terms and constant of each expression in `sums`; `rows[k]`: number of expression k in `sums.row`."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -215,11 +216,11 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return a pair for each row in `sums`: its index, and its expression as terms and constant."""
+        """Return a pair for each expression in `sums`: its number in `indices`; its terms and constant."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
-        """Return the Operations of a table; `quantity`: index of the quantity that its first operation computes."""
+        """Return the operations in `table`; `quantity`: index of the quantity that the first of them computes."""
         firsts, seconds = (self._expressions(each, range(len(each.column))) for each in (table.first, table.second))
         operations = []
         for kind, begin, end in table.groups[:, :3].tolist():
@@ -230,18 +231,19 @@ class LaneSeries:
         return operations
 
     def _factor_index(self, *key: Any) -> int:
-        """Return the index of a factor in the rows; a new factor gets the next index.
+        """Return the index, in each row, of a factor of products of series; a new factor gets the next index.
 
-        `key`: (terms, constant), or ("scaled", terms, constant) for the same factor multiplied by the order.
+        `key`: (terms, constant) of the factor, or ("scaled", terms, constant): then k times coefficient k is stored.
         """
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Find products that need no sum of their own, because the recurrence of a sine or cosine computes it.
+        """Find products (cos x) x' or (sin x) x'. They need no sum: the recurrence of sin x or cos x computes it.
 
-        (cos x) x' is the derivative of sin x. So a part of its coefficient k is a sum in the recurrence of sin x for
-        order k + 1, divided by the unit of time; this part is known before order k is solved. The same holds for (sin
-        x) x' and cos x. Return, for each such product (a quantity), the pair of factors of this sum, see `_factors`.
+        (cos x) x' is the derivative of sin x. So the sum in the recurrence of sin x for order k + 1, divided by the
+        unit of time, is coefficient k of (cos x) x', without the term in coefficient k of x', which is not known yet.
+        The same holds for (sin x) x' and cos x. Keys of the returned dict: the quantities (cos x) x' or (sin x) x';
+        values: the two factors in the recurrence of the sine or cosine, see `_factors`.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -255,7 +257,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return, for each result of an operation, the indices of the factors X, Y of the sum in its recurrence."""
+        """Return two factors X, Y (by index) for each result, whose recurrence needs the sum of X[j] Y[k - j]."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -272,7 +274,7 @@ class LaneSeries:
         return [(x, result_indices[1]), (x, result_indices[0])] if kind == SINE else [(x, result_indices[0])]
 
     def write_order_0(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Write code for order 0 at `inputs`, [t, q, v]; `scratch` has the factors of the linear equations already."""
+        """Write code that stores the row of order 0 in `scratch`, next to the factored matrix; `inputs`: t, q, v."""
         for index in (*range(self.rhs_offset, self.divisor_offset), *range(self.carried_offset, self.row_0_offset)):
             emit.store(emit.constant(0.0), scratch, index)
         row = _Row(self, emit, emit.pointer(scratch, self.row_0_offset))
@@ -283,7 +285,10 @@ class LaneSeries:
             emit.store(quantities.sum(*expr), scratch, self.rhs_offset + index)
 
     def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write code for order k > 0, which stores coefficients k + 1 of q in `out`, and factors in `scratch`."""
+        """Write code that stores coefficient k + 1 of q in `out`, for k > 0, and the row of order k in `scratch`.
+
+        `unit`: unit of time of the series. The code first solves for coefficient k - 1 of the accelerations.
+        """
         builder, n = emit.builder, self.n
         next_order = k + 1
         q = emit.pointer(out, k * n)
@@ -313,7 +318,7 @@ class LaneSeries:
         solution = self.solution
         _, (a, lam) = lower_program(emit, solution.solution_program, [*r, *c, *stored], self.numbers)
         per_v, per_q = unit * per_order, unit / emit.to_double(next_order)
-        previous = Quantities(emit, lambda i: zero)  # coefficients of order k - 1 of a and lam; other quantities: 0
+        previous = Quantities(emit, lambda i: zero)  # coefficient k - 1 of a and lam; 0 for other quantities
         for j in range(n):
             v = per_v * a[j]
             quantities.define(1 + n + j, v)
@@ -335,7 +340,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for coefficients of order 0 of the results; store in `row` the factors that later orders use."""
+        """Write code that computes coefficient 0 of the results, and stores coefficient 0 of factors in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -371,16 +376,16 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _write_sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Write loops for the sums of products over 1 < j < k; return the sums by key (pair, whether for order k + 1).
+        """Write loops for the sums of X[j] Y[k - j] over 1 < j < k, or of X[j] Y[k + 1 - j] for the next order.
 
-        For the pair (X, Y), given by indices, the sum is X[j] Y[k - j] for order k, and X[j] Y[k + 1 - j] for order
-        k + 1. `_PartialSums` later adds the first and last terms, which are not known yet. So one loop computes several
-        sums, does not wait for the previous order, and loads each row once.
+        Keys of the returned dict: pair of indices of the factors X and Y; whether the sum is for order k + 1. The terms
+        j = 1 and j = k need the newest coefficients: `_PartialSums` adds them later, so that the loops do not wait for
+        these coefficients. One loop computes several sums, and loads each row only once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
         keys += [(pair, False) for pair in pairs - set(self.carried_pairs)]
-        keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours then often share a factor
+        keys.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # consecutive sums then often share a factor
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
         order = k + 1
         for begin in range(0, len(keys), MAX_SUMS_IN_LOOP):
@@ -410,7 +415,10 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write code for the results of operations at order k > 0, without terms whose factors are not known yet."""
+        """Write code for coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
+
+        The term of a PENDING product that contains the unknown coefficient k of its second factor is left out.
+        """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:
@@ -456,14 +464,14 @@ class LaneSeries:
 
 
 class _Row:
-    """Row of one order in memory: a coefficient of each factor; values stored by this object are not loaded again."""
+    """Row of one order in memory: a coefficient of each factor; values that `store` wrote are not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store the coefficient `value` of the factor `key`; if `when` is "if used", skip factors that no sum uses."""
+        """Store `value`, a coefficient of the factor `key`; `when` = "if used": only if products have this factor."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value
@@ -475,7 +483,7 @@ class _Row:
 
 
 class _PartialSums(NamedTuple):
-    """Sums over 1 < j < k by `_write_sums`, and the rows from which the missing terms j = 1 and j = k are added."""
+    """Sums of X[j] Y[k - j] over 1 < j < k, and the rows needed to add the terms j = 1 and j = k, which are missing."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._write_sums`
     first_row: Value  # pointer to the row of order 1, or to a row of zeros if k is 1
@@ -483,12 +491,12 @@ class _PartialSums(NamedTuple):
     row_before: _Row  # row of order k - 1
 
     def sum_of_order(self, pair: tuple[int, int]) -> Value:
-        """Return the sum of X[j] Y[k - j] over 0 < j < k for the factors (X, Y) = `pair`."""
+        """Return the sum of X[j] Y[k - j] over 0 < j < k; `pair`: indices of the factors X and Y."""
         emit, (x, y) = self.row_before.emit, pair
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k for (X, Y) = `pair`; `row` has the factors of order k."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X, Y; `row`: factors at order k."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

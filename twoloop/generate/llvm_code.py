@@ -1,10 +1,12 @@
-"""Write LLVM code for programs (`Lowering`), and for single operations (`Emitter`).
+"""Write LLVM code for programs (class `Lowering`), and for single operations (class `Emitter`).
 
 Numba takes milliseconds to compile a line of source; LLVM takes well below a millisecond for an operation. So long
 lists of operations are written as LLVM functions, which kernels call by their addresses. Sine and cosine are written
 inline, so that the processor computes the sines and cosines of several angles in parallel.
 
-The code reads coefficients from memory: it can be used for all mechanisms with the same structure of the equations.
+The code reads coefficients from memory, so that all mechanisms with the same structure of the equations share it.
+
+LLVM compiles short blocks of instructions faster. So long functions may be split into parts (`Module.splits_blocks`).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -46,7 +48,7 @@ INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqr
 class Emitter:
     """Emitter that appends operations on doubles to an LLVM function, and returns the values of their results.
 
-    If `lanes` is more than 1, numbers are vectors with one number for each lane. Array indices count numbers, or these
+    If `lanes` is more than 1, each number becomes a vector with one number for each lane, and array indices count these
     vectors. `numbers` points to the coefficients that the code reads.
     """
 
@@ -86,7 +88,7 @@ class Emitter:
         return self.load(self.numbers, number.index, constant=True)
 
     def add_sums(self, a: Value, b: Value) -> Value:
-        """Return a + b for two sums; LLVM must not reassociate, because one chain of all terms would be slower."""
+        """Return a + b for two sums, which LLVM must compute separately: one chain of all terms would be slower."""
         return self.builder.operation("fadd", a, b)
 
     def fma(self, a: Value, b: Value, c: Value) -> Value:
@@ -94,7 +96,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Return the value at x of a polynomial, with pairs of terms in parallel; `coefficients`: constant first."""
+        """Return the value of a polynomial at x; `coefficients`: lowest power first. Pairs of terms run in parallel."""
         square, terms = self.builder.operation("fmul", x, x), [self.load_constant(each) for each in coefficients]
         pairs = [self.fma(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -151,7 +153,7 @@ class Emitter:
     def load_vector(self, base: Value, index: int, width: int) -> Value:
         """Return the vector that begins at base[index]; this address must be aligned to the size of the vector.
 
-        Right after its elements were stored one by one, the load is slow: the processor waits until all are stored.
+        This is slow if the elements have just been stored one by one: the processor waits until all are stored.
         """
         pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{vector_of(DOUBLE, width)}*")
         return self.builder.load(pointer, 8 * width)
@@ -201,16 +203,16 @@ class Emitter:
 class Quantities:
     """Values of numbered quantities and of their linear combinations; each value is loaded or computed only once.
 
-    Each part of a divided function loads its quantities again: otherwise the compiler would spill them to the stack. So
-    the memory from which quantities are loaded must not change.
+    If a function is split into parts, each part loads quantities again, because keeping them in registers or on the
+    stack would take longer. So the memory from which quantities are loaded must not change.
 
-    load : function that writes code to load a quantity, for quantities that were not defined.
+    load : function that writes code to load a quantity; it is called if `define` has not set the value.
     """
 
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
         self._emit, self._load = emit, load
         self._values: dict[int, Value] = {}
-        self._loaded: dict[int, Value] = {}  # values loaded in the current part of a divided function
+        self._loaded: dict[int, Value] = {}  # values loaded in the current part of the function
         self._part = emit.builder.part
         self._sums: dict[tuple[Terms, float], Value] = {}
 
@@ -219,7 +221,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value of a quantity: its defined value, or else a value loaded once in each part of a function."""
+        """Return the value of a quantity: set by `define`, or else loaded, once in each part of a split function."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._loaded_in_part()
@@ -228,11 +230,11 @@ class Quantities:
         return loaded[quantity]
 
     def mark_stored(self, quantity: int) -> None:
-        """Mark a defined quantity as stored in memory: the current part uses its value, and later parts load it."""
+        """Note that a quantity is stored: later parts of the function load it from memory, but not the current part."""
         self._loaded_in_part()[quantity] = self._values.pop(quantity)
 
     def _loaded_in_part(self) -> dict[int, Value]:
-        """Return the dict of values loaded in the current part of the function; it is empty in a new part."""
+        """Return the values loaded in the current part of the function, by quantity; an empty dict in a new part."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}
         return self._loaded
@@ -268,13 +270,13 @@ def write(
     emit: Callable[..., Any],
     emitter: Callable[..., Emitter] = Emitter,
 ) -> None:
-    """Add the function `name` to a module; `emit` writes its body, `kind` has the types of its result and arguments."""
+    """Add the function `name` to a module; `kind`: types of its result and arguments; `emit`: writes its body."""
     builder = module.function(name, *kind)
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
-LARGEST_ANGLE = 1e6  # largest accepted angle (rad); HALF_PI, a sum of two numbers, is too inaccurate for larger ones
-HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # pi/2 as a sum: angles are reduced by multiples of pi/2
+LARGEST_ANGLE = 1e6  # largest accepted angle (rad): reduction of larger angles by HALF_PI would be too inaccurate
+HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # two numbers, whose sum is pi/2 to about twice double precision
 # coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from Moshier's Cephes, sin.c
 SINES = (
     -1.66666666666666307295e-1,
@@ -320,13 +322,13 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
 FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
 
 Location = tuple[Value, int]  # memory location: pointer to an array, and an index in this array
-NO_LOCATIONS: Mapping[int, Location] = {}  # no memory locations
+NO_LOCATIONS: Mapping[int, Location] = {}
 
 
 class Lowering(Algebra[Value]):
-    """Algebra that writes the operations of programs to an LLVM function; its values are values of this function.
+    """Algebra that does not compute: it writes the operations of a program as instructions of an LLVM function.
 
-    locations : memory locations of quantities that are already stored.
+    locations : memory locations of the quantities that are loaded instead of computed, by index of the quantity.
     """
 
     def __init__(self, emit: Emitter, numbers: Coefficients, locations: Mapping[int, Location] = NO_LOCATIONS):
@@ -336,7 +338,7 @@ class Lowering(Algebra[Value]):
         self.functions = {kind: partial(emit.function, name) for kind, name in FUNCTIONS.items()}
         self.functions[RECIPROCAL] = lambda x: 1.0 / x
         self._quantities = Quantities(emit, lambda quantity: emit.load(*self._locations[quantity]))
-        self._sines_and_cosines: dict[Any, tuple[Value, Value]] = {}  # sines and cosines, by the keys of their angles
+        self._sines_and_cosines: dict[Any, tuple[Value, Value]] = {}  # sine and cosine of each angle; keys: Affine.key
         self._computed_quantities = set(locations)
 
     def define(self, quantity: int, value: Value) -> None:
@@ -344,7 +346,7 @@ class Lowering(Algebra[Value]):
         self._quantities.define(quantity, value)
 
     def define_inputs(self, graph: Graph, arguments: Sequence[Value]) -> None:
-        """Define the inputs of a graph by the arguments of the function: numbers, or pointers to arrays of inputs."""
+        """Define the inputs of a graph; each of the `arguments` is an input, or a pointer to an array of inputs."""
         first = 0
         for argument, size in zip(arguments, graph.input_sizes, strict=True):
             if argument.type == self.emit.double_type:
@@ -379,7 +381,7 @@ class Lowering(Algebra[Value]):
         return self._sines_and_cosines[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], locations: Mapping[int, Location] = NO_LOCATIONS) -> None:
-        """Write code that computes `quantities` in the given order, and stores those that occur in `locations`."""
+        """Write code that computes `quantities` in the given order; a quantity in `locations` is stored there."""
         if not locations:
             return super().run(graph, quantities)
         for i in quantities:
@@ -393,8 +395,8 @@ class Lowering(Algebra[Value]):
     def run_program(self, program: Program) -> list[list[Value]]:
         """Write code that computes the arrays of a program, and the quantities in its conditions; return the arrays.
 
-        In a divided function, each number is computed right before its use, so that few numbers are in registers
-        between parts; LLVM reorders instructions only within a part.
+        If the function is split into parts, each number is computed right before its use, so that few numbers have to
+        be kept from one part to the next; LLVM reorders instructions only within a part.
         """
         graph = program.graph
         if not self.emit.builder.module.splits_blocks:
@@ -412,7 +414,7 @@ class Lowering(Algebra[Value]):
         return [self.affine(expr) for expr in exprs]
 
     def is_valid(self, program: Program, values: Sequence[Value]) -> Value:
-        """Return whether the conditions of a program hold, `values` are finite, and angles are below LARGEST_ANGLE."""
+        """Return a bit: 1 if the program's conditions hold, `values` are finite, and |angles| < LARGEST_ANGLE."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN

@@ -1,7 +1,7 @@
-"""Write LLVM modules as text: functions, blocks and instructions.
+"""Write LLVM modules as text: functions, basic blocks and instructions.
 
 llvmlite would build modules from objects, which takes ten times as long as writing text, and longer than the
-compilation by LLVM. Types are represented by their text. Pointers name the type that they point to, such as double*,
+compilation by LLVM. A type is represented by its text. Pointer types name the type of the target, such as double*,
 because all versions of LLVM accept this.
 """
 
@@ -15,12 +15,12 @@ from twoloop.kernels.data.common import OPTIONS
 FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # flags of floating-point instructions, the same as in kernels
 DOUBLE, INTEGER, WORD, BIT, VOID = "double", "i64", "i32", "i1", "void"
 DOUBLES_PER_CACHE_LINE = 8  # size of a cache line of the processor, in doubles
-# largest number of instructions in a block if blocks are split: longer blocks more than double the compile time
+# number of instructions after which a block is split, if `Module.splits_blocks`: longer blocks double the compile time
 MAX_BLOCK_LENGTH = 400
 
 
 def _operator(name: str, is_reflected: bool = False) -> "Callable[[Value, Value | float], Value]":
-    """Return a method of Value that appends the operation `name`; `is_reflected`: the value is its second operand."""
+    """Return a method of Value that appends the instruction `name`; `is_reflected`: `self` is the second operand."""
     is_comparison, of_doubles = name.startswith("fcmp"), f"f{name} {FAST_MATH_FLAGS}"
 
     def append(value: "Value", other: "Value | float") -> "Value":
@@ -39,7 +39,7 @@ class Value:
 
     Operators append an instruction to the function, and return its result. One operand may be a literal number.
 
-    builder : builder of the function; a literal may have none, because the other operand of an operation has one.
+    builder : builder of the function. A literal may have none: then the other operand of an operation must have one.
     """
 
     __slots__ = ("builder", "text", "type")
@@ -140,7 +140,7 @@ def undefined(kind: str) -> Value:
 class Module:
     """LLVM module: functions, and declarations of the other functions that they call.
 
-    `splits_blocks`: whether long blocks are split, because the time that LLVM takes grows faster than their length.
+    `splits_blocks`: whether long blocks are split. The compile time of a block grows faster than its length.
     """
 
     def __init__(self, splits_blocks: bool = False) -> None:
@@ -202,7 +202,7 @@ class Builder:
         self.arguments = [Value(kind, f"%a{k}", self) for k, kind in enumerate(arguments)]
         self._n_values = self._n_allocated = 0
         self._far_pointer: Value | None = None
-        self.part = 0  # number of times that a block was split so far: index of the current part
+        self.part = 0  # index of the current part of the function: number of times that a block has been split
         self._blocks: list[Block] = []
         self._n_blocks = 0
         self.position_at_end(self.append_block())
@@ -212,7 +212,7 @@ class Builder:
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
-        # without this alignment, spilled vectors lie across two cache lines, and take twice as long to load and store
+        # without this alignment, vectors on the stack cross two cache lines, and take twice as long to load and store
         attributes = "noinline alignstack(64)" if f"<{DOUBLES_PER_CACHE_LINE} x" in body else "noinline"
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
@@ -247,7 +247,7 @@ class Builder:
         self.part += 1
 
     def operation(self, name: str, a: Value, b: Value) -> Value:
-        """Return the result of an operation, such as "add" or "fmul fast", on two values of the same type."""
+        """Append an instruction, such as "add" or "fmul fast", on two values of the same type; return its result."""
         return self._append_value(a.type, f"{name} {a.type} {a.text}, {b.text}")
 
     def negate(self, flags: str, a: Value) -> Value:
@@ -268,16 +268,16 @@ class Builder:
         return self._append_value(a.type, f"select {condition}, {a}, {b}")
 
     def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
-        """Write a call of the function `name`, and a declaration; return the result. `flags`: fast-math flags."""
+        """Append a call of the function `name`, and declare it in the module; return its result of type `kind`."""
         self.module.add_declaration(name, kind, [value.type for value in arguments])
         return self._append_value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
     def call_void(self, name: str, arguments: Sequence[Value]) -> None:
-        """Write a call of a function of the module that returns no value."""
+        """Append a call of a function that is defined in the module and returns no value."""
         self._append_line(f"call {VOID} @{name}({', '.join(map(str, arguments))})")
 
     def allocate(self, kind: str, size: int) -> Value:
-        """Return a pointer to `size` numbers of stack memory, which the first block of the function allocates."""
+        """Return a pointer to `size` values of type `kind` on the stack; the function allocates them when it begins."""
         pointer = Value(f"{kind}*", f"%room{self._n_allocated}")
         self._blocks[0].lines.insert(
             self._n_allocated, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
@@ -286,7 +286,7 @@ class Builder:
         return pointer
 
     def load_constant(self, number: float) -> Value:
-        """Return a number loaded from memory right before its use: a literal would occupy a register for long."""
+        """Return a number that is loaded from memory right before its use; LLVM would keep a literal in a register."""
         if self._far_pointer is None:
             self._far_pointer = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
@@ -294,7 +294,7 @@ class Builder:
         return self.load(self.advance(self._far_pointer, integer(self.module.add_number(number))))
 
     def return_false_unless(self, condition: Value) -> None:
-        """Write code that returns false from the function if a condition is false."""
+        """Append instructions that return false from the function if `condition` is false."""
         next_block, return_block = self.append_block(), self.append_block()
         self.branch(condition, next_block, return_block)
         self.position_at_end(return_block)
@@ -323,7 +323,7 @@ class Builder:
         return self._append_value(element_of(vector.type), f"extractelement {vector}, {WORD} {index}")
 
     def shuffle(self, a: Value, b: Value, indices: Sequence[int]) -> Value:
-        """Return a vector of the elements `indices` of the concatenation of the vectors a and b."""
+        """Return a vector of the elements with these indices in the vector [a, b], the concatenation of a and b."""
         mask = f"<{len(indices)} x {WORD}> <{', '.join(f'{WORD} {index}' for index in indices)}>"
         return self._append_value(vector_of(element_of(a.type), len(indices)), f"shufflevector {a}, {b}, {mask}")
 
@@ -349,7 +349,7 @@ class Builder:
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
-        """Return a context that writes instructions which run only if a condition is true."""
+        """Return a context; the instructions that are appended in it run only if `condition` is true."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
         self.position_at_end(then)
