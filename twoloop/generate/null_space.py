@@ -1,15 +1,18 @@
-"""Factor symmetric matrices of expressions, and eliminate dependent coordinates by the rows G a = gamma.
+"""Solve for accelerations with matrices of expressions: by factors L D L^T, or without dependent coordinates.
 
-With G = [G_d G_i], a_d = g + B a_i for B = -G_d^-1 G_i and g = G_d^-1 gamma. The remaining system is small: (T^T M T)
-a_i = T^T (Q - M g) with T = [B; 1]. This takes about half the operations of an elimination that begins with M, and M
-may be singular in directions that the constraints exclude.
+The accelerations a satisfy M a + G^T lam = Q and G a = gamma; G are the independent rows of all constraints, [C_q; A].
+
+Class `DependentCoordinates` splits a into dependent and independent accelerations a_d and a_i, and G into the columns
+G_d and G_i. Then a_d = g + B a_i, with B = -G_d^-1 G_i and g = G_d^-1 gamma. With T = [B; 1], the remaining system is
+small: (T^T M T) a_i = T^T (Q - M g), where g is 0 for independent coordinates. This takes about half the operations of
+an elimination that begins with M, and M may be singular in directions that the constraints exclude.
 
 Pivots are chosen once. If a pivot becomes small during a run, a condition of the generated code fails, and the
 elimination that begins with M computes the accelerations.
 
-Bodies of small inertia beside heavy bodies cause pivots of very different size, whatever rows are added to M. In this
-case, one step of refinement solves for the residual of the solution, and restores the digits that elimination loses.
-The loss may grow during a run: if refinement changes a solution too much, a condition fails, as for small pivots.
+Light bodies beside heavy bodies cause pivots of very different size, and elimination loses digits. Then one step of
+refinement restores them: it solves the system again, with the residual of the solution as the right-hand side. If
+refinement changes a solution too much, a condition of the generated code fails, as for small pivots.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,17 +22,17 @@ import numpy as np
 
 from twoloop.generate.graph import Affine, is_zero
 
-# accelerations are valid if a step of refinement changes them by at most this fraction. Usually their error is then the
-# square of this change; it is as large as the change if a part of small inertia loses all digits
+# accelerations are valid if a step of refinement changes them by at most this fraction. After the step, their relative
+# error is usually the square of this change; only if a light body loses all digits, it is as large as the change
 LARGEST_CHANGE = 1e-7
 
 
 class Block(NamedTuple):
-    """Block of one or two rows of the matrix that are eliminated together, with one division."""
+    """Pivot block of the factorization L D L^T: one or two rows that are eliminated together, with one division."""
 
     row_indices: tuple[int, ...]
     inverse: list[list[Affine]]  # inverse of the 1x1 or 2x2 matrix of pivots
-    # for each row of L with nonzero entries below the block: its index, and these entries
+    # for each later row that has nonzero entries of L in the columns of the block: its index, and these entries
     rows_below: list[tuple[int, list[Affine]]]
 
 
@@ -37,9 +40,10 @@ class Factors:
     """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; the pivots are the blocks of D.
 
     blocks : blocks in the order of elimination.
-    conditions : pairs, for rows of G (index `n` and later): the pivot of the row, and the pivot that it would have
-        without the other rows of G. The first expression must be larger than a fraction of the second.
-    mass_pivots : pivots of M (index below `n`), which are positive if M is definite.
+    conditions : for each row of G (index `n` and later), a pair of positive expressions: the magnitude of its pivot,
+        and the magnitude that this pivot would have if G had no other rows. If the first is less than a small fraction
+        of the second, the row nearly depends on other rows, and results are invalid.
+    mass_pivots : pivots of the rows of M (index below `n`). If M is positive definite, they are positive or constants.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -69,7 +73,7 @@ class Factors:
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a block of pivots; add conditions. `own_pivots`: pivots without other rows of G."""
+        """Return the inverse of a pivot block; `own_pivots`: pivot of a row if G had only this row; None for M."""
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -136,10 +140,10 @@ def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
 def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
     """Return pairs (coordinate, row of G) that are eliminated first: their pivots need no condition and no division.
 
-    The coordinate occurs in no other row of [M G^T; G 0], and its two entries, in M and in G, are constants. The rank
-    of G is the rank of the remaining rows plus the number of pairs.
+    Such a coordinate has only two entries in [M G^T; G 0], one in M and one in G, both constant. So the row of
+    G in the pair is independent of all other rows.
     """
-    pairs: dict[int, int] = {}  # coordinates by rows of G
+    pairs: dict[int, int] = {}  # keys: rows of G; values: coordinates
     for i, row in enumerate(rows[:n]):
         if len(row) == 2 and i in row and max(row) >= n and not any(entry.terms for entry in row.values()):
             pairs.setdefault(max(row), i)
@@ -147,10 +151,11 @@ def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tup
 
 
 def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    """Return the indices of all rows that are not in `pairs`, by minimum degree, in tuples of one or two rows.
+    """Return the order of elimination of the rows that are not in `pairs`, as tuples of one or two row indices.
 
-    Two rows with the same neighbours are in one tuple. A row of G (index n and later) comes after its coordinates. Of
-    rows with equal degree, the row that needs the shortest chain of divisions comes first, so that operations overlap.
+    The row with the fewest neighbours comes first (minimum degree); neighbours of a row are the columns of its nonzero
+    entries. Two rows with the same neighbours form one tuple. A row of G (index n and later) comes after the rows of M
+    of its coordinates. In a tie, the row with the shortest chain of divisions comes first, so that operations overlap.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -175,19 +180,19 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
 
 
 def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
-    """Eliminate rows from the graph of nonzero entries: connect their neighbours, and return these neighbours."""
+    """Eliminate `rows` from the graph of nonzero entries: connect all their neighbours, and return these."""
     new_neighbours = set().union(*(neighbours[i] for i in rows)) - set(rows)
     for j in new_neighbours:
         neighbours[j] = (neighbours[j] | new_neighbours) - {*rows, j}
     return new_neighbours
 
 
-PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
-Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
+PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of each pivot block (one or two)
+Terms = dict[int, Affine]  # nonzero entries of a row of a matrix, by column
 
-# limit below which the accelerations count as invalid, for the squares of three numbers: pivot / norm of the entries
-# that it divides; pivot / norm of its column; sine of the angle between the two columns of a block. A number of 10^-k
-# costs up to 3 k digits of accelerations. The choice at a start has stricter limits, see linalg/dependent_columns.py
+# accelerations count as invalid if the square of one of these numbers is below this limit: pivot / norm of the entries
+# that it divides; pivot / norm of its column; in a block of two columns, sine of the angle between them. A number 10^-k
+# costs up to 3 k digits of accelerations. The choice of pivots has stricter limits, see linalg/dependent_columns.py
 MIN_PIVOT_SQUARE = 0.03**2
 
 
@@ -196,17 +201,17 @@ class ReductionFailed(Exception):
 
 
 class DependentCoordinates:
-    """Solution of G a = gamma for the dependent accelerations, a_d = g + B a_i.
+    """Solution a = g + T a_i of G a = gamma for given accelerations a_i of independent coordinates, see the module.
 
-    rows : the matrix G, of full rank.
-    blocks : rows and columns of the pivots, in the order of elimination.
+    rows : the matrix G of all constraints, of full rank.
+    blocks : rows and columns of the pivots, in the order of elimination. The columns are the dependent coordinates.
     max_added : largest number of operations that may be added to the graph.
 
     Fields:
-    independent : independent coordinates.
-    T : for each row of T, its nonzero entries by column; a column is an independent coordinate.
+    independent : indices of the independent coordinates.
+    T : for each row of the matrix T, its nonzero entries; keys: indices of independent coordinates.
     g : the vector g of length n_q; 0 for independent coordinates.
-    conditions : pairs of expressions. Unless a pivot is too small, the first one is larger in each pair.
+    conditions : pairs of expressions. If the first is not larger than the second, a pivot is too small.
 
     Raise ReductionFailed if a pivot is always zero, or if the elimination takes more than `max_added` operations.
     """
@@ -232,7 +237,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve one or two rows of [G gamma] for as many coordinates, `columns`; eliminate these from other rows."""
+        """Solve the equations `rows` of G a = gamma for the accelerations `columns`; insert these in the others."""
         self.check_length()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)
@@ -257,7 +262,7 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check_length(self, n_following: int = 0) -> None:
-        """Raise ReductionFailed if more than `max_added` operations are added, including `n_following` later ones."""
+        """Raise ReductionFailed if operations added so far, and `n_following` further ones, exceed `max_added`."""
         if len(self._graph.operations) + n_following > self._max_operations:
             raise ReductionFailed
 
@@ -281,10 +286,10 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """Add two conditions: a pivot is not small relative to the entries that it divides, nor to its column.
+        """Append to `conditions` that a pivot is not small relative to the entries that it divides or to its column.
 
-        `pivot`: determinant of `block`. For two rows, the second condition is that the columns of the block are not
-        nearly parallel. A pivot may change its sign, because the formula for the accelerations remains valid.
+        `pivot`: determinant of `block`. In a block of two rows, the second condition is that its columns are not nearly
+        parallel. Squares are compared, because pivots may be negative. `solved`: entries divided by the pivot.
         """
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _add_products(self._zero, [(entry, entry) for entry in entries])
@@ -299,7 +304,7 @@ class DependentCoordinates:
             self.conditions.append((pivot * pivot, (a * b).times(MIN_PIVOT_SQUARE)))
 
     def _substitute(self, j: int, row: Terms) -> None:
-        """Store T[j] and g[j] of a dependent coordinate j, computed from T and g of the coordinates in `row`."""
+        """Store row j of T and entry j of g for a dependent coordinate j; `row`: equation that is solved for a_j."""
         self.check_length()
         rhs, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
@@ -313,13 +318,13 @@ class DependentCoordinates:
 def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations (n_q,) for M and Q, and conditions under which T^T M T is not nearly singular."""
+    """Return the accelerations (n_q,), and pairs of expressions: T^T M T is regular if the first is larger in each."""
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]
     forces = [(force[i] - _add_products(zero, ((x, g[j]) for x, j in rows[i]))).as_term() for i in range(n)]
     matrix: dict[tuple[int, int], Affine] = {}
-    coordinates.check_length(sum(len(row) ** 2 // 2 for row in T))  # operations of T^T M T, if M is diagonal
+    coordinates.check_length(sum(len(row) ** 2 // 2 for row in T))  # estimated operations for T^T M T
     for a, x in enumerate(independent):
         mass_T = [_add_products(zero, ((m, T[j][x]) for m, j in row if x in T[j])).as_term() for row in rows]  # M T
         for b, y in enumerate(independent[: a + 1]):
@@ -334,13 +339,13 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield each pivot of the reduced mass matrix T^T M T with its lower bound, a fraction of the diagonal entry."""
+    """Yield pairs: pivot of the reduced mass matrix T^T M T (`matrix`); its limit, a fraction of a diagonal entry."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None
         for i in row_indices:
             pivot = next(pivots)
-            # the pivot of the second row of a block is the determinant: its bound is multiplied by the first pivot
+            # for the second row of a block, `pivot` is the determinant: so the limit is multiplied by the first pivot
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:
@@ -366,13 +371,14 @@ def solve_refined(
     r: Sequence[Affine],
     c: Sequence[Affine],
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return a and lam (independent rows) with M a + G^T lam = r, G a = c; refine them if `choice.is_refined`.
+    """Return the solution a, lam (of independent rows) of M a + G^T lam = r, G a = c, and conditions of its validity.
 
-    Also return conditions: pairs of expressions, the first of which is larger unless refinement changes the solution
-    too much, relative to a or, near equilibrium, where a is small, to the acceleration of all masses by r alone.
+    If `choice.is_refined`, one step of refinement improves the solution. Then there is one condition, a pair of
+    expressions: if the first is not larger, refinement has changed a too much. The change is compared with a and, since
+    a is small near equilibrium, with the accelerations of all masses by r alone.
 
-    `solve`: function that solves a linear system by the factors of [M + s g^T g, G^T; G 0], where rows g were added to
-    M as in PivotChoice. `mass`: M without added rows. `rows`, `c`: rows of G and their right-hand sides, by index.
+    `solve`: function that solves a linear system with the matrix [M + sum of s g^T g, G^T; G 0], where s and g are
+    `choice.scales` and rows of G (see PivotChoice). `mass`: M. `rows`, `c`: rows of G and their right-hand sides.
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:

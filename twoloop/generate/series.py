@@ -1,8 +1,10 @@
 """Write the program for the Taylor series of a mechanism's motion.
 
-Each order needs G = [C_q; A], its rates, M and Q, see taylor_step.py. An operation is "early" if it depends on time and
-coordinates only, as for G and M, and "late" if it depends on velocities, too. G v and G^T lam + M a are computed with
-few products: terms that share a factor become one product.
+The motion satisfies G v + (C_t, b) = 0 and M a + G^T lam = Q. G = [C_q; A] are the rows of all constraints, C_t
+and b their rates at v = 0, and lam the multipliers. taylor_step.py solves these equations order by order.
+
+An operation is "early" if it depends on time and coordinates only, as for G and M, and "late" if it depends on
+velocities, too. In G v and G^T lam + M a, terms that share a factor become one product.
 """
 
 from collections.abc import Container, Sequence
@@ -23,7 +25,7 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-# series are traced if M and [C_q; A] have at most this number of entries, or if the user chooses the method Taylor
+# series are traced only if M, C_q and A have at most this number of entries, or if the user chooses the method Taylor
 MAX_ENTRIES = 200_000
 
 # callbacks from which a series is derived
@@ -31,13 +33,13 @@ USED_CALLBACKS = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate"
 
 
 class Sums(NamedTuple):
-    """Affine expressions as arrays: constant and first term of each expression, then all further terms."""
+    """List of affine expressions as arrays: constant and first term of each expression; all further terms."""
 
-    column: Integers  # quantity in the first term of each expression
+    column: Integers  # index of the quantity in the first term of each expression
     coefficient: Array  # coefficient of the first term of each expression
     constant: Array
     row: Integers  # for each further term, the index of its expression
-    further_column: Integers  # quantity in each further term
+    further_column: Integers  # for each further term, the index of its quantity
     further_coefficient: Array
 
 
@@ -45,11 +47,11 @@ class Sums(NamedTuple):
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    groups : one row for each group of independent operations of one kind: the kind, then first and end index of three
-        ranges: of the operations, of their further terms in `first`, and of those in `second` (see `Sums`). A group of
-        sines includes the cosines of the same angles. The last group contains the products whose second factor depends
-        on the solution of the linear system.
-    first, second : arguments of the operations.
+    groups : one row for each group of operations of one kind that do not need each other: the kind, then begin and end
+        of three ranges: of the operations; of their further terms in `first`; of those in `second` (see `Sums`). A
+        group of sines includes the cosines of the same angles. The last group contains the products whose second factor
+        depends on accelerations, multipliers or velocities, which linear equations determine in each order.
+    first, second : first and second argument of each operation.
     """
 
     groups: Integers
@@ -59,13 +61,13 @@ class OperationGroups:
 
 @dataclass(frozen=True)
 class SeriesProgram:
-    """Program of a series; its quantities are, in this order, t, q, v, a, lam, results of `early`, results of `late`.
+    """Program of a Taylor series; its quantities are t, q, v, a, lam, results of `early` and of `late`, in this order.
 
-    early : early operations; the last ones are the products in G v.
-    late : late operations; the last ones are the products in G^T lam + M a.
-    rows, row_indices : nonzero rows of G v + (C_t, b), and their indices; without the terms "constant times v_i".
-    balance, balance_indices : the same of Q - G^T lam - M a, without terms "constant times lam_i" or "times a_i".
-    traced : traces of the callbacks.
+    early : operations that depend on t and q only (see the module), and at the end, the products in G v.
+    late : operations that depend on v, too, and at the end, the products in G^T lam + M a.
+    rows, row_indices : G v + (C_t, b) without terms of the form "constant times v_i": nonzero rows, and their indices.
+    balance, balance_indices : Q - G^T lam - M a without terms of the form "constant times lam_i or a_i": likewise.
+    traced : traces of the callbacks, to be compared with calls; None: no comparison.
     """
 
     n_q: int
@@ -117,9 +119,9 @@ def is_quick_to_trace(system: ConstrainedSystem) -> bool:
 
 
 def series_for(system: ConstrainedSystem, check: Check = accept_traces) -> SeriesProgram:
-    """Return the cached series program of a system; `check` raises if calls of callbacks differ from their traces.
+    """Return the cached series program of a system; `check` compares traces of callbacks with calls.
 
-    Raise Untraceable in the same cases as `series_program`.
+    Raise Untraceable if `check` finds a difference, and in the same cases as `series_program`.
     """
 
     def trace_series(cache: TraceCache) -> SeriesProgram:
@@ -134,7 +136,8 @@ def series_program(
 ) -> SeriesProgram:
     """Trace the callbacks of a system and return its series program.
 
-    `equations`: traces to be extended; None: new traces. `independent`: rows of G in the program; None: all rows.
+    `equations`: traces to which the products are added; None: new traces. `independent`: indices of the rows of G that
+    the program contains; None: all rows.
 
     Raise Untraceable if a callback cannot be traced; the message names the callback and the reason.
     """
@@ -165,7 +168,7 @@ def series_program(
 
 
 def _find_sums(graph: Graph) -> dict[int, Affine]:
-    """Return, for each quantity that is a sum, the expression that replaces it: sums need no recurrence."""
+    """Return the expression of each quantity that is a sum; it replaces the quantity: sums need no recurrence."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -174,7 +177,7 @@ def _find_sums(graph: Graph) -> dict[int, Affine]:
 
 
 def _expand_sums(sums: dict[int, Affine], expr: Affine) -> Affine:
-    """Return an expression in which quantities that are sums are replaced by their terms."""
+    """Return an expression in which the terms of sums replace quantities that are sums; `sums`: see `_find_sums`."""
     sum_quantities = [i for i in expr.terms if i in sums]
     if not sum_quantities:
         return expr
@@ -194,9 +197,9 @@ def _sum_of_products(
 ) -> Affine:
     """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
 
-    Terms are collected by factors, or by the quantities in the factors, whichever needs fewer products. In a tie,
-    they are collected by quantities if `of_rates` (the sum is a row of G v + (C_t, b)), else by factors.
-    Quantities lead to products such as (cos x) x', whose sums are computed for sin x anyway, see lane_series.py.
+    There are two ways: terms with equal factors share a product, or terms with equal quantities in their factors. The
+    way with fewer new products is taken. In a tie, it is the second if `of_rates` (for a row of G v + (C_t, b)), else
+    the first. The second may yield (cos x) x', which is computed for sin x anyway, see lane_series.py.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -223,7 +226,7 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return key, scale, first, second: factor * multiplier is scale * first * second; see `Affine.normalized`."""
+    """Return key, scale, first, second: factor * multiplier = scale * (first * second); multiples have equal keys."""
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier
 
@@ -244,7 +247,7 @@ def _assemble_program(
     row_products: dict[Any, Any],
     reaction_products: dict[Any, Any],
 ) -> SeriesProgram:
-    """Return the SeriesProgram that computes `rows` and `balance`, given the products in them."""
+    """Return the SeriesProgram for `rows`, G v + (C_t, b), and `balance`, Q - G^T lam - M a, given their products."""
     early: list[Any] = []
     late: list[Any] = []
     factors = [expr for group in (row_products, reaction_products) for _, *exprs in group.values() for expr in exprs]
@@ -291,7 +294,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: numbers of the quantities."""
+    """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: index of each quantity there."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)
@@ -318,7 +321,7 @@ def _grouped_operations(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     for (depth, kind), members in sorted(groups.items()):
         if kind == COSINE:
             continue
-        members.sort(key=_term_counts)  # operations of equal length become neighbours
+        members.sort(key=_term_counts)  # operations with equal numbers of terms become neighbours
         if kind == SINE:
             cosines = {first.key: node for node, first, _ in groups[depth, COSINE]}
             members += [(cosines[first.key], first, second) for _, first, second in members]
@@ -332,7 +335,7 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
 
 
 def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> OperationGroups:
-    """Return the OperationGroups of groups (kind, operations); `nodes`: number of each quantity in the program."""
+    """Return groups (kind, operations) as OperationGroups; `nodes`: index of each quantity in the SeriesProgram."""
     members = [member for _, group in groups for member in group]
     sums = [_convert_to_sums([member[k] for member in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
@@ -345,7 +348,7 @@ def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> 
 
 
 def _convert_to_sums(exprs: list[Affine], nodes: dict[int, int]) -> Sums:
-    """Return expressions as Sums; `nodes`: number of each quantity in the program."""
+    """Return expressions as Sums; `nodes`: index of each quantity of the graph in the SeriesProgram."""
     terms = [[(nodes[i], c) for i, c in expr.terms.items()] or [(0, 0.0)] for expr in exprs]
     further_terms = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]
     return Sums(

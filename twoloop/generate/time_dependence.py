@@ -26,41 +26,42 @@ from twoloop.problem.system import ConstrainedSystem
 TIME_CALLBACKS = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
 # callbacks whose dependence on the state is analysed
 STATE_CALLBACKS = ("force", "mass", "constraint", "jacobian", "nonholonomic")
-SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # operations without short pulses if degrees are at most MAX_DEGREE
+SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # results of these have no short pulses up to the degree MAX_DEGREE
 MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, have no short pulses up to this degree
 MAX_DEGREE_OF_STATE = 32  # polynomials in q and v, and their roots, have no short pulses up to this degree
-MAX_DEGREE_OF_DIVISOR = 4  # up to this total degree of its divisors, in q and v, a quotient has no short pulses
-FASTEST_DECAY = -2.0  # quotients that decay as x^p with smaller p may have short pulses; 1 / (1 + (x / w)**2) has none
-MAX_RATE = 4.0  # a sine is not steep if its argument changes by at most this per unit of a coordinate or velocity
+MAX_DEGREE_OF_DIVISOR = 4  # a quotient has no short pulses if its divisors have at most this total degree in q, v
+FASTEST_DECAY = -2.0  # a quotient may have short pulses if it decays as x^p with p below this value, like 1 / (1 + x^4)
+MAX_RATE = 4.0  # largest derivative of the argument of a sine, by a coordinate or velocity, for which it is not steep
 # systems with more coordinates are not traced for this analysis: that may take ten times as long as sampling the forces
 MAX_COORDINATES = 300
 TIME_MASK = 1  # bit mask of t, the first input of a graph
 
 
 class ShortForces(NamedTuple):
-    """Whether forces or drives may have short pulses, as functions of t, and as functions of q or v."""
+    """Whether forces or drives may have short pulses: large values only in a short range of t, or of q or v."""
 
     by_time: bool  # a force, C_t or b may have short pulses as a function of time
-    by_state: bool  # a force may have short pulses as a function of q or v
+    by_state: bool  # a force, M, C, C_q or A may have short pulses as a function of q or v
 
 
 class Dependence(NamedTuple):
-    """Result of the analysis of the callbacks of systems; all systems of a trace cache share it."""
+    """Result of the analysis of the callbacks of a system; all systems with the same TraceCache share it."""
 
     short_forces: ShortForces
     is_steep: bool  # whether forces or drives may be steep, see `forces_may_be_steep`
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
-        """Return this result, which is the same for all systems of the trace cache."""
+        """Return this object: all systems with the same TraceCache have the same result."""
         return self
 
 
 def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
-    """Return whether forces, C_t or b may have short pulses in time, and whether forces may have them in q or v.
+    """Return whether callbacks of a system may have short pulses, see ShortForces.
 
-    If callbacks cannot be traced, both are true. Systems with more than MAX_COORDINATES coordinates are not traced, and
-    only the first is true. Python functions may store their arguments: they are traced only if the force was.
+    If callbacks cannot be traced, `by_time` and `by_state` are True. Systems with more than MAX_COORDINATES coordinates
+    are not traced; then `by_time` is True, and `by_state` is False. Callbacks that are called in Python may store their
+    arguments, so that symbols might reach later calls: they are traced only if `force_was_traced`.
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -71,8 +72,9 @@ def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> Shor
 def forces_may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
     """Return whether forces may act for a short time, or vary much over a distance shorter than a step.
 
-    Quotients and roots may vary in this way: the stages of a long step may evaluate 1 / (1 + (x / w)**2) on its flanks,
-    but not at its peak. Stages may also evaluate a fast vibration at nearly equal phases.
+    This is possible for quotients and roots: a long step might evaluate the force 1 / (1 + (x / w)**2) on both sides of
+    its peak only. It might also evaluate a fast vibration at nearly equal phases. `force_was_traced`: see
+    `find_short_forces`.
     """
     if any(find_short_forces(system, force_was_traced)):
         return True
@@ -81,7 +83,7 @@ def forces_may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bo
 
 
 def _dependence(system: ConstrainedSystem, force_was_traced: bool) -> Dependence | None:
-    """Return the cached analysis of a system; None if its callbacks cannot, or should not yet, be traced."""
+    """Return the cached analysis of a system; None if callbacks cannot be traced, or might store the symbols."""
     if system.called_in_python and not force_was_traced:
         return None
     try:
@@ -109,7 +111,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
 
 
 class DegreeAlgebra(Algebra[float]):
-    """Algebra of degrees: the value of a quantity is its degree, as if it were a polynomial in some of the inputs."""
+    """Algebra of degrees: a value is the degree of a quantity as a polynomial in `inputs`; f(x) has that of x."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {
@@ -132,7 +134,7 @@ class DegreeAlgebra(Algebra[float]):
 
 
 class TrigonometricDegrees(DegreeAlgebra):
-    """Algebra of degrees in sines and cosines; their high powers are nearly zero between short pulses."""
+    """Algebra of degrees as polynomials in sines and cosines: a high power of a sine consists of short pulses."""
 
     functions = MappingProxyType(
         {**DegreeAlgebra.functions, **dict.fromkeys((SINE, COSINE), lambda degree: max(degree, 1.0))}
@@ -148,9 +150,9 @@ class GrowthExponents(DegreeAlgebra):
 
 
 class DivisorDegrees(DegreeAlgebra):
-    """Algebra of divisors: a value is the sum of the degrees of all divisors in a quantity.
+    """Algebra of divisors: the value of a quantity is the sum of the degrees of all divisors in its formula.
 
-    Arguments of arctangents count, too, because the derivatives of arctangents are quotients.
+    `degrees`: degrees of all quantities. Arguments of arctangents count, too: derivatives of arctangents are quotients.
     """
 
     def __init__(self, degrees: DegreeAlgebra):
@@ -164,13 +166,14 @@ class DivisorDegrees(DegreeAlgebra):
 
 
 class DerivativeBounds(DegreeAlgebra):
-    """Algebra of rates: a value bounds the derivative of a quantity with respect to any one coordinate or velocity.
+    """Algebra of rates: a value is a rough bound of the derivatives of a quantity with respect to t, q and v.
 
-    If a parameter is a factor, the bound is infinite, because the parameter may have any value.
+    Factors of products are assumed to be at most 1. If a coefficient depends on parameters, which may have any values,
+    the bound is infinite.
     """
 
     def affine(self, expr: Affine) -> float:
-        """Return the largest bound of a derivative among the terms of an affine expression."""
+        """Return the bound for an affine expression: the largest bound of its terms."""
         return max(
             (math.inf if type(c) is Parameter else abs(c) * self.values.get(i, 1.0) for i, c in expr.terms.items()),
             default=0.0,
