@@ -1,7 +1,8 @@
 """Compute with numbers that record how they depend on parameters, so that one trace serves all parameter values.
 
-A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. The
-current values decide whether terms cancel, and whether expressions are equal; so these values must be generic.
+A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. Its
+current value decides whether terms cancel, and whether expressions are equal. So parameters must have generic values
+(random numbers), for which no terms cancel by chance.
 """
 
 import math
@@ -20,13 +21,13 @@ Array = NDArray[np.float64]
 Powers = tuple[tuple[int, float], ...]
 
 MAX_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
-_as_float = float.__pos__  # converts a Parameter to a float; the function float() would be refused
-# if the sum of two terms is at most this fraction of a term, it is a rounding error, and counts as zero
+_as_float = float.__pos__  # converts a Parameter to a float; float(x) raises an exception while callbacks are traced
+# the sum of two terms with opposite signs counts as zero if it is at most this fraction of one of them
 CANCELLATION_LIMIT = 8.0 * 2.0**-52
 NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY_FUNCTIONS, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # substitutes that use only Python's operators; keys: names in NumPy
+OPERATORS: dict[str, Callable[..., Any]] = {  # keys: names in NumPy; values: functions by Python's operators only
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,
@@ -39,7 +40,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {  # substitutes that use only Python
     "reciprocal": lambda x: 1.0 / x,
     "hypot": lambda x, y: (x * x + y * y) ** 0.5,
 }
-# names in FUNCTIONS and OPERATORS (values) of functions that have other names in `math` or NumPy (keys)
+# functions with several names. Keys: other names in `math` or NumPy; values: names in FUNCTIONS and OPERATORS
 NUMPY_NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power", "true_divide": "divide"}
 
 
@@ -52,11 +53,11 @@ class Refusal(BaseException):
 
 
 class SymbolicObject:
-    """Base of the objects that replace numbers while a callback is traced.
+    """Base class of Graph and ParameterTape, which record operations on symbols while a callback is traced.
 
-    is_tracing : whether a callback is being traced with this object.
-    refusal_reason : reason why the callback cannot be traced, or "". The reason is stored, because the callback may
-        catch the exception.
+    is_tracing : whether a callback is running on symbols of this record.
+    refusal_reason : reason why the callback cannot be traced; "" if there is none so far. The reason is stored, because
+        the callback may catch the exception.
     """
 
     is_tracing, refusal_reason = False, ""
@@ -83,11 +84,11 @@ class SymbolicObject:
 class ParameterTape(SymbolicObject):
     """Record of how numbers were computed from parameters.
 
-    Numbers are multiples of products of powers of atoms. An atom is a parameter, a sum of numbers, or a function of
-    numbers. Callbacks must not branch on the current values of the numbers.
+    A number is a constant times a product of powers of atoms. An atom is a parameter, a sum of numbers, or a function
+    of numbers. Callbacks must not branch on the current values of the numbers.
 
-    values : current values of all parameters; they must be generic for parameters that vary.
-    varying : indices of the parameters that vary.
+    values : current values of all parameters; random for parameters that vary, so that no terms cancel by chance.
+    varying : indices of the parameters that vary; the others are constants.
     """
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
@@ -100,7 +101,7 @@ class ParameterTape(SymbolicObject):
             self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return, as Powers, the atom with a definition (a sum or a function); a new definition adds an atom."""
+        """Return the atom with this definition (a sum or a function) as Powers; create the atom if it is new."""
         if definition not in self._atom_indices:
             self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)
@@ -117,14 +118,14 @@ class ParameterTape(SymbolicObject):
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def number_evaluator(self, parameters: Array) -> Callable[[float], Any]:
-        """Return a function that evaluates a float or a Parameter for other parameters, see `product_evaluator`."""
+        """Return a function that evaluates a float or a Parameter for these `parameters`, see `product_evaluator`."""
         product = self.product_evaluator(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates Powers for other parameters.
+        """Return a function that evaluates Powers for the values `parameters` of all parameters.
 
-        For parameters (n_runs, n_p) the function returns an array (n_runs,), or one number for all runs.
+        If `parameters` is (n_runs, n_p), the function returns an array (n_runs,), or one number for all runs.
         """
         atoms: dict[int, Any] = {}
         products: dict[Powers, Any] = {(): 1.0}
@@ -165,7 +166,7 @@ class ParameterTape(SymbolicObject):
 
 
 class Parameter(float):
-    """Float that records how it depends on parameters: its value is `scale` times `powers`, a product of atoms."""
+    """Float that records how it depends on parameters: as the constant `scale` times `powers`, a product of atoms."""
 
     __slots__ = ("powers", "scale", "tape")
     tape: ParameterTape
@@ -187,7 +188,7 @@ class Parameter(float):
         return elementwise(lambda *arguments: apply_function(name, *arguments), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse an operation whose result depends on the current value, unless a module of `generate` calls it."""
+        """Refuse an operation by a callback that reveals the current value; modules of `generate` may do it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.is_tracing and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
@@ -254,7 +255,7 @@ def _product(a: float, b: float) -> float:
 
 
 def _power(base: float, exponent: float) -> float:
-    # a power with a fractional exponent becomes an atom: as Powers, (x^2)^0.5 would become x, not |x|
+    # a power with a fractional exponent becomes an atom: multiplying exponents would make (x^2)^0.5 x, not |x|
     if type(exponent) is Parameter or not exponent.is_integer():
         return _record_function("power", base, exponent)
     assert isinstance(base, Parameter)
@@ -277,7 +278,7 @@ def _tape_of(*numbers: float) -> ParameterTape:
 def apply_function(name: str, *arguments: Any) -> Any:
     """Return the value of a function of NumPy or `math`, by its name; a Parameter if an argument is a Parameter."""
     name = NUMPY_NAMES.get(name, name)
-    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # a symbol has its own operators
+    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # for symbols, which have their own operators
         return OPERATORS[name](*arguments)
     numbers = [x if type(x) is Parameter else float(x) for x in arguments]
     if not any(type(x) is Parameter for x in numbers):
@@ -304,7 +305,7 @@ def _binary_operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any
         pair = (other, self) if swapped else (self, other)
         if issubclass(type(other), np.ndarray):
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
-        if not issubclass(type(other), NUMBER_TYPES):  # by type(): a symbol refuses isinstance
+        if not issubclass(type(other), NUMBER_TYPES):  # not by isinstance(), which symbols refuse
             return NotImplemented
         return operation(*(x if type(x) is Parameter else float(x) for x in pair))
 
@@ -329,12 +330,12 @@ for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "true
     setattr(Parameter, f"__{_symbol}__", _binary_operator(_name, False))
     setattr(Parameter, f"__r{_symbol}__", _binary_operator(_name, True))
 for _name in _UNARY_FUNCTIONS:
-    # NumPy functions call methods of these names for arrays of objects
+    # for an array of objects, np.sin calls the method `sin` of each object, and so on
     setattr(Parameter, _name, lambda self, name=_name: apply_function(name, self))
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
-    """Return an array of function values at all entries of arrays, without calling `__array_ufunc__` of the entries."""
+    """Apply `function` to all entries of arrays without calling `__array_ufunc__` of entries; return an array."""
     operands = list(map(_object_array, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:
@@ -344,7 +345,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _object_array(value: Any) -> Any:
-    """Return a value as an array of objects; its type is tested by type(), because symbols refuse isinstance()."""
+    """Return a value as an array of objects; the code uses type(), because symbols refuse isinstance()."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)
@@ -364,6 +365,6 @@ def as_number(value: Any) -> float:
 
 
 def math_function(name: str) -> Callable[[float], float]:
-    """Return a function of `math` by its name; for a Parameter, the function returns a Parameter."""
+    """Return the function `name` of `math`, extended to Parameters: for a Parameter, it returns a Parameter."""
     function = getattr(math, name)
     return lambda x: apply_function(name, x) if type(x) is Parameter else function(x)

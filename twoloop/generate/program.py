@@ -1,7 +1,7 @@
-"""Execute programs (selected outputs of a graph) in any algebra, and assign array indices to their coefficients.
+"""Execute programs, which compute expressions of a graph, and assign array indices to their coefficients.
 
-- `Program.run` executes a program, or writes code for it. The algebra defines what values are: arrays (`ArrayAlgebra`),
-  LLVM values (`llvm_code.Lowering`), degrees of growth (`time_dependence.DegreeAlgebra`).
+- `Program.run` executes a program in an algebra, which defines what a value is: an array of numbers (`ArrayAlgebra`), a
+  value in generated code (`llvm_code.Lowering`), or a polynomial degree (`time_dependence.DegreeAlgebra`).
 - `OperationTable` lists the operations as arrays, which compiled kernels interpret row by row.
 - Derivatives are further quantities of the graph (`graph.Derivative`). Expressions in parameters alone are coefficients
   (`parameter_expressions`), which are computed before a program runs.
@@ -35,8 +35,8 @@ COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 class Algebra(Generic[T]):
     """Arithmetic in which a program runs; subclasses define the type of values T, and the operations on values.
 
-    functions : for each kind of operation with one argument, the function that computes its value.
-    values : values of the quantities defined so far, by index of the quantity.
+    functions : keys: kinds of operations with one argument; values: the functions that compute them.
+    values : keys: indices of quantities; values: their values, if defined so far.
     """
 
     functions: Mapping[int, Callable[[T], T]]
@@ -93,13 +93,13 @@ class Program:
     conditions: list[tuple[Affine, Affine]] = field(default_factory=list)
 
     def run(self, algebra: Algebra[T], inputs: Sequence[T] = ()) -> list[list[T]]:
-        """Return the arrays of the program in an algebra; `inputs`: values of its inputs that are not defined yet."""
+        """Return the arrays of the program in an algebra; `inputs`: values of the inputs, unless already defined."""
         for quantity, value in enumerate(inputs):
             algebra.define(quantity, value)
         return algebra.run_program(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return the indices of the quantities needed for arrays and conditions, see `Graph.quantities_for`."""
+        """Return the indices of the quantities needed for arrays and conditions, except inputs and `available` ones."""
         return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
@@ -165,9 +165,9 @@ class ArrayAlgebra(Algebra[Any]):
 class OperationTable(NamedTuple):
     """Operations of a program as arrays, for the kernels in kernels/evaluation/operations.py.
 
-    `rows` has a row for each operation, with its kind, its node, and the ranges of its arguments' terms. `columns` and
-    `coefficients` are the nodes and coefficients of all terms. `constants` has the constants of both arguments of each
-    operation. Values are numbered: the number of a value is its "node"; inputs come first, then computed quantities.
+    Values are numbered; the number of a value is its "node". Inputs come first, then computed quantities. `rows` has a
+    row for each operation: its kind, the node that it computes, and the range of the terms of each argument. `columns`
+    and `coefficients`: node and coefficient of each term. `constants`: the constants of both arguments, by operation.
     """
 
     rows: Any
@@ -178,7 +178,7 @@ class OperationTable(NamedTuple):
 
     @classmethod
     def from_results(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
-        """Return the table that computes `results` (expressions, by index of the result) from `n_inputs` inputs."""
+        """Return the table that computes `results` from `n_inputs` inputs; keys: indices of results."""
         needed = graph.quantities_for(results.values())
         node_of = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node_of[i]) for i in needed]  # type: ignore[misc]
@@ -202,7 +202,7 @@ class OperationTable(NamedTuple):
         )
 
     def as_floats(self) -> list[float]:
-        """Return the table as a list of floats, to be stored in parameters of a model; results are the first nodes."""
+        """Return the table as floats, to be stored in parameters of a model; results become nodes 0, 1, ..."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -212,7 +212,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
-        """Return the table as one array of integers and one of floats; results are stored at `result_indices`."""
+        """Return the table as two arrays, integers and floats; `result_indices`: index of each result in the output."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         header = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -220,7 +220,7 @@ class OperationTable(NamedTuple):
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
     def replace_coefficients(self, convert: Callable[[Any], Array]) -> "OperationTable":
-        """Return a copy of the table with `convert` applied to its arrays of coefficients and of constants."""
+        """Return a copy of the table in which convert(array) replaces the arrays of coefficients and of constants."""
         return self._replace(constants=convert(self.constants), coefficients=convert(self.coefficients))
 
 
@@ -259,8 +259,8 @@ class Coefficient(float):
 class Coefficients:
     """Assignment of array indices to the coefficients of expressions, in the order of their first use.
 
-    Equal expressions have the same indices. `separate_varying`: whether coefficients that vary with parameters
-    have an array and indices of their own, because their values differ between SIMD lanes.
+    Equal expressions share their coefficients. `separate_varying`: whether coefficients that vary with parameters are
+    in a second array with its own indices, because their values differ between SIMD lanes.
     """
 
     def __init__(self, separate_varying: bool = False) -> None:
@@ -278,13 +278,13 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """Return `values` as expressions in the parameters, in the same array object until a coefficient is added."""
+        """Return `values` as floats and Parameters; the array object stays the same until a coefficient is added."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas
 
     def indexed_terms(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
-        """Return terms and a constant with each number as a literal, or as a Coefficient that is read from an array."""
+        """Return terms and a constant in which each number is a literal (0, 1 or -1), or a Coefficient in an array."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
         numbers = self._indexed_terms.get(key)
         if numbers is None:
@@ -304,7 +304,7 @@ class Coefficients:
     def structure(self, program: Program, stored: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
         """Yield everything that the code for a program depends on, except the values of coefficients.
 
-        `stored`: indices in memory of the quantities that are loaded instead of computed.
+        `stored`: keys: quantities that the code loads instead of computing them; values: their indices in memory.
         """
         graph, exprs = program.graph, program.expressions
         needed = graph.quantities_for(exprs, stored)
@@ -343,7 +343,7 @@ class Coefficients:
 
 
 def nearest_literal(value: float) -> float | None:
-    """Return 0, 1 or -1 if `value` is equal to it up to rounding; None: the number must be read from an array."""
+    """Return 0, 1 or -1 if `value` equals it up to rounding errors; None for other numbers and for Parameters."""
     if type(value) is Parameter or not math.isfinite(value):
         return None
     nearest = float(round(value))

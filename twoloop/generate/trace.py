@@ -1,11 +1,12 @@
 """Trace callbacks: run them in Python on symbols; functions of `math` and `numpy` are replaced by symbolic ones.
 
-A callback must do with symbols exactly what it does with numbers. So a function that may treat symbols differently is
-refused by name when it is called with a symbol, even if the callback catches the exception. Differences that tracing
-cannot detect, such as a changed global variable, are found by comparing numbers (`traced_values.py`).
+A callback must do with symbols exactly what it does with numbers. So a function that may treat symbols differently
+raises an exception if it is called with a symbol; the message names the function. Even if the callback catches the
+exception, it is not traced. Differences that tracing cannot detect, such as a changed global variable, are found by
+comparing numbers (`traced_values.py`).
 
-`Equations` returns the result of every callback of one system as an array of expressions; exact derivatives replace
-missing callbacks. Series, eliminations, references and derived callbacks are generated from these arrays.
+`Equations` returns the result of every callback of one system as an array of expressions. If a callback is missing,
+exact derivatives replace its result. Series, eliminations, references and derived callbacks are generated from these.
 
 `TraceCache` stores traces for all systems that share their callbacks: coefficients are expressions in the parameters.
 
@@ -54,16 +55,16 @@ NUMPY_FUNCTIONS = {
     *("size", "square", "squeeze", "stack", "subtract", "sum", "tile", "trace", "transpose", "true_divide", "vdot"),
     *("vstack", "zeros_like", "ones_like", "empty_like", "full_like"),
 }
-# functions of NumPy that are replaced so that the arrays they return can contain expressions
+# functions of NumPy that are replaced during tracing: the substitutes return arrays that can contain expressions
 ARRAY_CONSTRUCTORS = ("zeros", "ones", "empty")
 ARRAY_CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 
 
 def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
-    """Run a callback in Python on symbols and return its result; compiled callbacks fill an array of `arguments`.
+    """Run a callback in Python on symbols and return what it returns.
 
-    Raise Untraceable if the callback does not run on symbols, or may treat symbols differently from numbers; the
-    message says why.
+    A compiled callback writes its result to an array in `arguments` instead. Raise Untraceable if the callback does not
+    run on symbols, or may treat symbols differently from numbers; the message says why.
     """
     graph, value = t.graph, None
     with graph.running_callback():
@@ -94,7 +95,7 @@ def convert_to_expressions(graph: Graph, values: Any) -> Any:
 
 
 class _CallbackCopier(FunctionCopier):
-    """Copier of callbacks whose copies call substitutes for the functions of `math` and `numpy` (`_Mathematics`)."""
+    """Copier of callbacks: a copy calls symbolic substitutes (`_Mathematics`) for functions of `math` and `numpy`."""
 
     def is_copied(self, value: Any) -> bool:
         return isinstance(value, Dispatcher | types.FunctionType)
@@ -157,7 +158,7 @@ def _refuse_symbols(value: Any, verb: str) -> None:
 
 
 def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Return a wrapper of a function that refuses symbols, because the function might not handle them like numbers."""
+    """Return a function that refuses symbols (`function_of_numbers` might not treat them like numbers)."""
 
     @functools.wraps(function_of_numbers)
     def call_with_numbers(*arguments: Any, **options: Any) -> Any:
@@ -264,14 +265,14 @@ TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# keys: callbacks for right-hand sides gamma; values: callbacks for C_q and C_t, or for A and b, which also yield gamma
+# keys: callbacks that compute gamma; values: callbacks for C_q and C_t, or A and b, whose derivatives also yield gamma
 GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
 class Equations:
     """Traced callbacks of a system; each callback is traced once, when its trace is first used.
 
-    parameters : values that replace the system's own parameters.
+    parameters : numbers or Parameters that callbacks get as parameters; None: the parameters of the system.
 
     Fields:
     graph : graph of the traces; its first inputs are t, q and v.
@@ -286,7 +287,7 @@ class Equations:
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._expressions: dict[str, Any] = {}
-        self._results_before_copy: dict[str, Any] = {}  # results of callbacks traced before this graph was copied
+        self._results_before_copy: dict[str, Any] = {}  # results of callbacks that were traced before copying
 
     def trace_all(self) -> "Equations":
         """Trace all callbacks of the system that can be traced, so that copies share the results; return self."""
@@ -308,7 +309,7 @@ class Equations:
         return equations
 
     def expressions(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the result of a callback as expressions; for a missing callback, derivatives (C_q, gamma) or zeros.
+        """Return the result of a callback as expressions; if it is missing, derivatives (C_q, gamma), or else zeros.
 
         `v`: expressions that replace the inputs `self.v` as velocities.
 
@@ -321,7 +322,7 @@ class Equations:
         return self._expressions[kind].copy()
 
     def derivatives(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return C_q, C_t or gamma by differentiation, as an array of expressions, even if a callback computes it."""
+        """Return C_q, C_t or gamma as derivatives of other callbacks, even if there is a callback for it."""
         if kind == "jacobian":
             return self._jacobian()
         return (
@@ -331,7 +332,7 @@ class Equations:
         )
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Return a missing C_q or gamma as derivatives, or the trace of any other callback."""
+        """Return derivatives for C_q or gamma if there is no callback for it; for other callbacks, the trace."""
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:
@@ -381,7 +382,7 @@ class Equations:
         return symbol_array(time_derivative.differentiate(expr) for expr in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return -(dG/dt v + dr/dt) at constant v; `rows`, `rates`: callbacks for G and r (C_q and C_t, or A and b)."""
+        """Return gamma = -d/dt(G v + r) at constant v; `rows`, `rates`: kinds of G and r (C_q, C_t, or A, b)."""
         direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
         gamma = self.expressions(rates)
@@ -416,12 +417,14 @@ def only_quantity(expr: Affine) -> int:
 
 
 Array = NDArray[np.float64]
-ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]  # entry i is scales[i] * products[indices[i]]
-Evaluator = Callable[[Any], Array]  # evaluates an array of expressions for the parameters of one system
+# array of expressions in the form (scales, indices, products): its entry i is scales[i] * products[indices[i]]
+ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]
+Evaluator = Callable[[Any], Array]  # function that evaluates an array of expressions for the parameters of one system
 
-# limits of the random values of parameters in traces: these have similar sizes, so that rounding hides no term
+# range of the random values that replace parameters in traces; values of similar size, so that rounding hides no term
 GENERIC_RANGE = 0.5, 1.5
-# a parameter of magnitude below this value, or above its inverse, is a constant: its powers would under- or overflow
+# a parameter whose magnitude is below this value, or above its inverse, is a constant in traces: its powers might
+# underflow or overflow
 MIN_MAGNITUDE = 1e-30
 
 _TRACE_CACHES = BoundedCache()
@@ -431,13 +434,13 @@ class TraceCache:
     """Cache of traces, and of results derived from traces, for all systems that share their callbacks.
 
     parameters : parameters of one of the systems.
-    classes : class of each parameter: 1, 2, ..., the same number for equal magnitudes, with the sign of the parameter.
-        0: the parameter is a constant in the traces.
+    classes : class of each parameter: 0 if the parameter is a constant in the traces. Otherwise a number 1, 2, ...,
+        which is the same for parameters of equal magnitude, with the sign of the parameter.
 
     Fields:
-    parameters : parameters with which callbacks are traced.
+    parameters : parameters with which callbacks are traced: Parameters with random values, and constants.
     traced_kinds : kinds of callbacks that were traced. They do not branch, and so always write to the same entries.
-    within_bounds : kinds of traced callbacks for which `check_bounds` succeeded in one of the systems.
+    within_bounds : kinds of traced callbacks whose indices were checked in one of the systems: all are within bounds.
     """
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
@@ -454,23 +457,23 @@ class TraceCache:
         self.traced_kinds: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
-        # results of `_scaled_products`; keys: ids of arrays, which are stored, too, so that their ids stay unique
+        # results of `_scaled_products`; keys: id(array); the arrays are stored, too, so that no other gets the same id
         self._arrays: dict[int, tuple[Any, ScaledProducts]] = {}
         self._tracing_lock = RLock()  # one lock for all traces, because they record on one tape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
         """Return the traced callbacks of a system, with their own copy of the graph, which the caller may extend."""
-        if system.called_in_python:  # Python functions may store their arguments: call them with symbols late
+        if system.called_in_python:  # trace each only when needed: Python functions may store the symbols
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
     def magnitudes(self, parameters: Array) -> Array:
-        """Return the magnitude that all `parameters` of a class share, by class; class k has the index k - 1."""
+        """Return the magnitude of the parameters of each class; class k (or -k) has the index k - 1."""
         return np.abs(parameters[self._first_of_class])
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates Powers (products of powers of atoms) for the parameters of a system."""
+        """Return a function that evaluates Powers (products of powers of atoms) for the `parameters` of one system."""
         return self._tape.product_evaluator(self.magnitudes(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
@@ -514,13 +517,12 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, key: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return the result of `make` for a trace cache, converted for one system by the result's method `specialize`.
+    """Return what `make` derives from traces (for example a series), with the parameters of one system inserted.
 
-    The trace cache is shared with other systems. A cache for this system alone replaces it if callbacks cannot be
-    traced with variable parameters, or if `check` raises Untraceable (a callback may treat variable parameters
-    differently from numbers). Results are cached by `key`.
-
-    Raise Untraceable if the result cannot be derived from either cache, or if `check` raises for it.
+    `make` gets a TraceCache, and returns an object with a method `specialize`. Results are cached by `key`.
+    The first TraceCache is shared with other systems. If callbacks cannot be traced with variable parameters, or if
+    `check` raises Untraceable for the result (a callback may treat variable parameters differently from numbers), a
+    cache for this system alone is used instead. If this fails in the same way, Untraceable is raised.
     """
     for find_cache in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("trace cache", find_cache), partial(find_cache, system))
@@ -537,7 +539,7 @@ def derive_cached(
 
 
 def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return the result of `derive_cached` for one trace cache, or the exception that says why there is no result."""
+    """Return what `make` derives from `cache`, specialized for `system`; if this fails, return the exception."""
     try:
         result = cache.remembered(key, partial(make, cache))
         return result.specialize(
@@ -550,20 +552,20 @@ def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make:
 
 
 def load_checked_bounds(system: ConstrainedSystem) -> None:
-    """Add to `within_bounds` the kinds of callbacks whose indices were checked in systems with the same traces."""
+    """Add to `system.within_bounds` the kinds of callbacks whose indices were checked in systems with equal traces."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 
 
 def share_checked_bounds(system: ConstrainedSystem) -> None:
-    """Add traced kinds in `system.within_bounds` to the trace cache, for other systems with the same traces."""
+    """Add the traced kinds in `system.within_bounds` to the trace cache, so that other systems skip their check."""
     if not system.called_in_python:
         cache = shared_cache(system)
         cache.within_bounds |= cache.traced_kinds & system.within_bounds
 
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the trace cache of a system, see `trace_cache_of`; the system stores it at the first call."""
+    """Return the result of `trace_cache_of`; the system stores it at the first call."""
     return system.remembered(("trace cache", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
@@ -597,12 +599,12 @@ def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
 
 
 class ParameterArrays:
-    """Arrays of numbers that replace arrays of expressions in parameters; `write` computes them for new parameters."""
+    """Arrays of numbers that replace arrays of expressions; `write` updates all of them to new parameters."""
 
     def __init__(self) -> None:
-        # arrays of numbers; keys: ids of the arrays of expressions, which are stored, too, so that ids stay unique
+        # keys: id(array of expressions); values: this array, which must exist as long as its id is used; its numbers
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # flat arrays of numbers, indices of entries that vary, and slices of the values that `write` computes for them
+        # flat array of numbers; indices of its entries that vary; range of their values among all values in `write`
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -610,9 +612,9 @@ class ParameterArrays:
         self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, exprs: Any) -> Array:
-        """Return the array of numbers that `write` fills for an array of expressions, always the same for one object.
+        """Return the array of numbers that replaces `exprs`; later calls for the same object return the same array.
 
-        If the entries of the given array are plain numbers, return this array.
+        If the entries of `exprs` are plain numbers, return `exprs`.
         """
         if exprs.dtype != object:
             return exprs  # type: ignore[no-any-return]
@@ -638,7 +640,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Evaluate all expressions and write their values to the arrays; `product` evaluates Powers."""
+        """Evaluate all expressions and write their values to the arrays; `product`: see `product_evaluator`."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

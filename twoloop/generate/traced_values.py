@@ -1,8 +1,8 @@
 """Compare the values of traces with the values that calls of the callbacks return.
 
 A trace is wrong if tracing did not detect that the callback branches, if the callback stores data between calls, or if
-it reads changing data that are not its arguments (a global variable, whose value numba froze at compilation). Before a
-run, values are compared at states near the start, with times spread over the run; after a run, at states of the run.
+it reads data other than its arguments (a compiled callback uses the value of a global variable at compilation). Before
+a run, values are compared at states near the start, with times spread over the run; after a run, at states of the run.
 """
 
 import copy
@@ -32,16 +32,19 @@ KINDS = (
 N_NEARBY = 8  # number of random states near the start at which calls and traces are compared, besides the start
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
-# largest number of compared states, approximately: in a chunk of steps; in a run; in a run with Python callbacks
+# approximate largest number of compared states: in a chunk of steps that are stored together; in a run; in a run with
+# callbacks that are called in Python
 MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run: for large systems, fewer states suffice
-# a difference of call and trace counts as a rounding error up to this fraction of the largest term of any entry
+# limits of the difference between call and trace, as fractions of the largest term that the trace adds up in any entry
+# of the callback. Up to ROUNDING_DIFFERENCE, it counts as a rounding error. Above CLEAR_DIFFERENCE, the trace is wrong.
+# Between them, `_is_systematic` decides
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-# a trace is wrong if it differs from a call by more than this fraction; see also `_is_systematic`
 CLEAR_DIFFERENCE = 1e-6
-PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # `_is_systematic` uses N_NEIGHBOURS states at relative distances up to the first
-MARGIN = 0.01  # margin of the bounds of a CheckedRegion, relative to its ranges; less than most steps of a run move
-MARGIN_AT_REST = 1e-9  # margin added for coordinates at rest, whose range is 0, relative to the largest range
+# `_is_systematic` compares at N_NEIGHBOURS states near a state; their relative distance from it is up to PERTURBATION
+PERTURBATION, N_NEIGHBOURS = 1e-7, 12
+MARGIN = 0.01  # a CheckedRegion extends beyond the checked states by this fraction of their range, less than most steps
+MARGIN_AT_REST = 1e-9  # further extension, as a fraction of the largest range, for coordinates that do not move
 
 
 class CallbackTraces:
@@ -60,7 +63,7 @@ class CallbackTraces:
         self.is_compared = np.array([kind in kinds for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
-        self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, whether or not compared
+        self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, even if not compared
         self.is_trusted = False
         entries = (exprs[kind][index] for kind, index in self.entry_indices)
         # entries that are always zero are left out of the table
@@ -69,13 +72,13 @@ class CallbackTraces:
         self.program = OperationTable.from_results(graph, 1 + 2 * system.n_q, results)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
-        """Return a copy for another system of the same trace cache; `evaluate` computes the system's coefficients."""
+        """Return a copy with the coefficients of another system; `evaluate` computes them from its parameters."""
         traced = self.replace_coefficients(evaluate)
         traced.name = system.name
         return traced
 
     def replace_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
-        """Return a copy, not trusted yet, with each array of coefficients replaced by `convert`."""
+        """Return a copy in which convert(array) replaces each array of coefficients; its traces are not trusted yet."""
         traced = copy.copy(self)
         traced.program = self.program.replace_coefficients(convert)
         traced.is_trusted = False
@@ -86,24 +89,24 @@ class CallbackTraces:
         refuse_wrong_traces([self], system, t0, t1, q, v)
 
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
-        """Compare calls and traces at the states `nearby`; set `is_trusted`, or raise Untraceable if they differ."""
+        """Compare calls and traces at the states `nearby`; raise Untraceable if they differ, else set `is_trusted`."""
         difference = None
         for states in (nearby, *nearby[:, None, :]):  # first all states at once; if a call raises, one after another
             try:
                 difference = difference or self.difference(system, states, everywhere=False)
-            except Exception:  # the state is outside the domain of the callbacks
+            except Exception:  # the callbacks are not defined at this state
                 continue
             if states is nearby:
                 break
         if difference is not None:
             raise Untraceable(difference)
-        self.is_trusted = not system.called_in_python  # compiled callbacks never change
+        self.is_trusted = not system.called_in_python  # compiled callbacks never change; others are compared again
 
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
-        """Return a description of the first difference between calls and traces at states [t, q, v], or None.
+        """Return a message about the first difference of calls and traces at states [t, q, v], or None if they agree.
 
-        `everywhere`: where a call returns a value that is not finite, the value of the trace must not be finite either.
-        If false, such values are not compared.
+        If a call returns a value that is not finite, the value of the trace must not be finite either. But if
+        `everywhere` is False, such values are not compared.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -149,7 +152,7 @@ class CallbackTraces:
         return n_different, called, traced, bounds
 
     def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Return whether an entry differs by about the same amount at neighbouring states, unlike a rounding error."""
+        """Return True if call and trace differ by similar amounts at states nearby; a rounding error would vary."""
         directions = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * directions))
         errors = (called - traced)[:, entry]
@@ -167,14 +170,14 @@ class CallbackTraces:
 
 
 class Sample:
-    """Sample of the states [t, q, v] of a run so far, thinned out evenly in long runs; `n`: length of [q, v]."""
+    """Sample of the states [t, q, v] of a run so far; in a long run, evenly spaced ones. `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._chunks = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add the states of a chunk of steps: `rows` [q, v, ...] at times `t`, and the last state: `state` at `end`."""
+        """Add states of successive steps: `rows` [q, v, ...] at the times `t`, and the last state, `state` at `end`."""
         stride = 1 + len(t) // MAX_STATES_OF_CHUNK
         times = t[::stride]
         states = np.empty((len(times) + 1, 1 + self._n))
@@ -216,7 +219,7 @@ Check = Callable[[CallbackTraces], None]  # function that raises Untraceable if 
 
 
 def accept_traces(traced: CallbackTraces) -> None:
-    """Accept any traces; this `Check` is for results that no run uses."""
+    """Accept any traces without a comparison; this `Check` is for results that no run uses."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
@@ -247,12 +250,12 @@ def extreme_states(t: Array, rows: Array) -> Array:
 class CheckedRegion:
     """Region in which callbacks agreed with their traces: ranges of the states [t, q, v], and of the parameters.
 
-    bounds : smallest and largest t, q and v, with a margin; states within these bounds need no comparison.
+    bounds : smallest and largest t, q and v of checked states, with a margin; states in between need no comparison.
     """
 
     def __init__(self) -> None:
         self._runs = 0
-        self._parameters: tuple[Array, Array] | None = None  # smallest and largest parameters, by component
+        self._parameters: tuple[Array, Array] | None = None  # smallest and largest value of each parameter
         self._ranges = np.zeros((2, 0))  # smallest and largest value of each component of the states
         self.bounds = self._ranges
 
@@ -281,12 +284,12 @@ class CheckedRegion:
         return bool((smallest - margin <= parameters).all() and (parameters <= largest + margin).all())
 
     def add_parameters(self, parameters: Array) -> None:
-        """Extend the ranges to the parameters of a run whose calls and traces agreed."""
+        """Extend the ranges so that they include the `parameters` of a run in which calls and traces agreed."""
         smallest, largest = self._parameters or (parameters, parameters)
         self._parameters = np.minimum(smallest, parameters), np.maximum(largest, parameters)
 
     def add(self, states: Array) -> None:
-        """Extend the ranges of states, and `bounds`, to states where calls and traces agreed."""
+        """Extend the ranges and `bounds` so that they include `states`, where calls and traces agreed."""
         if len(states) == 0:
             return
         checked = np.concatenate([states, self._ranges]) if self._ranges.size else states
