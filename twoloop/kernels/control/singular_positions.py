@@ -1,4 +1,7 @@
-"""Check the partition and the distance from a singular position between the steps of a run."""
+"""Check, between the steps of a run, whether the partition is still good and whether a singular position is near.
+
+Pivots are those of an elimination of C_q with full pivoting (w.pivot: the smallest one). `f`: kit, `w`: workspace.
+"""
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import compiled, merged
@@ -7,40 +10,42 @@ from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_ratio, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
-SHORT_STEP = 0.5  # a singular position is suspected if a step is below this fraction of the longest of the last steps
-# pivots of C_q are computed anew if a step is below this fraction of the longest of the last steps
+SHORT_STEP = 0.5  # check for a singular position if a step is shorter than this fraction of the longest recent step
+# compute the pivots of C_q anew if a step is shorter than this fraction of the longest recent step
 COLLAPSED_STEP = 0.2
-# a singular position is near if the smallest pivot of C_q is below this fraction of its maximum so far
+# a singular position counts as near if the smallest pivot of C_q is below this fraction of its maximum in the run
 SINGULAR_PIVOT = 0.2
-# replaces SINGULAR_PIVOT in the fixed-order form, whose pivots are sines of angles between rows
+# value used instead of SINGULAR_PIVOT in the fixed-order form, whose pivots are sines of angles between rows of C_q
 FIXED_ORDER_SINGULAR = 0.01
-# the fixed-order form repeats rejected steps with projected stages if the pivot is below this fraction of the largest
+# below this fraction of the maximum pivot, the fixed-order form projects the stages of rejected steps that it repeats
 REPEAT_PIVOT = 0.05
-SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
-MIN_STEP_NEAR_SINGULAR = 0.001  # smallest step size near a singular position, relative to the longest recent step
-# the run ends if the smallest pivot is below this fraction of its maximum so far: rounding spoils accelerations
+SHRINKAGE = 0.8  # size of a step that is repeated with projected stages, relative to the size of the rejected step
+MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
+# if the smallest pivot is below this fraction of its maximum in the run, rounding errors spoil accelerations: the run
+# ends with RANK_LOST, unless a crossing of the singular position can still be attempted
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that generated code does not use
-# the augmented form checks a partition every 1 + n // FREEDOMS_PER_CHECK steps for n degrees of freedom, because a
-# check computes the full matrix T
+CHECK_INTERVAL = 16  # number of accepted steps from one check of the partition to the next if steps do not use it
+# in the augmented form, with n degrees of freedom, the partition is checked every 1 + n // FREEDOMS_PER_CHECK steps,
+# because each check computes the null space of [C_q; A], a dense matrix that steps in this form do not need
 FREEDOMS_PER_CHECK = 32
-N_CHECKED_PARTS = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
-# a step is checked if the pivot at one of its ends is below this fraction of the largest so far
+N_CHECKED_PARTS = 8  # `comes_near_singular` divides a step into this number of equal parts, and checks pivots between
+# pivots within a step are computed if the smallest pivot at one of its ends is below this fraction of LARGEST_PIVOT
 MAX_UNCHECKED_PIVOT = 0.5
-# the smallest pivot counts as zero in a step if a sample is below this fraction of its largest change between samples
+# `comes_near_singular` samples the smallest pivot within a step. If a sample is below this fraction of the largest
+# change from one sample to the next, the pivot may have been zero between two samples
 PASSED_PIVOT_RATIO = 0.6
-# MIN_NEAR_RATIO, MAX_NEAR_RATIO: smallest and largest result of near_pivot_ratio; MAX_ROUNDING_ERROR: allowed rounding
-# error, in tolerances; EPS: unit roundoff
+# MIN_NEAR_RATIO, MAX_NEAR_RATIO: limits of the result of `near_pivot_ratio`. MAX_ROUNDING_ERROR: allowed rounding error
+# near a singular position, in tolerances. EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-MIN_END_RATIO = 0.25  # fixed-order form: a step is halved if its last pivot is below this fraction of its first one
+MIN_END_RATIO = 0.25  # in `ends_near_singular`, smallest ratio of pivots at the end and at the beginning of a step
 
 
 @merged
 def is_near_singular(f, w, control, clock, t, q):
-    """Return whether control[MAY_CROSS] is 1 and a singular position is near (t, q), where the partition is renewed.
+    """Return True if control[MAY_CROSS] is 1 and a singular position is near the accepted position q at time t.
 
-    It is only renewed if a singular position was near when the partition was chosen, or if the partition may be old:
-    steps of generated code do not use it.
+    The smallest pivot at the last choice of a partition decides. If it is small, or may be old because steps of
+    generated code do not use the partition, first choose a new partition at (t, q).
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
@@ -52,9 +57,9 @@ def is_near_singular(f, w, control, clock, t, q):
 
 @merged
 def ends_near_singular(f, w, control, clock):
-    """Return whether a step of the fixed-order form ends so near a singular position that no step should begin there.
+    """Return True if a step of the fixed-order form ends so near a singular position that no step should begin there.
 
-    A singular position within a step, far enough from both ends, does no harm.
+    The step should then be repeated with another size: a singular position does no harm far from both ends of a step.
     """
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0:
         return False
@@ -63,17 +68,18 @@ def ends_near_singular(f, w, control, clock):
 
 @merged
 def is_too_short_near_singular(f, clock, size):
-    """Return whether a failed step of the fixed-order form, near a singular position, is too short to be repeated."""
+    """Return True if a failed step of the fixed-order form is near a singular position and too short to be repeated."""
     is_near = clock[at.PIVOT_HERE] < FIXED_ORDER_SINGULAR * clock[at.LARGEST_PIVOT]
     return f.form == FIXED_ORDER and is_near and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG]
 
 
 @merged
 def prepare_projected_repetition(f, w, control, clock, size):
-    """Return whether to repeat a rejected step of the fixed-order form with projected stages; if so, set clock[H_NEXT].
+    """Return True if a rejected step of the fixed-order form must be repeated with its stages projected.
 
-    Near a singular position, accelerations of stages off the constraints have large errors. A long step that ends well
-    beyond the position may succeed where shorter steps fail: the first repetition has at least the size H_LONG.
+    Then also set the flag for this projection, and the new size clock[H_NEXT]. Near a singular position, stages that
+    violate the constraints have inaccurate accelerations. A long step that ends well beyond the position may succeed
+    where shorter steps fail, so the first repetition is at least as long as clock[H_LONG], the longest recent step.
     """
     is_near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0 or w.nearly_singular == 1.0 or not is_near:
@@ -88,15 +94,16 @@ def prepare_projected_repetition(f, w, control, clock, size):
 
 @merged
 def near_pivot_ratio(tolerances):
-    """Return the pivot, relative to the largest, below which rounding errors exceed MAX_ROUNDING_ERROR tolerances."""
+    """Return pivot / LARGEST_PIVOT below which rounding errors may be larger than MAX_ROUNDING_ERROR tolerances."""
     return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 
 @compiled
 def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
-    """Return the smallest of the pivots of C_q sampled within a step, and their largest change from sample to sample.
+    """Sample the smallest pivot of C_q within a step of size `size` (s) from t; return two numbers.
 
-    The samples are on the cubic through the states at both ends of the step, whose pivots are `before` and `end`.
+    These are the smallest sample, and the largest change from one sample to the next. `before` and `end` are the
+    samples at the ends of the step. The others are at positions on the cubic through `state` and `new_state`.
     """
     n, least, change = w.Q.size, min(before, end), 0.0
     for k in range(1, N_CHECKED_PARTS):
@@ -113,9 +120,10 @@ def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
 
 @compiled
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
-    """Return whether an accepted step comes so near a singular position that a crossing step must replace the step.
+    """Return True if a step with a small error estimate comes so near a singular position that it must be discarded.
 
-    Near the position, rounding errors of the stages may exceed the tolerances although the error estimate is small.
+    Rounding errors of its stages may exceed the tolerances. If control[MAY_CROSS] is SUSPENDED, return False and record
+    the smallest pivot in clock[PIVOT_PASSED]. Far from singular positions, set control[MAY_CROSS] to 1.
     """
     bridge = control[at.MAY_CROSS]
     if bridge == 0.0 or control[at.CHECKS_WITHIN] == 0.0 or w.nearly_singular != 1.0 or control[at.FIXED_STEP] > 0.0:
@@ -142,21 +150,21 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
 
 @merged
 def record_pivot_at_output(f, w, clock, state):
-    """Update clock[PIVOT_AT_OUTPUT], the smallest pivot at output times and grid times, by the pivot at `state`."""
+    """Lower clock[PIVOT_AT_OUTPUT] to the ratio of smallest to largest pivot of [C_q; A] at `state`, if less."""
     pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
     if f.form == FIXED_ORDER and pivot > 0.0:
-        # pivots of the fixed-order form are sines of angles, all of them small in large mechanisms: only the ratio to
-        # the largest pivot so far shows a singular position
+        # pivots of the fixed-order form are sines of angles between rows. All are small in large mechanisms: only the
+        # ratio to the largest value of the smallest pivot so far shows a singular position
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 
 
 @merged
 def check_partition(f, w, control, clock, size, at_output, state):
-    """Renew a poor partition, and check how near a singular position is; return CONTINUE or an end code.
+    """Choose a new partition if the present one is poor, and check the pivots; return CONTINUE or an end code.
 
-    `size` is the size (s) of the last step; `at_output` is true if this step ended at an output time. `state` contains
-    all coordinates, so that it need not be converted for a new partition.
+    The end code is RANK_LOST if no partition can be chosen, or NEAR_SINGULAR. `size` is the size (s) of the last step.
+    `at_output` is True if this step ended at an output time: then it may be short for this reason alone.
     """
     short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
     if f.form == FIXED_ORDER:
@@ -177,7 +185,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # steps of generated code do not use the partition: only a new one shows whether a singular position is still near
+    # steps of generated code do not update the pivots: choose a new partition, to see if a singular position is near
     if f.is_generated == 1 and w.near_now == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)
@@ -185,16 +193,16 @@ def check_partition(f, w, control, clock, size, at_output, state):
     if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
         w.nearly_singular = w.near_now = 1.0
     if size < COLLAPSED_STEP * clock[at.H_LONG] and w.nearly_singular == 0.0 and control[at.MAY_CROSS] == 1.0:
-        # the pivots of an old partition may not show that the motion approaches a singular position
+        # pivots are computed when a partition is chosen: old ones do not show the approach to a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.sensitivity = 1.0  # its value far from singular positions: the partition is renewed again soon
+        w.sensitivity = 1.0  # its value far from singular positions, so that `partition_is_poor` soon holds again
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:
-        # an implicit method may still continue with a new partition, if the old one was chosen at a distant state
+        # if the old partition was chosen at a distant state, an implicit method may continue with a new partition
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.MAY_CROSS] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
-            return at.RANK_LOST  # no step can cross the singular position, where rounding would determine velocities
+            return at.RANK_LOST  # steps across the singular position would be determined by rounding errors
     return at.NEAR_SINGULAR if short and is_near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

@@ -1,19 +1,19 @@
 """Step-size control: the size of the next step, the times at which steps end, and additional error measures.
 
-The next step size follows from the error of the last step. For methods with a trend (Gustafsson, ACM TOMS 20 (1994),
-496) the next size also depends on how the error has changed since the last accepted step (`f`: kit, `w`: workspace).
+The next step size follows from the error of the last step. Some methods also use the trend of the error, its change
+since the last accepted step (Gustafsson, ACM TOMS 20 (1994), 496). In this module, `f` is the kit, `w` the workspace.
 
-Errors that the embedded formula does not show are measured in two ways:
+Two measures show errors that the error estimate of the integration formula misses:
 
 - `prediction_error` compares the dependent positions that the formula predicts with positions that satisfy the
   constraints. In the same assembly of the mechanism, the difference is of the order of the step's error. If the step
-  has ended in another assembly, the difference is larger, however smooth the independent coordinates are. If all
+  has ended in another assembly, the difference is larger, even if the independent coordinates are smooth. If all
   coordinates are prescribed, this is the only error estimate. Where two assemblies come close to one another, a large
-  step may end in the wrong assembly with a small difference. Then the sign of det C_qd changes, although a motion
-  changes it only at a singular position. So if the sign changes in a step, the prediction must be nearly exact, as it
-  is in short steps through a singular position.
-- `defect_ratio` is the defect of a Taylor step: the difference between accelerations by the series and accelerations by
-  the equations at the same states. A series contains the forces at the beginning of the step, but no later sudden
+  step may end in the wrong assembly with a small difference. Then the sign of det C_qd changes (C_qd: the dependent
+  columns of C_q). A motion changes this sign only at a singular position, where short steps have nearly exact
+  predictions. So if the sign changes in a step, its prediction must be nearly exact.
+- `defect_ratio` measures the defect of a Taylor step: the difference, at the same state, between accelerations by the
+  series and by the equations. The series knows the forces at the beginning of the step only, not a later sudden
   change. So the equations are evaluated at the end of the step and, if it is longer than DEFECT_GAP, also within it.
 """
 
@@ -37,14 +37,14 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-KEEP_BELOW_RATIO = 1.2  # methods that use the trend keep h, and so their factors, if it could grow by at most this
+KEEP_BELOW_RATIO = 1.2  # methods with a trend keep the step size if it could grow by at most this factor
 
 
 @compiled
 def step_size_ratio(rule, past, h, error):
-    """Return the ratio of the next step size to h by the step-size `rule`, given this step's `error` in tolerances.
+    """Return the ratio of the next step size to the size h of this step, whose `error` is in tolerances.
 
-    `past` is the history of step-size control: size and error of the last accepted step.
+    `rule`: parameters of step-size control; `past`: size and error of the last accepted step (see loop_state.py).
     """
     if not error > 0.0:
         return rule[FACTOR_MAX]
@@ -66,7 +66,7 @@ def record_accepted_step(rule, past, h, error):
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project (Q, V), a state near the constraints, in place, and store its accelerations in A; return a code."""
-    # PROJECT is the cheapest task in generated code; and in the fixed-order form, the task EVALUATE does not project
+    # in generated code, the task PROJECT is the cheapest; in the fixed-order form, the task EVALUATE does not project
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -74,7 +74,7 @@ def project_and_evaluate(f, w, t, Q, V, A):
 
 @kernel(COMMIT)
 def commit_nothing(f, w, options, memory, tolerances, accepted):
-    """Do nothing: the method of the step has no memory."""
+    """Do nothing after an attempted step, accepted or not: `commit` of a method that has no memory."""
 
 
 EQUAL_SPACINGS = 4.0  # largest difference of times that count as equal, in spacings of floating-point numbers
@@ -82,21 +82,22 @@ EQUAL_SPACINGS = 4.0  # largest difference of times that count as equal, in spac
 
 @merged
 def size_on_grid(clock, t, h, target, goal):
-    """Return the size (s) of a step from t, the number of grid steps that it completes, and whether it reaches `goal`.
+    """Return three values for a step from t in a run with steps of fixed size h, which end at grid times.
 
-    Grid times are T_START plus multiples of h. `target` is the next output time; a grid time that differs from `target`
-    by at most h / 10^6 counts as equal. `goal` is `target`, or the time of a jump of C_t or b before `target`.
+    The values are the size (s) of the step, the number of grid times that it reaches (0 or 1), and whether it reaches
+    `goal`. Grid times are T_START + k h. `target`: next output time. If a grid time differs from `target` by at most
+    h / 10^6, both count as equal. `goal`: time of a jump of C_t or b before `target`, if there is one, else `target`.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     margin = max(1e-6 * h, rounding)
     n_grid_steps = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + margin:
-        n_grid_steps = 0.0  # earlier steps have counted all grid times up to `target`
+        n_grid_steps = 0.0  # earlier steps have already counted all grid times up to `target`
     end = clock[at.T_START] + (clock[at.N_FIXED] + n_grid_steps) * h
     reaches_goal = goal <= end + margin
     size = h
     if abs(t + h - end) > rounding:
-        size = end - t  # end at a grid time again, after an output time between grid times
+        size = end - t  # t is not a grid time, for example after a jump: end at the next grid time
     if reaches_goal and goal < target and abs(goal - end) > rounding:
         n_grid_steps = 0.0
     return size, n_grid_steps, reaches_goal
@@ -104,7 +105,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, left, crosses_jump):
-    """Return the size (s) of a step (about h at most), and whether it reaches the goal, a time `left` s ahead."""
+    """Return the size (s) of a step (about h at most), and whether it reaches the goal, a time `left` s after t."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:
@@ -115,12 +116,12 @@ def size_off_grid(control, t, h, left, crosses_jump):
     return size, reaches_goal
 
 
-H_LONG_DECAY = 0.98  # each accepted step multiplies H_LONG, the longest of the last steps, by this factor
+H_LONG_DECAY = 0.98  # each accepted step multiplies clock[H_LONG], the longest recent step size, by this factor
 
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step; update largest defect and widest gap in w; fill `out_step`, a row of out_steps."""
+    """Count an accepted step of size `size` (s): update w and clock, and fill `out_step`, a row of out_steps."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)
@@ -141,17 +142,17 @@ def count_step(w, tolerances, control, clock, size, out_step):
     out_step[at.JACOBIANS] = 0.0 if w.explicit_step == 1.0 else w.n_jacobians
 
 
-# allowed error of a predicted position, relative to the largest motion of a coordinate in the step
+# allowed error of a predicted position, relative to the largest displacement of any coordinate in the step
 FRACTION_OF_MOTION = 0.1
 FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if the sign of det C_qd changes in the step
-LEAST = 1e-300  # lower bound of the allowed error, which avoids a division by zero
-# part of the allowed error of a predicted position, in tolerances, that does not depend on the motion in the step
+LEAST = 1e-300  # lower bound of the allowed error of a predicted position, which avoids a division by zero
+# this fraction of the tolerance is added to FRACTION_OF_MOTION times the displacement, for steps that hardly move
 FIXED_FRACTION = 0.01
 
 
 @merged
 def store_prediction(w, q1):
-    """Store in w.predicted the dependent positions in q1 (n_q), which the formula of the method has predicted."""
+    """Copy the dependent positions in q1 (n_q), which the integration formula has predicted, to w.predicted."""
     for k in range(w.dependent.size):
         w.predicted[k] = q1[w.dependent[k]]
 
@@ -160,9 +161,9 @@ def store_prediction(w, q1):
 def prediction_error(w, tolerances, h, q, v, q1):
     """Return the largest error of the dependent positions that the formula predicts, divided by the allowed error.
 
-    The error is the difference of w.predicted from the positions in q1, which satisfy the constraints. The allowed
-    error is the smaller one of the tolerance and about FRACTION_OF_MOTION times the motion in the step. The factors
-    of C_qd in `w` must belong to q1. For steps of fixed size, return 0.
+    The step of size h leads from (q, v) to q1. The error is the difference of w.predicted and q1, whose positions
+    satisfy the constraints. The allowed error is the tolerance or, if smaller, about FRACTION_OF_MOTION times the
+    displacement in the step. The factors of C_qd in `w` must belong to q1. For steps of fixed size, return 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -183,22 +184,22 @@ def prediction_error(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Project (q1, v1), predicted by a step of size h from (q, v); return a code, and the `prediction_error`."""
+    """Move (q1, v1), predicted by a step from (q, v), onto the constraints; return a code and `prediction_error`."""
     store_prediction(w, q1)
     code = restore_constraints(f, w, t, q1, v1, inner_tol)
     return code, prediction_error(w, tolerances, h, q, v, q1) if code == DONE else 0.0
 
 
-ROUNDING = 1e-13  # defect that counts as a rounding error, relative to the largest acceleration
+ROUNDING = 1e-13  # a defect up to this fraction of the largest acceleration counts as a rounding error
 
 
 @compiled
 def defect_ratio(tolerances, h, order, predicted, a, q, v):
-    """Return the defect |predicted - a| at the end of a step of size h, relative to the largest allowed defect.
+    """Return the largest defect |predicted - a| of accelerations at the end (q, v) of a Taylor step of size h.
 
-    The error that the defect causes in q and v must be below the tolerances. The defect of a series of order `order`
-    grows as the highest power of time; so its integral over the step is h / order times its value at the end. If an
-    acceleration is not finite, the result is infinite.
+    `predicted`: accelerations by the series; `a`: by the equations. Defects are relative to the allowed defect, which
+    causes errors of one tolerance in q or v. The defect of a series of order `order` grows as the highest power of
+    time: its integral over the step is h / order times its value at the end. Return inf if a value is not finite.
     """
     rtol, duration, largest, ratio = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

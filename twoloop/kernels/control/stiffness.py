@@ -1,23 +1,22 @@
 """Combine two methods in one run: an explicit one, and an implicit one for stiff parts of the motion.
 
-The largest rate of the motion, rho, is the square root of the largest eigenvalue of dF/dq, or the largest eigenvalue of
-dF/dv, where F are the accelerations. From time to time a few power iterations, of one evaluation each, estimate rho. If
-h rho is well below the stability limit of the explicit method, the motion is not stiff. Near the limit, either
-stiffness or accuracy may determine the step size h. Then the implicit method is tried for some steps, with its errors
-multiplied by ten, and replaces the explicit method if it costs less per second of motion.
+The largest rate of the motion, rho (1/s), is the larger of two numbers: the square root of the largest eigenvalue of
+dF/dq, and the largest eigenvalue of dF/dv, where F(q, v) are the accelerations. From time to time, a few power
+iterations of one evaluation each estimate rho. Let h be the step size. If h rho is well below the stability limit of
+the explicit method, the motion is not stiff. Near the limit, either stiffness or accuracy may determine h. Then a trial
+begins: the implicit method takes some steps, with its errors multiplied by ten. It stays if it costs less per second.
 
-A trial also begins at smaller h rho if
+A trial also begins at smaller h rho in three cases:
 
-- rho is far above the rates of change in the motion: the error of a component that decays at this rate may limit steps;
-- any component that vibrates at the rate rho has velocities of a few tolerances at most: steps at the stability limit
-  excite such components;
+- rho is far above the rate at which the motion changes: a component that decays at the rate rho may limit h;
+- vibrations at the rate rho have velocities of a few tolerances at most: steps at the stability limit excite them;
 - the whole run is expected to cost a thousand times as much as a trial.
 
-If a trial may not pay, it waits until the run has cost a few times as much as a trial, or is expected to cost ten times
-as much. Costs are counted in evaluations of the explicit method; with generated code, an evaluation of the implicit
-method counts several times. The explicit method is tried again if h rho is well below the limit, or if a second of
-motion costs more than it did with the explicit method. After an unsuccessful trial, the number of estimates before the
-next trial doubles. In this module, `f` is the kit, and `w` the workspace.
+Unless h rho is far above the limit, a trial waits until the run has cost a few times as much as a trial, or is expected
+to cost ten times as much. Costs are counted in evaluations of the explicit method. With generated code, an evaluation
+of the implicit method counts several times. The explicit method is tried again if h rho is well below the limit, or if
+a second of motion costs more than it did with the explicit method. After an unsuccessful trial, the number of estimates
+before the next trial doubles. In this module, `f` is the kit, and `w` the workspace.
 
 Kernels call both methods by their addresses, so that each method is compiled in its own module.
 """
@@ -51,70 +50,71 @@ from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, GAP, MAX_G
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# number of evaluations before the first estimate of rho, and between two estimates, each of which takes about eight
-# evaluations. While the explicit method is active, both numbers are multiplied by COST_RATIO
+# rho is first estimated after FIRST_ESTIMATE evaluations, then every BETWEEN_ESTIMATES evaluations. Both numbers are
+# multiplied by options[COST_RATIO] while the explicit method is active. An estimate takes about eight evaluations
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
-N_POWER_ITERATIONS = 4  # number of power iterations for dF/dq in one estimate, and largest number for dF/dv
-NEGLIGIBLE_DAMPING = 1e-3  # power iterations for dF/dv end if the step size times the eigenvalue is below this number
-ZERO_REPLACEMENT = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
-STABILITY_LIMIT = 3.0  # if h rho exceeds this multiple of LIMIT, stability surely limits steps of the explicit method
-# if the Jacobian is computed by finite differences (about eight evaluations per coordinate), a trial that may not pay
-# also waits until the run has cost this number of evaluations per independent coordinate
+N_POWER_ITERATIONS = 4  # number of power iterations with dF/dq in an estimate of rho; largest number with dF/dv
+NEGLIGIBLE_DAMPING = 1e-3  # power iterations with dF/dv end early if the eigenvalue times the step size is below this
+ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
+STABILITY_LIMIT = 3.0  # if h rho exceeds this multiple of options[LIMIT], a trial begins even if it is expensive
+# if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial also waits until the
+# run has cost this number of evaluations per independent coordinate, unless h rho exceeds STABILITY_LIMIT
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-# a trial that may not pay begins only after the run has cost as much as this number of trials
+# unless h rho exceeds STABILITY_LIMIT, a trial waits until the run has cost as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
-COUNTED_FRACTION_OF_RUN = 0.3  # from the beginning, this fraction of the expected cost of the whole run counts as spent
-# a trial begins, whatever the rates are, if the run has cost more than this multiple of MIN_COST_IN_TRIALS trials.
-# After k trials, the next one begins at k + 1 times this cost
+COUNTED_FRACTION_OF_RUN = 0.3  # at least this fraction of the expected cost of the whole run counts as its cost so far
+# after the run has cost this multiple of MIN_COST_IN_TRIALS trials, a trial begins at any value of rho. After k trials,
+# the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # rho is "hidden" (not seen in the motion) above this multiple of the motion's rate
-QUIET_FACTOR = 10.0  # steps at the stability limit excite oscillations with velocities of up to this many tolerances
-# with a hidden rate rho, an implicit method may allow longer steps if h rho exceeds this multiple of LIMIT
+MIN_RATIO_TO_MOTION = 30.0  # the motion does not show rho ("hidden") if rho exceeds this multiple of `_motion_rate`
+QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
+# if rho is hidden, or its vibrations are small, a trial begins if h rho exceeds this multiple of options[LIMIT]
 MIN_HIDDEN_RATIO = 0.05
-DIFFERENCE_STEP = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
-RETURN_BELOW = 0.4  # the explicit method is tried again if h rho is below this multiple of LIMIT
-# factor on errors of the implicit method on trial: its order is lower, and it must not win by larger errors
+DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / rho
+RETURN_BELOW = 0.4  # the explicit method is tried again if h rho is below this multiple of options[LIMIT]
+# errors of the implicit method on trial are multiplied by this factor, so that it cannot win by making larger errors
 TRIAL_ERROR_FACTOR = 10.0
-MEAN_WEIGHT = 0.8  # weight of the old mean step size when a step updates it; the new step size has the rest
+MEAN_WEIGHT = 0.8  # after a step: new mean step size = MEAN_WEIGHT * old mean + (1 - MEAN_WEIGHT) * size of the step
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # a trial succeeds if it divides the cost of a second of motion by at least this factor
+MIN_GAIN = 1.2  # a trial succeeds if a second of motion costs less than before by at least this factor
 N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
 
-# values of memory[PHASE]: explicit method, implicit method on trial, implicit method, explicit method on trial
+# values of memory[PHASE]. EXPLICIT, IMPLICIT: this method is in use. ON_TRIAL: the implicit method is on trial.
+# BACK_ON_TRIAL: the explicit method is on trial, after the implicit method was in use
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
-# `options` contains in this order: the N_PAIR options of the pair, at the indices below; for each method its step-size
-# rule (see loop_state.py) and, at REUSE_OF, its value of REUSE; the options of the first, then of the second method.
-# - LIMIT, N_ESTIMATES: the implicit method is tried if h rho exceeds LIMIT in N_ESTIMATES estimates
+# `options` contains N_PAIR options of the pair (indices below); N_OF_EACH numbers for each method, namely parameters of
+# step-size control (loop_state.py) and, at REUSE_OF, w.reuse; and the options of the first and the second method.
+# - LIMIT, N_ESTIMATES: the implicit method is tried after h rho has exceeded LIMIT in N_ESTIMATES estimates
 # - MATRIX_COST: cost of a Jacobian, in evaluations of accelerations
-# - COST_RATIO: cost of an evaluation by the second method, in evaluations by the first
+# - COST_RATIO: cost of an evaluation by the second (implicit) method, in evaluations by the first (explicit) one
 # - SIZE_1: number of options of the first method
 LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
-# indices in `memory`, which contains scalars, two directions (n_q each), and the memories of the two methods
+# indices in `memory`: N_SCALARS numbers. Two vectors of power iterations (n_q) and both methods' memories follow them
 (
     PHASE,  # EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps in this phase
     MAY_ESTIMATE,  # 1: rho may be estimated, because the last attempted step was accepted
-    NEXT_ESTIMATE,  # rho is estimated again after this number of evaluations since the start of the run
-    ESTIMATES_TO_WAIT,  # number of estimates before the next trial may begin
-    WAIT,  # value of ESTIMATES_TO_WAIT after the last trial
-    T_BEGIN,  # beginning (s) of the measurement of the cost per second
-    COST_BEGIN,  # cost of the run at the time T_BEGIN, in evaluations
-    COST_PER_SECOND,  # cost of a second of motion, in evaluations, by the method used before the trial
+    NEXT_ESTIMATE,  # number of evaluations, counted from the start of the run, after which rho is estimated again
+    ESTIMATES_TO_WAIT,  # number of estimates of rho that must still follow before the next trial may begin
+    WAIT,  # value of ESTIMATES_TO_WAIT at the end of the last trial
+    T_BEGIN,  # time (s) at which the measurement of the cost per second began; NaN: no step was attempted yet
+    COST_BEGIN,  # cost of the run up to the time T_BEGIN, in evaluations
+    COST_PER_SECOND,  # cost of a second of motion before the last trial, in evaluations by the explicit method
     RATE,  # last estimate of rho (1/s)
-    FIRST_MEMORY,  # number of entries of the memory of the first method
-    H_MEAN,  # mean step size (s)
-    HISTORY,  # first index of the history of step-size control in this phase: two numbers, see loop_state.py
+    FIRST_MEMORY,  # length of the memory of the first method
+    H_MEAN,  # weighted mean of the last step sizes (s), see MEAN_WEIGHT
+    HISTORY,  # first of two entries with the history of step-size control (see loop_state.py) in this phase
     _HISTORY_ERROR,
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    N_ABOVE_LIMIT,  # number of estimates with h rho above LIMIT since the last one below LIMIT
+    N_ABOVE_LIMIT,  # number of estimates with h rho > LIMIT; a smaller h rho sets it to 0, unless trials cost too much
     N_SCALARS,
 ) = range(19)
 
@@ -128,12 +128,12 @@ def switching_options(
     first: ArrayLike,
     second: ArrayLike,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of a pair of methods.
+    """Return the array `options` of a pair of methods, the first one explicit, the second one implicit.
 
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
-    `rules` has a row for each method: step-size rule and value of REUSE. `first`, `second`: options of the methods.
+    `rules` has a row for each method: parameters of step-size control, then w.reuse. `first`, `second`: their options.
     """
-    first = np.asarray(first)  # numbers, or expressions in the parameters
+    first = np.asarray(first)  # its entries are numbers, or expressions recorded for parameters of the system
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
     return np.concatenate([scalars, np.asarray(rules, dtype=np.float64).ravel(), first, np.asarray(second)])
 
@@ -165,10 +165,10 @@ def _memory_views(memory, n):
 
 @compiled
 def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
-    """Multiply `direction` (n_q) by dF/dq, or dF/dv if `by_v`; return the factor by which its largest entry grows.
+    """Take one power iteration: multiply `direction` (n_q) by dF/dq or, if `by_v` is True, by dF/dv (F: accelerations).
 
-    Then scale `direction` to a largest component of 1. Only components of independent coordinates are used. If the
-    product cannot be evaluated, return 0 and leave `direction` unchanged. (Q, V, A) is scratch.
+    Only components of independent coordinates are used. Scale the product to a largest component of 1, and return the
+    growth, an estimate of the largest eigenvalue. If F cannot be evaluated, return 0. (Q, V, A) is scratch.
     """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -197,12 +197,12 @@ def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
 
 @compiled
 def _largest_rate(f, w, memory, t, state, new_state):
-    """Return rho (1/s) at `state` by power iterations of the two directions in `memory`; `new_state` is scratch."""
+    """Return rho, the largest rate (1/s) of the motion at `state`, by power iterations; `new_state` is scratch."""
     n = w.Q.size
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     growth_by_q = growth_by_v = 0.0
-    # generated code does not use the partition, which may therefore be old: its independent coordinates may hardly move
+    # generated code does not use the partition, which may be old. Choose a new one: its independent coordinates move
     is_explicit = memory[PHASE] == EXPLICIT
     if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -212,7 +212,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
         growth_by_v = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
         if growth_by_v * memory[H_MEAN] < NEGLIGIBLE_DAMPING:
             break
-    for m in range(n):  # a component is zero if its coordinate was dependent in all estimates so far
+    for m in range(n):  # a zero component could remain zero in later estimates, even if rho then belongs to it
         if by_q[m] == 0.0:
             by_q[m] = ZERO_REPLACEMENT
         if by_v[m] == 0.0:
@@ -222,7 +222,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the relative rate of change (1/s) of velocities or of accelerations, whichever is larger; inf: unknown."""
+    """Return max|a| / max|v| or max|da/dt| / max|a| (1/s), whichever is larger; inf: unknown. `rate` is rho (1/s)."""
     n = Q.size
     dt = DIFFERENCE_STEP / rate
     fastest = largest = change = 0.0
@@ -242,9 +242,9 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _has_small_vibrations(w, tolerances, state, rate):
-    """Return whether vibrations with the present accelerations have velocities of at most QUIET_FACTOR tolerances.
+    """Return True if vibrations of angular frequency `rate` (1/s) have velocities of at most QUIET_FACTOR tolerances.
 
-    A vibration of angular frequency `rate` (1/s) and accelerations of amplitude a has velocities of amplitude a / rate.
+    The amplitude of their velocities is a / rate, where the amplitude of accelerations, a, is taken from `state`.
     """
     n = w.Q.size
     for i in w.independent_v:
@@ -256,7 +256,7 @@ def _has_small_vibrations(w, tolerances, state, rate):
 
 @compiled
 def _cost_of_run(w, options):
-    """Return the cost of the run so far, in evaluations; a Jacobian counts as MATRIX_COST evaluations."""
+    """Return the cost of the run so far, in evaluations; a Jacobian counts as options[MATRIX_COST] evaluations."""
     return w.n_evaluations + options[MATRIX_COST] * w.n_jacobians
 
 
@@ -285,7 +285,7 @@ def _begin_phase(w, options, memory, phase, t):
 
 @compiled
 def _judge_trial(w, options, memory, t):
-    """Return the phase after a trial, EXPLICIT or IMPLICIT, or -1 if the trial continues; t: present time."""
+    """Return the phase that follows a trial, EXPLICIT or IMPLICIT, or -1 while the trial continues; t: present time."""
     if memory[STEPS] == N_UNMEASURED_STEPS:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
     if memory[STEPS] < N_UNMEASURED_STEPS + N_MEASURED_STEPS:
@@ -301,20 +301,20 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate rho and decide whether to try the other method; if so, return the phase that begins now, else -1."""
+    """Estimate rho, and decide whether a trial of the other method begins; return its phase, or -1 if none begins."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
     memory[NEXT_ESTIMATE] = w.n_evaluations + _evaluations_between_estimates(options, memory)
     memory[ESTIMATES_TO_WAIT] -= 1.0
-    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]  # relative to LIMIT
+    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]  # h rho as a multiple of the stability limit
     if h_rho > 1.0:
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # unless stability surely limits the steps, a trial begins only if it is cheap compared with the cost of the run so
-    # far, or with a part of the expected cost of the whole run. Finite differences for the Jacobian raise this limit
+    # unless h rho exceeds STABILITY_LIMIT, a trial begins only if it is cheap compared with `counted`: the cost of the
+    # run so far or, if larger, a fraction of the expected cost of the whole run
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)
@@ -327,8 +327,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a costly run starts a trial whatever the rates are: friction is stiff only while it reverses, and few estimates
-    # fall into this time. `cost > min_cost`: short steps at the start say little about the cost of the whole run
+    # a costly run starts a trial at any value of rho: friction is stiff only while it reverses, and few estimates fall
+    # into this time. The condition cost > min_cost excludes short steps at the start, which make a run look costly
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > STABILITY_LIMIT
@@ -336,9 +336,9 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         or is_costly
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # (while a trial is too expensive, N_ABOVE_LIMIT keeps its value)
+    if is_cheap and h_rho <= 1.0:  # (else N_ABOVE_LIMIT keeps its value, so that a trial begins when it is cheap)
         memory[N_ABOVE_LIMIT] = 0.0
-    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than in the previous explicit phase
+    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # the explicit method was cheaper
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0
@@ -348,7 +348,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
 
 @kernel(COMMIT)
 def commit_switching(f, w, options, memory, tolerances, accepted):
-    """Commit or discard the attempted step in the memory of the active method, and count it if it is accepted."""
+    """Commit (if `accepted`) or discard the attempted step in the memory of the active method; count accepted steps."""
     first, second = _memory_views(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
     memory[MAY_ESTIMATE] = 0.0
@@ -365,9 +365,9 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method; first choose this method anew if rho must be estimated or a trial judged.
+    """Attempt a step by the active method; before this, change the method if an estimate of rho or a trial says so.
 
-    The memory of a method is cleared when this method becomes active. The active method determines the step-size rule.
+    The memory of a method is set to zero when this method becomes active. Each method has its own step-size control.
     """
     n = w.Q.size
     first, second = _memory_views(memory, n)
@@ -393,14 +393,14 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: use the implicit method now, and later
+        # a step of fixed size that does not converge cannot be shortened: use the implicit method now and later
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0
             w.explicit_step = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only the first method may take steps longer than GAP, because it also evaluates the equations within a step
+        # only the first method evaluates the equations within a step, so only its steps may exceed tolerances[GAP]
         ratio = gap_ratio(tolerances, h)
         if ratio > 0.0:
             return Attempt(DONE, ratio, 1.0 / ratio)
