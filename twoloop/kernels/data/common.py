@@ -1,9 +1,9 @@
 """Define what all kernels share: types, compiling decorators, the workspace, the table of callbacks, tolerances.
 
-Each kind of callback has a fixed signature, and writes its results into an argument. So the integrator is compiled
-once, and receives the functions of any mechanism and any method as arguments. Arguments have the same names in all
-kernels: `f` is the `Kit` (the functions and constant data of a system and a method), `w` the workspace `Work` (the
-arrays that kernels write), `t` the time and `h` a step size in s.
+A kernel is a compiled function of this package. Each kind of callback has a fixed signature, and writes its results
+into an argument. So kernels are compiled once, and receive the functions of any mechanism and any method as arguments.
+Arguments have the same names in all kernels: `f` is the `Kit` (functions and constant data of a system and a method),
+`w` the workspace `Work` (arrays that kernels write), `t` the time (s), `h` a step size (s).
 """
 
 import hashlib
@@ -28,83 +28,86 @@ from twoloop.kernels.data.indices import ATOL, COUNTERS, ESTIMATE, FLAGS, GAP, G
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
-INTEGERS_32 = types.int32[::1]  # for long programs, which fit in the processor's cache as 32-bit integers
+INTEGERS_32 = types.int32[::1]  # for long programs (lists of operations): as 32-bit integers, more fits in the cache
 
-# names of the programs in `Functions`: programs that replace missing callbacks (evaluation/operations.py), and programs
-# for sparse factors of large systems (linalg/symbolic_factorization.py, sparse_lu.py). A missing program has size 0
+# names of the programs (lists of operations) in `Functions`. jacobian_... and gamma_... replace missing callbacks, see
+# evaluation/operations.py. ldl_program and newton_program factor the matrices of large systems, see
+# linalg/symbolic_factorization.py and sparse_lu.py. The array of a missing program has size 0
 PROGRAMS = "jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "ldl_program", "newton_program"
-# the callbacks of a mechanism, its parameters, its flags and its programs
+# what kernels know of a mechanism: callbacks (KINDS), parameters `p`, flags (see indices.py) and programs
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # type: ignore[misc]
 
 
 class Work(NamedTuple):
-    """Arrays that an evaluation writes; allocated once per run.
+    """Workspace: the arrays that kernels write, allocated once per run.
 
-    Sizes: n_q coordinates; n_c rows of C_q and n_a rows of A; r independent rows in C_q, r_v in C_q and A together;
-    n_dof = n_q - r_v. Fields that end in _v belong to velocities; without rows of A, they are the arrays for positions.
+    G = [C_q; A] contains the Jacobian C_q of the constraints on positions (n_c rows) and the rows A of non-holonomic
+    constraints A v + b = 0 (n_a rows). Of n_q coordinates, r positions and r_v velocities are dependent: r and r_v are
+    the numbers of independent rows of C_q and of G. n_dof = n_q - r_v. Subscripts: d dependent, i independent columns.
+    Fields that end in _v belong to velocities; if n_a = 0, they are the same arrays as the fields without _v.
     """
 
     M: Any  # (n_q, n_q) mass matrix
     L: Any  # (n_q, n_q) inverse of M if M is constant, else the factors of M, dense (see ldl_factor) or banded
-    G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
-    entries: Any  # view of `G` as a vector
-    augmented: Any  # view of the memory of `G` and, after it, of `M`
-    S: Any  # (r_v, r_v) G M^-1 G^T for the independent rows of G, which is overwritten by its factors
-    W: Any  # (r_v, n_q) G M^-1 for the independent rows of G
-    A: Any  # (n_dof, n_dof) T^T M T (T: null space of G), overwritten by its factors; empty where S is used
+    G: Any  # (n_c + n_a + 1, n_q) [C_q; A] at the position that was evaluated last, and a row of zeros
+    entries: Any  # view of G as a vector, row by row
+    augmented: Any  # view, as a vector, of the entries of G followed by those of M
+    S: Any  # (r_v, r_v) Schur complement G M^-1 G^T of the independent rows of G, then its factors
+    W: Any  # (r_v, n_q) G M^-1 of the independent rows of G
+    A: Any  # (n_dof, n_dof) T^T M T (columns of T: null space of G), then its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
-    D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T; last row: dependent velocities for v_i = 0; columns in elimination order
-    Gx: Any  # (n_c + n_a, n_q) C_q and A at a displaced position (for Gamma by differences); scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) the G that was used to compute S and W, for constant M; NaN: none yet
-    pattern: Any  # (n_c + n_a, n_q) 1 for entries of G that have been nonzero, else 0
-    mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; empty without the augmented form
-    row_entries: Any  # (n_c + n_a + 1) where each row's list begins, then the lists: columns of nonzero entries of G
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: with twice the time step, and with the previous time step
+    D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T, the null space; last row: v_d for v_i = 0; columns in elimination order
+    Gx: Any  # (n_c + n_a, n_q) [C_q; A] at a displaced position, for Gamma by differences; scratch for full pivoting
+    G_of_S: Any  # (n_c + n_a, n_q) G for which S and W were computed, if M is constant; NaN: S and W are not valid
+    pattern: Any  # (n_c + n_a, n_q) 1 for entries of G that have been nonzero at any position of the run, else 0
+    mass_pattern: Any  # (n_q, n_q) the same for entries of M; used in the augmented form only, else empty
+    row_entries: Any  # for each row of G: index in this array of its list; then the lists: columns of nonzero entries
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the time step e, and with the previous value of e
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b at later times, see discontinuities.py
     Q: Any  # (n_q) force
-    x: Any  # (n_q) scratch
-    y: Any  # (n_q) scratch
-    C: Any  # (n_c) C(t, q); also scratch for corrections
-    Rate: Any  # (n_c + n_a) C_t and b
-    Gamma: Any  # (n_c + n_a) right-hand side of G a = Gamma
-    g: Any  # (n_c + n_a) scratch
-    z: Any  # (r_v) scratch
+    x: Any  # (n_q) scratch, for example a displaced position
+    y: Any  # (n_q) scratch, for example a correction of positions
+    C: Any  # (n_c) violations C(t, q) of the constraints; also scratch
+    Rate: Any  # (n_c + n_a) C_t = dC/dt at constant q, and b in A v + b = 0
+    Gamma: Any  # (n_c + n_a) right-hand side of G a = Gamma for the accelerations a
+    g: Any  # (n_c + n_a) scratch, with one entry for each row of G
+    z: Any  # (r_v) scratch, with one entry for each independent row of G
     lam: Any  # (n_c + n_a) scratch for multipliers that the caller does not need
     minimum: Any  # scratch for the multipliers of least norm, see saddle_point.py
     rows: Any  # (r) indices of the independent rows of C_q
     dependent: Any  # (r) indices of the dependent coordinates
     independent: Any  # (n_q - r) indices of the independent coordinates
-    index: Any  # program that factors C_qd, see markowitz_lu.py
-    values: Any  # the factors of C_qd
+    index: Any  # list of operations that factors C_qd, see markowitz_lu.py
+    values: Any  # factors of C_qd, the dependent columns of the independent rows of C_q
     rows_v: Any  # (r_v) indices of the independent rows of G
     dependent_v: Any  # (r_v) indices of the dependent velocities
     independent_v: Any  # (n_dof) indices of the independent velocities
-    index_v: Any  # program that factors G_d
-    values_v: Any  # the factors of G_d
-    index_a: Any  # program that factors the augmented matrix; index_a[SIZE] is 0 until the program is written
-    values_a: Any  # the factors of the augmented matrix; empty in other forms
-    right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix, and scratch
+    index_v: Any  # list of operations that factors G_d, the dependent columns of the independent rows of G
+    values_v: Any  # factors of G_d
+    index_a: Any  # list of operations that factors the augmented matrix [M G^T; G 0]; index_a[SIZE] = 0: none yet
+    values_a: Any  # factors of the augmented matrix; empty in other forms than AUGMENTED
+    right: Any  # (2 (n_q + r_v)) right-hand side of equations with the augmented matrix, then scratch
     order: Any  # (n_q) scratch: order of the columns in full pivoting
     row_order: Any  # (n_c + n_a) scratch: order of the rows in full pivoting
-    counters: Any  # (N_COUNTERS) numbers of steps, iterations and evaluations in the run, see indices.py
-    lapack: Any  # addresses of band.ROUTINES; 0 where linear algebra is dense
+    counters: Any  # (N_COUNTERS) numbers of steps, iterations, evaluations etc. in the run, see indices.py
+    lapack: Any  # addresses of the LAPACK routines in band.ROUTINES; zeros if no matrix is banded
     predicted: Any  # (r) dependent positions predicted by the integration formula, before they are projected
     notes: Any  # (N_NOTES) values that one kernel stores for another, see indices.py
-    nodes: Any  # results of the operations of a traced program
+    nodes: Any  # results of all operations of a traced program, see evaluation/operations.py
     matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
-    # the fields from here to `solutions` belong to the fixed-order form, and are empty in other forms; N is n_q + n_c
-    mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
-    jacobian_values: Any  # entries of G
-    is_independent: Any  # (n_c) 1 for independent rows, else 0
-    factors: Any  # entries of the factors, at the indices that the program gives
-    pivot_sizes: Any  # (N) squared norms of the rows, for a comparison with pivots, see linalg/sparse_ldl.py
-    unknowns: Any  # (N) right-hand side on entry to a solver, solution on return
-    solutions: Any  # (3 N) scratch, then (n_c) factors s of rows g that are added to M as s g g^T, see sparse_ldl.py
+    # the next fields, up to `solutions`, belong to the fixed-order form and are empty in other forms; N = n_q + n_c
+    mass_values: Any  # nonzero entries of M, in the order of linalg/symbolic_factorization.py
+    jacobian_values: Any  # nonzero entries of C_q, in the order of linalg/symbolic_factorization.py
+    is_independent: Any  # (n_c) 1 for independent rows of C_q, 0 for redundant rows
+    factors: Any  # entries of the factors of the augmented matrix, at the indices that f.ldl_program contains
+    pivot_sizes: Any  # (N) squared norms of rows, to which the pivots are compared, see linalg/sparse_ldl.py
+    unknowns: Any  # (N) right-hand side when a solver is called, solution when it returns
+    solutions: Any  # (3 N) scratch; then (n_c) for each row g of C_q, the factor s of the term s g g^T added to M, or 0
 
-    sizes: Any = None  # sizes of the arrays, see `Sizes` in layout.py
+    sizes: Any = None  # the numbers that determine the sizes of all arrays, see `Sizes` in layout.py
     address: Any = 0  # address of `table`
-    table: Any = None  # addresses and shapes of the arrays above, for kernels
+    table: Any = None  # addresses and shapes of the arrays above, by which kernels receive them
 
 
 _INTEGER_FIELDS = {
@@ -131,10 +134,10 @@ class Attempt(NamedTuple):
     """Result of an attempted step: its code, its error and the factor for the next step size.
 
     code : DONE, or the reason why the step failed.
-    error : error in units of the tolerances: the step is accepted if it is at most 1. If a step is longer than the
-        method allows, the step is not computed, and `error` is the ratio of its size to the allowed size.
-    factor : ratio of the next step size to the size of this step; 0: the controller computes the ratio from the error.
-        If both factor and error exceed 1, the step size was a guess: the step has to be repeated with a larger size.
+    error : error estimate in tolerances; if it exceeds 1, the step is rejected. If a step is longer than the method
+        allows, it is not computed: then `error` is the ratio of its size to the largest allowed size.
+    factor : ratio of the next step size to the size of this step; 0: step-size control computes the ratio from `error`.
+        If both factor and error exceed 1, the step size was a guess: the step must be repeated with a larger size.
     """
 
     code: int
@@ -143,9 +146,10 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Compiled functions of a method: `attempt` computes a step, `commit` accepts or discards the step in `memory`.
+    """Compiled functions of a method.
 
-    `many` computes several steps in one call, and is None if the method has no such function.
+    `attempt` computes a step. `commit` then updates the method's memory, according to whether the step is accepted.
+    `many` computes several accepted steps in one call; None: the method has no such function.
     """
 
     attempt: Any = None
@@ -163,7 +167,7 @@ KIT = Reference(
 )
 for _name, _kind in KINDS.items():
     KIT.add_function(_name, _kind.signature)
-# signature of an inner loop: (kit, work, task, t, q, v, tolerance, a, lam) -> code, see inner_loop.py
+# signature of inner loops: (kit, workspace, task, t, q, v, tolerance, a, lam) -> code, see inner_loop.py
 INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
 for _name in ("inner", "general"):
     KIT.add_function(_name, INNER)
@@ -180,20 +184,20 @@ for _name in ("commit", "commit_first", "commit_second"):
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
-# functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Functions with a boolean
-# result return False, and write no results, if a condition of the generated code is not satisfied
+# signatures of the functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Those with
+# a boolean result return False, and write no results, if a condition under which the code is valid does not hold
 OWN_FUNCTIONS = {
-    # functions of a state, with arguments (t, q, v, numbers) and then arrays for the results. own_accelerate
-    # stores a; own_correct_positions stores the correction and the corrected q; own_project stores a, the correction of
-    # q, the corrected q and v, and lam; own_redundant stores nothing, but checks that redundant rows are satisfied
+    # functions of a state: arguments (t, q, v, f.numbers), then arrays of results. own_accelerate stores accelerations;
+    # own_correct_positions, the correction of q and the corrected q; own_project, accelerations, the correction of q,
+    # the corrected q and v, and multipliers. own_redundant stores nothing: it returns True if redundant rows hold
     "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_project": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    # functions of collocation; their first argument is the memory described in data/collocation.py. attempt_nodes
-    # (memory, state, tolerances, numbers) returns how the iteration ended, audit_nodes (memory, state, numbers) the
-    # defect between nodes. The others return nothing: retry_nodes (memory, state), end_nodes (memory, state,
-    # new_state), correct_ends and project_ends (memory, numbers)
+    # functions of collocation; `memory` is described in data/collocation.py, `numbers` is f.own_numbers. attempt_nodes
+    # (memory, state, tolerances, numbers) solves for the stages and returns a code such as CONVERGED; audit_nodes
+    # (memory, state, numbers) returns the defect between nodes. Those without a result: retry_nodes (memory, state),
+    # end_nodes (memory, state, new_state), correct_ends and project_ends (memory, numbers)
     "attempt_nodes": f8(*[VECTOR] * 4),
     "audit_nodes": f8(*[VECTOR] * 3),
     "retry_nodes": types.none(*[VECTOR] * 2),
@@ -218,7 +222,7 @@ def _source_text(module: str) -> str:
 
 
 def _imported_modules(text: str) -> set[str]:
-    """Return the names of the modules of the kernels that a source text imports, such as "steps.stages"."""
+    """Return the names of the modules below twoloop.kernels that a source text imports, such as "steps.stages"."""
     names = set()
     for folder, several, single in re.findall(
         r"^from twoloop\.kernels([\w.]*) import (?:\(([^)]*)\)|(.+))$", text, re.MULTILINE
@@ -233,9 +237,10 @@ def _imported_modules(text: str) -> set[str]:
 
 @cache
 def source_digest(module: str) -> str:
-    """Return a digest of the callback signatures and of the sources of a module and of all modules that it imports.
+    """Return a hash of all sources on which the machine code of a module depends; it changes if one of them changes.
 
-    `module`: name below twoloop.kernels, such as "steps.stages".
+    These are the source of `module` (a name below twoloop.kernels, such as "steps.stages"), the sources of all modules
+    that it imports, directly or not, and the signatures of callbacks.
     """
     modules: set[str] = set()
     pending = {module}
@@ -249,7 +254,7 @@ def source_digest(module: str) -> str:
 
 
 def _module_name(function: Callable[..., Any]) -> str:
-    """Return the name of the module that defines a kernel, such as "steps.stages"."""
+    """Return the name, such as "steps.stages", of the module that defines a kernel."""
     path = Path(inspect.getfile(function)).with_suffix("")
     return ".".join(path.relative_to(_FOLDER).parts) if path.is_relative_to(_FOLDER) else path.stem
 
@@ -273,9 +278,9 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
     return compile_now
 
 
-# options of numba for all kernels. "fastmath" lacks "nnan" and "ninf", so that NaN and infinity are respected.
-# `_nrt` = False excludes numba's runtime: code that allocates arrays does not compile, and arrays have no reference
-# counts, which would take a third of the time of an evaluation of the four-bar
+# options of numba for all kernels. "fastmath" omits the flags "nnan" and "ninf", because code must handle NaN and
+# infinity. `_nrt` = False excludes numba's runtime: then kernels cannot allocate arrays, and do not count references to
+# arrays, which would take a third of the time of an evaluation of a four-bar linkage
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
@@ -285,31 +290,31 @@ OPTIONS: dict[str, Any] = {
 
 
 def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Return a decorator that compiles helpers: functions that kernels call, but not Python."""
+    """Return a decorator that compiles helpers: functions that compiled kernels call, and Python does not."""
     wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
-# forceinline is always set explicitly, because a callee inherits the flags of its caller: otherwise, all helpers that a
-# merged helper calls would be merged, too
+# numba passes the flags of a caller on to the functions that it calls. So forceinline is always set: else all helpers
+# that a merged helper calls would be merged, too
 exact = _helper_decorator(fastmath=False, forceinline=False)  # keeps the order of floating-point operations
-compiled = _helper_decorator(forceinline=False)  # compiled as one function, which LLVM inlines only if it is short
+compiled = _helper_decorator(forceinline=False)  # LLVM compiles a function, and inlines it only if it is short
 inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
-# inlined by LLVM: each call becomes a copy of the code. For short helpers, and for helpers used in every evaluation
+# LLVM replaces each call by a copy of the code. For short helpers, and for helpers used in every evaluation
 merged = _helper_decorator(forceinline=True)
 
 
-NO_NUMBERS = np.zeros(0)  # data for generated functions that read no data
+NO_NUMBERS = np.zeros(0)  # Kit.numbers if there are no generated functions that read data
 
 
 class Kit:
     """Functions and data of a system and a method, passed to kernels as one reference.
 
-    `functions` are the callbacks, `inner` is the inner loop, and `step` has the functions of the method, or None if no
-    kernel calls them. Kernels call inner loop and step by their addresses, without compiling them again. `first` and
-    `second` are the methods of a pair of methods. `own` contains the functions generated for the mechanism; an inner
-    loop that calls them leaves tasks without such a function to `general`, the inner loop of any mechanism. `numbers`
-    are the data of the generated functions, and `own_numbers` the data of the collocation functions.
+    `functions`: callbacks and data of the system. `inner`: the inner loop. `step`: functions of the method, or None if
+    no kernel calls them; `first`, `second`: the same for both methods of a pair. Kernels call these functions by their
+    addresses, without compiling them again. `own`: functions generated for the mechanism, if there are any. If `inner`
+    calls them, it leaves all other tasks to `general`, the inner loop for any mechanism. `numbers`: data that generated
+    functions read; `own_numbers`: data that the generated functions of collocation read.
     """
 
     def __init__(
@@ -346,7 +351,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
-# indices of callbacks in Functions, which are the values of FAULT_KIND in Work.notes
+# indices of callbacks in the tuple Functions. w.fault_kind has these values
 MASS, FORCE, CONSTRAINT, JACOBIAN, RATE, GAMMA = (
     Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 )
@@ -375,7 +380,7 @@ def finite(A):
 
 @compiled
 def not_finite(w, kind, t, q):
-    """Store in w the time t and the kind of the callback whose value is not finite (-1: q itself); return a code."""
+    """Store t and the index `kind` of a callback with a NaN or infinite value (-1 if q has one); return NOT_FINITE."""
     w.fault_kind = kind if finite_vector(q) else -1.0
     w.fault_time = t
     return NOT_FINITE
@@ -383,7 +388,7 @@ def not_finite(w, kind, t, q):
 
 @compiled
 def faulty_callback(w):
-    """Return the index in Functions of the callback that makes accelerations not finite; -1: unknown."""
+    """Return the index in Functions of a callback whose result in w is NaN or infinite; -1: none was found."""
     n_c = w.C.size
     if not finite_vector(w.Rate[:n_c]):
         return RATE
@@ -398,24 +403,24 @@ def faulty_callback(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-GAP_SLACK = 1e-9  # a step size may exceed GAP by this fraction of GAP, which counts as a rounding error
+GAP_SLACK = 1e-9  # an excess of a step size over tolerances[GAP] by this fraction counts as a rounding error
 
 
 @merged
 def allowed_error(tolerances, m, x, x1):
-    """Return the allowed error of coordinate m, or of its velocity, in a step that changes its value from x to x1."""
+    """Return atol + rtol max(|x|, |x1|) for coordinate m (or its velocity), which a step changes from x to x1."""
     return tolerances[ATOL + m] + tolerances[RTOL] * max(abs(x), abs(x1))
 
 
 @merged
 def is_beyond_gap(tolerances, h):
-    """Return whether a step of size h is longer than tolerances[GAP]."""
+    """Return whether a step of size h is longer than tolerances[GAP], the longest time between evaluations."""
     return h > tolerances[GAP] * (1.0 + GAP_SLACK)
 
 
 @merged
 def gap_ratio(tolerances, h):
-    """Return h / tolerances[GAP] if a step of size h is too long; 0 if it is not, or if the step size is fixed."""
+    """Return h / tolerances[GAP] if a step of size h exceeds tolerances[GAP]; else, and for steps of fixed size, 0."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

@@ -1,8 +1,8 @@
-"""Indices into the arrays that kernels share, and the codes that they return.
+"""Indices into the arrays that kernels share, and the codes that kernels return.
 
-Kernels keep their state in arrays of numbers, because compiled code passes arrays by reference. Each group below names
-the indices of one array; control/loop_state.py has the indices that only the loop over steps uses. In kernels, elements
-of `Work.notes`, `Work.counters` and `Functions.flags` are attributes, such as w.pivot for w.notes[PIVOT].
+Kernels (compiled functions) keep their state in arrays, because compiled code passes arrays by reference. Each group
+below names the indices of one array; control/loop_state.py contains those that only the loop over steps uses. Kernels
+read elements of `Work.notes`, `Work.counters` and `Functions.flags` as attributes: w.pivot is w.notes[PIVOT].
 """
 
 from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
@@ -18,24 +18,25 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     GAMMA_INACCURATE,
     RANK_DIFFERS,
     ROWS_CONTRADICT,
-    NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller takes a dense form
-    NOT_LOADED,  # the caller has to load the machine code of the step
+    NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller uses a dense form
+    NOT_LOADED,  # the machine code of the step is missing: the caller loads it, then repeats the call
     UNSUITED,  # the method does not suit the motion: the caller continues with another method
-    STOPPED,  # the time limit of the run has passed, see TIME_IS_UP
+    STOPPED,  # an evaluation was left out because the time limit of the run has passed, see TIME_IS_UP
 ) = range(13)
 
-# indices in Functions.flags, whole numbers that describe a system to kernels
+# indices in Functions.flags, integers that describe a system to kernels; 0 is the opposite of 1
 (
     CONSTANT_MASS,  # 1: M is constant
     DIAGONAL_MASS,  # 1: M is diagonal
-    BANDWIDTH,  # bandwidth of M for banded linear algebra; -1: linear algebra is not banded
-    FORM,  # form of the linear equations for accelerations: one of the four below, see linalg/saddle_point.py
-    DENSE_FORM,  # the value of FORM to use if sparse factors have too many entries
+    BANDWIDTH,  # bandwidth of M if linear algebra with M is banded; -1: it is not
+    FORM,  # form of the linear equations for accelerations: MULTIPLIERS, NULL_SPACE, AUGMENTED or FIXED_ORDER
+    DENSE_FORM,  # value of FORM that replaces AUGMENTED if the sparse factors have too many entries
     IS_GENERATED,  # 1: the inner loop is code generated for the mechanism
-    FIRST_GIVEN,  # first index of the flags in GIVEN
+    FIRST_GIVEN,  # index of the first flag of an optional callback, see GIVEN
 ) = range(7)
-MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM; for FIXED_ORDER see sparse_inner_loop.py
-# indices of the flags of optional callbacks: 1 if the callback is given
+# values of FORM, see linalg/saddle_point.py and, for FIXED_ORDER, evaluation/sparse_inner_loop.py
+MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)
+# index in Functions.flags for the name of each optional callback; the flag is 1 if the user has given the callback
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
@@ -47,8 +48,8 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     N_ACCEPTED,
     N_REJECTED_ERROR,
     N_REJECTED_CONVERGENCE,
-    N_OUTER,  # number of iterations of the outer loop, which computes the stages of steps
-    N_INNER,  # number of iterations of the inner loop, which projects positions onto the constraints
+    N_OUTER,  # number of iterations of the outer loop, which solves for the stages of implicit steps
+    N_INNER,  # number of iterations of the inner loop, which moves positions onto the constraints
     N_EVALUATIONS,
     N_PARTITIONS,
     N_FACTORIZATIONS,
@@ -58,44 +59,47 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
 
 # indices in Work.notes: values that one kernel stores for another
 (
-    SENSITIVITY,  # max|C_qd^-1 C_qi| after the first step with this partition; 0: not known yet
-    ORIENTATION,  # sign of det C_qd at the last accepted state with this partition; 0: not known yet
-    ORIENTATION_NEW,  # sign of det C_qd at the end of the attempted step; 0: not known yet
-    FAULT_KIND,  # index in Functions of the callback that returned a value that is not finite; -1: none known
-    FAULT_TIME,  # time (s) at which a callback returned a value that is not finite
-    GAMMA_REQUIRED,  # required relative accuracy of Gamma by differences, see evaluation/constraints.py
-    GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to largest_difference_step
-    GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_STEP_RATIO was chosen
-    GAMMA_SCALE,  # largest entry of Gamma so far
-    REUSE,  # the factors of C_qd are not renewed if the last correction of positions is at most this
-    ROUNDED,  # rounding error of positions; replaces REUSE when a state that may be accepted is computed
-    GENERATION,  # number of partitions that have been chosen in the run
-    RANK,  # rank of C_q, stored if the workspace is allocated for another rank
-    RANK_V,  # rank of C_q and A together, stored if the workspace is allocated for another rank
-    CONTRADICTION,  # index of a row that is violated although it counted as redundant
-    PIVOT,  # smallest pivot of the last full pivoting, for rows scaled to 1; small near a singular position
-    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check for singular positions
-    NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check must first renew the partition
-    MASS_SCALE,  # factor on M in the augmented matrix, see linalg/saddle_point.py
-    FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
-    HAS_GAMMA,  # 1: the callback `kinematics` has computed w.Rate and w.Gamma[:n_c] for the current state
-    USED_GENERAL,  # 1: the general inner loop, not the generated code, computed the last state
-    EXPLICIT_STEP,  # 1: the last attempted step of a pair of methods was explicit
-    DEFECT,  # largest defect of the attempted step, relative to the allowed defect; -1: not evaluated
+    SENSITIVITY,  # max|C_qd^-1 C_qi| at the first check of this partition, at least 1; 0: not checked yet
+    ORIENTATION,  # sign of det C_qd (dependent columns) at the last accepted state with this partition; 0: not known
+    ORIENTATION_NEW,  # sign of det C_qd at the end of the attempted step; 0: not known
+    FAULT_KIND,  # index in Functions of a callback that returned NaN or infinity; -1: none known
+    FAULT_TIME,  # time (s) at which this callback returned NaN or infinity
+    GAMMA_REQUIRED,  # allowed error of Gamma by differences (evaluation/constraints.py), relative to GAMMA_SCALE
+    GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to the result of `largest_difference_step`
+    GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
+    GAMMA_SCALE,  # size of Gamma, to which its errors are compared: largest |entry| or sum of |terms| of G a so far
+    REUSE,  # after a correction of positions of at most this size, C_qd is not evaluated and factored again
+    ROUNDED,  # rounding error of positions; used instead of REUSE for states at the ends of steps
+    GENERATION,  # number of partitions so far: a change of this number shows that the partition has changed
+    RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
+    RANK_V,  # rank of [C_q; A], stored together with RANK
+    CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
+    PIVOT,  # smallest pivot of C_q, rows scaled to 1, at the last full pivoting; small near a singular position
+    # 1: the run has come near a singular position, or cannot check for them; 2 (fixed-order form): it is near one, and
+    # stages must be projected; 0: else
+    NEARLY_SINGULAR,
+    NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
+    MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py
+    FACTORED,  # 1: the factors of the equations for accelerations belong to w.M and w.G; 0: M or G has changed since
+    HAS_GAMMA,  # 1: w.Rate and w.Gamma[:n_c] belong to the present state, by the callback `kinematics`; 0: else
+    USED_GENERAL,  # 1: the general inner loop computed the last projected state; 0: generated code did
+    EXPLICIT_STEP,  # 1: with a pair of methods (stiffness.py), the last attempted step was explicit; 0: else
+    DEFECT,  # largest defect of accelerations in the attempted step, relative to the allowed defect; -1: not evaluated
     LARGEST_DEFECT,  # largest value of DEFECT in the accepted steps
-    UNCHECKED,  # number of accepted steps whose defect was not evaluated
-    WIDEST_GAP,  # longest time (s) between two evaluations within accepted steps
-    LAST_JUMP,  # time (s) of the last known jump of C_t or b
-    NEXT_JUMP,  # time (s) of the next known jump of C_t or b
-    MAX_COEFFICIENT,  # largest coefficient of an independent row in a redundant row at the last partition; 0: unknown
-    SMALLEST,  # fixed-order form: smallest squared sine of the angle from a row to previous rows, see sparse_ldl.py
-    TIME_IS_UP,  # 1, set by another thread: the time limit of the run has passed, and evaluations of stages end
+    UNCHECKED,  # number of accepted steps without an evaluated defect
+    WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
+    LAST_JUMP,  # time (s) of the last known jump of C_t or b; -infinite: none
+    NEXT_JUMP,  # time (s) of the next known jump of C_t or b, or the end of the run; infinite: neither is known
+    # a redundant row of G is a combination of independent rows: largest |coefficient| at the last partition; 0: unknown
+    MAX_COEFFICIENT,
+    SMALLEST,  # fixed-order form: smallest sine^2 of the angle of a row of C_q to others; negative: M is not definite
+    TIME_IS_UP,  # 1: the time limit of the run has passed (set by another thread), and evaluations return STOPPED
     N_NOTES,
 ) = range(33)
 
 
 def _group(first: str, end: str) -> dict[str, int]:
-    """Return the indices above, by names in lower case, from the name `first` to the name before `end`."""
+    """Return {name in lower case: index} for the constants above from `first` to the last one before `end`."""
     names = list(globals())
     return {name.lower(): globals()[name] for name in names[names.index(first) : names.index(end)]}
 
@@ -104,35 +108,35 @@ def _group(first: str, end: str) -> dict[str, int]:
 NOTES, COUNTERS = _group("SENSITIVITY", "N_NOTES"), _group("N_ACCEPTED", "N_COUNTERS")
 FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kind, index in GIVEN.items()}
 
-# indices in `tolerances`, the array that steps read; for the tolerances see eq. (26) of the paper
+# indices in `tolerances`, an array that steps read: relative and absolute tolerances (eq. (26) of the paper) and limits
 (
     RTOL,
-    ESTIMATE,  # 1: errors of steps are estimated; 0: not, because the step size is fixed
-    LEAST,  # smallest tolerance of a coordinate or a velocity
-    GAP,  # longest time between two evaluations of the equations (s)
-    DEFECT_GAP,  # longest time (s) between two evaluations in steps that evaluate their defect between nodes
-    ATOL,  # first index of the absolute tolerances: one for each coordinate and its velocity
+    ESTIMATE,  # 1: steps estimate their errors; 0: they do not, because the step size is fixed
+    LEAST,  # smallest tolerance of a coordinate or a velocity at the start of the run
+    GAP,  # longest allowed time (s) between two evaluations of the equations
+    DEFECT_GAP,  # replaces GAP (s) in steps that evaluate their defect between nodes; at most GAP
+    ATOL,  # index of the first absolute tolerance; there is one for each coordinate and its velocity
 ) = range(6)
 MAX_GAP_RATIO = 0.01  # value of GAP, relative to the duration of the run
-REPORTED_ERROR = 30.0  # velocity errors of more tolerances than this are reported near a singular position
+REPORTED_ERROR = 30.0  # near a singular position, velocity errors above this number of tolerances are reported
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
-# kinds of intervals between accepted states, for dense output: which data do the polynomials interpolate?
+# kinds of intervals between accepted states. The kind tells which data the polynomials of dense output interpolate
 (
-    SEPARATE,  # one polynomial for q (through q and v), another for v (through v and a): their errors are independent
-    VELOCITIES,  # one polynomial through q and v, not a, because a contains the noise of stiff modes
-    ACCELERATIONS,  # one polynomial through q, v and a
+    SEPARATE,  # one polynomial for q interpolates q and v; another for v interpolates v and a, whose errors differ
+    VELOCITIES,  # one polynomial interpolates q and v, but not the accelerations a, which contain noise of stiff modes
+    ACCELERATIONS,  # one polynomial interpolates q, v and a
     ACROSS,  # same as ACCELERATIONS, for a step across a singular position
-    JUMP,  # no polynomial: the interval is a few spacings of floating-point numbers long, and velocities jump in it
+    JUMP,  # velocities jump, and nothing is interpolated: only a few floating-point numbers are in the interval
 ) = range(5)
 # columns of the table of intervals, which has one row for each interval that contains output times
 (
-    FIRST_OWN,  # index of the state at the beginning of the interval
-    LAST_OWN,  # index of the state at its end
-    KIND,  # kind of the interval
+    FIRST_OWN,  # index of the accepted state at the beginning of the interval
+    LAST_OWN,  # index of the accepted state at the end of the interval
+    KIND,  # kind of the interval: SEPARATE, VELOCITIES, ACCELERATIONS, ACROSS or JUMP
     FIRST_TIME,  # index of the first output time in the interval
     END_TIME,  # 1 + index of the last output time in the interval
-    LOW,  # index of the first state that the polynomial may interpolate; velocities jump before it
-    HIGH,  # index of the last state that the polynomial may interpolate; velocities jump after it
+    LOW,  # index of the first state that the polynomial may interpolate: velocities jump before, or the run starts
+    HIGH,  # index of the last state that the polynomial may interpolate: velocities jump after, or the run ends
     N_COLUMNS,
 ) = range(8)
