@@ -1,7 +1,7 @@
 """Interpolate states within steps by polynomials through neighbouring states, and project the results.
 
-Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. For methods with long steps,
-`fill_intervals` first computes states in an interval, as nodes of its polynomial. `f`: the kit, `w`: the workspace.
+Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. If a method takes long steps,
+`fill_intervals` first computes states within an interval, which its polynomial interpolates. (`f`: kit, `w`: workspace)
 """
 
 import numpy as np
@@ -19,23 +19,24 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# v has a polynomial of its own if the rounding error of q, divided by the interval, exceeds this number of tolerances
+# v has a polynomial of its own if (rounding error of q) / (duration of the interval) exceeds this number of tolerances
 MAX_VELOCITY_ROUNDING = 10.0
-# a position counts as singular if its pivot is below this fraction of the larger pivot at the two ends of the interval
+# a pivot here is the ratio of the smallest to the largest pivot, see min_pivot_ratio in partition.py. A position counts
+# as singular if its pivot is below SINGULAR_PIVOT, or this fraction of the larger pivot at the ends of the interval
 SINGULAR_PIVOT_RATIO = 0.01
-SINGULAR_PIVOT = 1e-5  # positions with a smaller pivot always count as singular; see min_pivot_ratio in partition.py
-# a position with a pivot below WEAK_PIVOT counts as singular, too, if pivot * (change of velocities by the projection)
-# is at most MAX_VIOLATION tolerances: this is about the violation of the constraints, which is then too small to matter
+SINGULAR_PIVOT = 1e-5
+# a position with a pivot below WEAK_PIVOT also counts as singular if pivot * (change of v by the projection) is below
+# MAX_VIOLATION tolerances: this product estimates how much v violates the constraints, which is too little to matter
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
 @merged
 def _node_range(low, high, i, last):
-    """Return the indices of the first and last state that the polynomial interpolates in an interval from i to `last`.
+    """Return the indices of the first and last state that the polynomial of the interval from i to `last` interpolates.
 
-    These states are centred at the interval, and not outside `low` to `high`.
+    The interval is in the middle of these states, unless an index would be below `low` or above `high`.
     """
-    if last > i + 1:  # the interval has interior states from `fill_intervals`: interpolate only these
+    if last > i + 1:  # `fill_intervals` has added states within the interval: interpolate no others
         return i, last
     n_states = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - n_states // 2, high + 1 - n_states))
@@ -44,11 +45,12 @@ def _node_range(low, high, i, last):
 
 @compiled
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
-    """Store nodes in z and coefficients in c of the Hermite polynomial through rows lo to hi; return their number.
+    """Compute the Hermite polynomials through rows lo to hi of `states`; return the number of their coefficients.
 
-    The polynomial, in Newton's form, has the variable (time - t[i]) / h. It interpolates n columns of `states`,
-    beginning with index `column`, minus their values in row i. The next n columns are the first derivatives, and the
-    next n the second derivatives; the polynomial interpolates values and order - 1 derivatives.
+    Each of the n columns of `states` from index `column` on has a polynomial; it is zero at time t[i], because row i is
+    subtracted. The next n columns are first derivatives, and the next n second derivatives: polynomials interpolate
+    values and order - 1 derivatives. Store the nodes of Newton's form in z, in the variable (time - t[i]) / h, and the
+    coefficients in c.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order
@@ -72,10 +74,10 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 
 @merged
 def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
-    """Store in q and v the values at t[i] + s h of the polynomials of an interval of duration h, by Horner's scheme.
+    """Store in q and v the values of the polynomials of an interval at the time t[i] + s h; h: duration.
 
-    (z, c, size): nodes, coefficients and number of coefficients for q; (z_v, c_v, size_v): the same for v if `kind` is
-    SEPARATE. Otherwise v is the derivative of q.
+    (z, c, size): nodes, coefficients and number of coefficients of the polynomials of q. If `kind` is SEPARATE,
+    (z_v, c_v, size_v) are the same for v; otherwise v is the derivative of the polynomials of q.
     """
     n = q.size
     for m in range(n):
@@ -94,7 +96,7 @@ def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q
 
 @merged
 def _kind_by_duration(kind, tolerances, h, states, i):
-    """Return `kind`, or SEPARATE if the duration h is so short that rounding errors of q would spoil velocities."""
+    """Return `kind`, or SEPARATE if the duration h is so short that rounding of q would spoil its derivative v."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
@@ -105,9 +107,10 @@ def _kind_by_duration(kind, tolerances, h, states, i):
 
 @inlined
 def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
-    """Store the polynomials of an interval, given by a row of the table of intervals, in (z_q, c_q) and (z_v, c_v).
+    """Store the polynomials of an interval: nodes z_q and coefficients c_q for q; z_v and c_v for v if it has its own.
 
-    Return kind and duration of the interval, first and last node, values per node, and both numbers of coefficients.
+    `group`: row of the table of intervals (data/indices.py). Return the kind and duration (s) of the interval; indices
+    of the first and last interpolated state; number of values (with derivatives) per state; numbers of coefficients.
     """
     i, last, kind = group[kinds.FIRST_OWN], group[kinds.LAST_OWN], group[kinds.KIND]
     h = t[last] - t[i]
@@ -121,7 +124,7 @@ def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
 
 @merged
 def _velocity_change(tolerances, v_before, v):
-    """Return the largest change of a velocity from v_before to v, relative to its tolerance."""
+    """Return the largest change of a velocity from v_before to v, in units of its tolerance."""
     speed, largest = largest_of(v_before), 0.0
     for m in range(v.size):
         change = abs(v[m] - v_before[m]) / (tolerances[ATOL + m] + tolerances[RTOL] * speed)
@@ -132,10 +135,10 @@ def _velocity_change(tolerances, v_before, v):
 
 @compiled
 def _is_singular(f, w, t, states, i, last, time, q, change):
-    """Return whether q at `time` is so near a singular position that rounding explains how the projection changed v.
+    """Return True if q at `time` is so near a singular position that rounding explains how the projection changed v.
 
-    `change`: change of velocities by the projection, in tolerances. i, `last`: indices of the states at the ends of
-    the interval. The pivot at q is compared with SINGULAR_PIVOT_RATIO and WEAK_PIVOT.
+    `change`: change of velocities by the projection, in tolerances; i, `last`: indices of the states at the ends of the
+    interval. For the comparison of pivots see SINGULAR_PIVOT_RATIO and WEAK_PIVOT.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):
@@ -150,21 +153,22 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
 def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z, coefficients, out):
     """Store [q, v] at times[p] in row p of `out`; return the number of failed projections.
 
-    A projection fails if dependent coordinates cannot be determined, or if rounding errors dominate the projected
-    velocities near a singular position. Row p then gets the values of the polynomials. `groups`: the table of intervals
-    described in data/indices.py. `tolerance`: tolerance of the projection. `z`, `coefficients`: scratch.
+    The values of polynomials are projected onto the constraints. A projection fails if dependent coordinates cannot be
+    determined, or if rounding dominates the projected velocities near a singular position; then the values of the
+    polynomials are stored. `groups`: the table of intervals of data/indices.py; `tolerance`: tolerance of the
+    projection; `z`, `coefficients`: scratch.
     """
     n = w.Q.size
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], coefficients[:half], coefficients[half:]
-    q_0, v_0 = coefficients[2 * half - 2], coefficients[2 * half - 1]  # two rows at the end, which are free for this
+    q_0, v_0 = coefficients[2 * half - 2], coefficients[2 * half - 1]  # scratch rows, which no polynomial uses
     has_D = f.form == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
     failures = 0
     for g in range(groups.shape[0]):
         i, last = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN]
         fit = _fit_polynomials(tolerances, t, states, groups[g], z_q, c_q, z_v, c_v)
         kind, h, _, _, _, size, size_v = fit
-        # choose independent coordinates anew in each interval, so that a result does not depend on other output times
+        # choose independent coordinates anew in each interval: then its states do not depend on earlier output times
         has_partition = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]
@@ -204,7 +208,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest entry of scale_q |q - q_other| and scale_v |v - v_other|, in tolerances of state i."""
+    """Return the largest entry of scale_q |q - q_other| and of scale_v |v - v_other|, in tolerances at state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -216,7 +220,7 @@ def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_
 
 @merged
 def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """Store the accelerations of the polynomials at t[i] + s h in a (n_q); arguments: see `_evaluate_polynomials`."""
+    """Store the accelerations by the polynomials at t[i] + s h in `a`; for arguments see `_evaluate_polynomials`."""
     for m in range(a.size):
         value, slope, curvature = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
@@ -235,7 +239,7 @@ def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
 
 @merged
 def _has_similar_gaps(t, lo, hi):
-    """Return whether the steps from t[lo] to t[hi] differ in size by at most the factor MAX_GAP_RATIO."""
+    """Return True if the longest step from t[lo] to t[hi] is at most MAX_GAP_RATIO times the shortest."""
     shortest, longest = np.inf, 0.0
     for r in range(lo, hi):
         shortest, longest = min(shortest, t[r + 1] - t[r]), max(longest, t[r + 1] - t[r])
@@ -244,15 +248,15 @@ def _has_similar_gaps(t, lo, hi):
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
-    """Store in out[g] the estimated error of the polynomials of interval g of `groups`, relative to the tolerances.
+    """Store in out[g] the estimated error of the polynomials of interval g of `groups`, in units of the tolerances.
 
-    Of these estimates, the first one that applies is taken:
-    - 0 for polynomials that do not interpolate accelerations (kinds SEPARATE and VELOCITIES), with more than two nodes
-      at about equal distances, none of them inside the interval;
-    - how much the last of more than two nodes changes the polynomial, if this is at most 1, or if the kind is
-      VELOCITIES: then accelerations contain the noise of stiff modes;
+    The estimate is the first of these that applies:
+    - 0 if the polynomials do not interpolate accelerations (kinds SEPARATE and VELOCITIES), and have more than two
+      nodes at about equal distances, none of them inside the interval;
+    - if there are more than two nodes: how much the last node changes the polynomials. This applies if it is at most 1,
+      or if the kind is VELOCITIES, because the accelerations then contain the noise of stiff modes;
     - the residual of the polynomials in the constraints and the equations of motion at CHECKED_FRACTIONS. A residual of
-      accelerations, times h over the number of coefficients, counts as a residual of velocities.
+      accelerations, times h / (number of coefficients), counts as an error of velocities.
     """
     n = w.Q.size
     half = z.size // 2
@@ -304,7 +308,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def fill_accelerations(f, w, times, states, out):
-    """Store [a, lam] at consistent states [q, v] in the rows of `out` (NaN: failure); return the number of failures."""
+    """Store [a, lam] at consistent states [q, v] in the rows of `out`; return the number of failures, which are NaN."""
     n = w.Q.size
     code = SINGULAR
     failures = 0
@@ -331,11 +335,11 @@ def fill_accelerations(f, w, times, states, out):
 
 @kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
 def fill_intervals(f, w, options, memory, memory_0, tolerances, state, new_state, t, states, intervals, out_t, out):
-    """Store states within intervals, computed by equal steps of the method; return the number of failed intervals.
+    """Divide intervals into equal steps of the method, and store the states; return the number of failed intervals.
 
-    `intervals`: indices of the intervals. For each interval, `out_t` (times) and `out` (states) get the same number of
-    rows: the first state, the interior states, and the last state. If a step fails, the first time of its interval
-    becomes NaN. `memory_0`: the method's memory at the start of a run.
+    `intervals`: indices of the intervals. Each interval gets the same number of rows in `out_t` (times) and `out`
+    (states): for its first state, the states between its steps, and its last state. If a step fails, the first time of
+    the interval becomes NaN. `memory_0`: the method's memory at the start of a run.
     """
     n = w.Q.size
     n_rows = out_t.size // intervals.size

@@ -1,29 +1,31 @@
-"""Define the operations of traced programs and the layout of their tables, and run programs in compiled code.
+"""Run traced programs in compiled code; define their operations and the layout of their tables.
 
-Programs compute C_q and Gamma if no callback computes them (generate/derived_callbacks.py), and forces, prescribed
-motions and constraint rows that the user of a model defines by functions (bodies/programs.py). An exact derivative may
-overflow where the function itself does not, for example the derivative of tanh. `f` is the kit, `w` the workspace.
+A traced program is the list of operations that a function does on symbols. If no callback computes C_q or Gamma, a
+program does (generate/derived_callbacks.py). Programs also compute forces, prescribed motions and constraint rows that
+the user of a model defines by functions (bodies/programs.py). The exact derivative of a function, such as tanh, may
+overflow where the function does not: then the caller does without the program. (`f`: the kit, `w`: the workspace)
 """
 
 import math
 
 from twoloop.kernels.data.common import compiled, exact
 
-# kinds of operations. PENDING: product of two Taylor series, of which the coefficient of each order of the second is
-# unknown until the linear equations of this order are solved. RESULT: output of a program
+# kinds of operations. SUM: a sum of terms and nothing else. RESULT: the same, for an output of a program. PENDING: a
+# product of two Taylor series; the coefficient of order k of the second series is not known until the linear equations
+# of order k, which contain the product, are solved
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
-# columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of the node (for
-# RESULT: of the output) that it computes. FIRST, SECOND, END: the first argument of the operation is the sum of the
-# terms FIRST to SECOND - 1, the second argument of the terms SECOND to END - 1
+# columns of a table, which has one row for each operation. A node is a number that a program reads or computes; a term
+# is a coefficient times a node. KIND: kind of the operation. NODE: index of the node that receives the result. Argument
+# 1 is a constant plus the terms FIRST to SECOND - 1; argument 2 is a constant plus the terms SECOND to END - 1
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# A program is a vector of integers: N_SIZES sizes (at the indices below), the rows of the table, the node of each term,
-# and the index of each result in its array. Results are numbered after all other nodes
+# A program is a vector of integers: N_SIZES sizes (at the indices below); the rows of the table; for each term, the
+# index of its node; for each result, its index in w.Gamma or in the flattened C_q. The results are the last nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 
 @exact
 def result_of_operation(kind, x, y):
-    """Return the result of the operation `kind`, such as SINE, on x; y is the second factor of a product."""
+    """Return the result of an operation of a `kind`, such as SINE, on its arguments x and (only for PRODUCT) y."""
     if kind == PRODUCT:
         z = x * y
     elif kind == RECIPROCAL:
@@ -47,9 +49,9 @@ def result_of_operation(kind, x, y):
 
 @exact
 def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return numbers[constant] plus the sum of coefficient times node over the terms `begin` to `end` - 1.
+    """Return an argument of an operation: numbers[constant] plus the terms `begin` to `end` - 1.
 
-    `columns` and `coefficients` are as in `run_table`.
+    A term is a coefficient times a node. For `columns` and `coefficients` see `run_table`.
     """
     total = numbers[constant]
     for k in range(begin, end):
@@ -59,11 +61,11 @@ def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, en
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Compute all `nodes` from t, q and v, which become the input nodes, beginning with index `inputs`.
+    """Do the operations of a table: store t, q and v in `nodes` from index `inputs` on, then compute all other nodes.
 
-    The table contains integers, or whole floats if it is among the parameters of a model. `rows` and `columns` are the
-    first indices of the operations and of the terms' nodes in `table`; `coefficients` and `constants` are the first
-    indices of these numbers in `numbers`.
+    `table` contains integers, or whole floats if it is among the parameters of a model. In `table`, the rows, one for
+    each operation, begin at index `rows`, and the node indices of the terms at index `columns`. In `numbers`, the
+    coefficients of the terms begin at index `coefficients`, and the constants, two for each row, at index `constants`.
     """
     nodes[inputs] = t
     for j in range(q.size):
@@ -79,7 +81,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
 
 @exact
 def _run_program(program, numbers, nodes, t, q, v):
-    """Compute all `nodes` of a program that replaces a callback of a system, from the inputs t, q and v."""
+    """Compute the `nodes` of a program that replaces a callback, given t, q, v and its constants and coefficients."""
     n_rows = program[N_ROWS]
     columns = N_SIZES + N_COLUMNS * n_rows
     run_table(program, N_SIZES, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
@@ -87,14 +89,14 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, the index of the first result in `nodes`, and where the list of indices begins."""
+    """Return how many results there are, where they begin in `nodes`, and where their indices begin in `program`."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Store Gamma in w.Gamma by a traced program; return False if there is no program, or a value is not finite."""
+    """Store Gamma (of G a = Gamma) in w.Gamma by a traced program; return False without a program or finite values."""
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -109,7 +111,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in G (zero on entry) by a traced program; return False if there is none, or a value is not finite."""
+    """Store C_q in G (zero on entry) by a traced program; return False without a program or finite values."""
     program = f.jacobian_program
     if program.size == 0:
         return False

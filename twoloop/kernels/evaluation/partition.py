@@ -36,10 +36,10 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
-RANK_TOLERANCE = 1e-11  # pivots up to this size count as zero, for rows scaled to 1
-PARTITION_CHANGED = -1  # code that replaces DONE if a new partition was adopted
-MAX_ROWS_ELIMINATED = 200  # with more rows of G, min_pivot_ratio does no elimination: it would take too long
-SENSITIVITY_GROWTH = 3.0  # a partition is poor once max|C_qd^-1 C_qi| has grown by more than this factor
+RANK_TOLERANCE = 1e-11  # pivots count as zero up to this limit, if the largest entry of each row is 1
+PARTITION_CHANGED = -1  # return code: the task is done as for DONE, and a new partition was adopted
+MAX_ROWS_ELIMINATED = 200  # with more independent constraints, `min_pivot_ratio` does no elimination, to save time
+SENSITIVITY_GROWTH = 3.0  # a partition is poor once its sensitivity has grown by more than this factor
 
 
 @compiled
@@ -57,17 +57,18 @@ def scale_rows(A):
 def _max_abs_from_column(row, first):
     maximum = 0.0
     for j in range(first, row.size):
-        if abs(row[j]) > maximum:  # false for NaN
+        if abs(row[j]) > maximum:  # false for a NaN, which is skipped
             maximum = abs(row[j])
     return maximum
 
 
 @compiled
 def full_pivoting(A, order, row_order, row_maxima, first, last, max_rank):
-    """Do Gaussian elimination of A in place with full pivoting, beginning with pivot `first`; return the rank.
+    """Continue the Gaussian elimination of a matrix A in place with full pivoting; return the rank.
 
-    Pivots are chosen in the rows before row `last`, at most `max_rank` in all, including the pivots before `first`.
-    `order` and `row_order` are permuted in the same way as columns and rows of A; `row_maxima` is scratch.
+    Earlier calls have eliminated the pivots before index `first`. Further pivots are chosen in the rows before index
+    `last`, until there are `max_rank` pivots in all, or all entries left are at most RANK_TOLERANCE. The indices in
+    `order` and `row_order` are permuted like the columns and rows of A; `row_maxima` is scratch.
     """
     n_q = A.shape[1]
     k = first
@@ -105,10 +106,12 @@ def full_pivoting(A, order, row_order, row_maxima, first, last, max_rank):
 
 @compiled
 def min_pivot_ratio(f, w, t, q):
-    """Return the ratio of the smallest to the largest pivot of C_q and A at (t, q), without changing the partition.
+    """Return the ratio of the smallest to the largest pivot of [C_q; A] at (t, q), to detect singular positions.
 
-    Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the
-    fixed-order form, or with more than MAX_ROWS_ELIMINATED rows, return w.pivot, the smallest pivot at the last choice.
+    A: rows of the non-holonomic constraints. The ratio is 0 if the rank is lower than before. The partition stays the
+    same. Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the
+    fixed-order form, or with more than MAX_ROWS_ELIMINATED independent rows, return w.pivot, which was stored by the
+    last factorization (fixed-order form) or by the last choice of a partition.
     """
     if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.pivot
@@ -128,7 +131,7 @@ def min_pivot_ratio(f, w, t, q):
 
 @compiled
 def _pivot_rows(w, n_rows, max_rank):
-    """Eliminate the first `n_rows` rows of w.Gx by full pivoting, in a new order; return their rank."""
+    """Choose at most `max_rank` pivots in the first `n_rows` rows of w.Gx; store their order in w; return the rank."""
     for j in range(w.order.size):
         w.order[j] = j
     for i in range(w.row_order.size):
@@ -138,9 +141,10 @@ def _pivot_rows(w, n_rows, max_rank):
 
 @compiled
 def _find_pivot_order(w, max_rank, max_rank_v):
-    """Store in w.row_order and w.order the rows and columns of the pivots of w.Gx: first pivots in C_q, then in A.
+    """Find pivots of w.Gx = [C_q; A], first in C_q, then in A, the rows of the non-holonomic constraints.
 
-    Returns the rank of C_q, at most `max_rank`, and the rank of C_q and A together, at most `max_rank_v`.
+    Store the indices of their rows in w.row_order, and of their columns in w.order. Return the rank of C_q, at most
+    `max_rank`, and the rank of [C_q; A], at most `max_rank_v`.
     """
     G, order, row_order = w.Gx, w.order, w.row_order
     n_c, n_rows = w.C.size, w.Rate.size
@@ -149,7 +153,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # end of the rows to eliminate: the rows of A replace the redundant rows of C_q, from index `rank`
+    last = rank  # end of the rows that may be pivots: each row of A changes places with a redundant row of C_q
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -160,7 +164,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot of C_q at (t, q), with rows scaled to 1, without changing the partition."""
+    """Return the smallest pivot of C_q at (t, q), with rows scaled to maxima of 1; return 0 if the rank is lower."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -182,9 +186,10 @@ def _copy_in_ascending_order(source, target):
 
 @compiled
 def _adopt_pivot_order(w):
-    """Store the partition given by w.row_order and w.order, and write its elimination programs (see markowitz_lu.py).
+    """Store a new partition, and write the programs that factor its dependent columns of w.G, the constraint rows.
 
-    Return False if the dependent columns of w.G are singular.
+    The first indices in w.row_order and w.order, those of the pivots, become independent rows and dependent
+    coordinates. Return False if the dependent columns are singular.
     """
     rank, rank_v = w.rows.size, w.rows_v.size
     # indices are stored in ascending order, so that equal sets of coordinates are equal partitions
@@ -202,13 +207,13 @@ def _adopt_pivot_order(w):
     if w.G_of_S.size > 0:
         w.G_of_S[0, 0] = np.nan
     if rank_v < w.Rate.size:
-        w.index_a[SIZE] = 0  # the program was written for other independent rows
+        w.index_a[SIZE] = 0  # write a new program for the augmented matrix, which contains the independent rows
     return write_programs(w)
 
 
 @compiled
 def write_programs(w):
-    """Write programs (markowitz_lu.py) to factor the dependent columns of w.G; return False if these are singular."""
+    """Write programs that factor the dependent columns of the Jacobian w.G; return False if these are singular."""
     _record_columns_of_entries(w)
     w.factored = 0.0
     is_regular = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
@@ -219,7 +224,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store the columns of the nonzero entries of each row of w.G, given by w.pattern, in w.row_entries (see Work)."""
+    """Store in w.row_entries where the list of each row of w.G begins, then the lists: columns where w.pattern is 1."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -233,7 +238,7 @@ def _record_columns_of_entries(w):
 
 @compiled
 def record_entries(w):
-    """Set w.pattern to 1 where w.G is not zero; return whether this changes w.pattern, which makes programs invalid."""
+    """Set w.pattern to 1 where w.G is not zero; return True if w.pattern changes: elimination needs new programs."""
     if not update_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -244,8 +249,8 @@ def record_entries(w):
 def choose_partition(f, w, t, q):
     """Choose and store the dependent and independent coordinates and the independent rows at (t, q); return a code.
 
-    The code is SINGULAR if the rank is lower than for the previous partition. For the first partition, if the workspace
-    is allocated for other ranks, the ranks are stored in w, and the code is RANK_DIFFERS.
+    Codes: DONE; SINGULAR if the rank is lower than for the previous partition; RANK_DIFFERS if this is the first
+    partition and the workspace is allocated for other ranks. Then the ranks are stored in w.rank and w.rank_v.
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
@@ -266,15 +271,15 @@ def choose_partition(f, w, t, q):
 
 @compiled
 def adopt_partition_of_midpoint(f, w, t_mid, state, new_state):
-    """Adopt the partition that full pivoting chooses at the middle of a step; return a code.
+    """Adopt the partition that full pivoting chooses at the middle of an attempted step.
 
-    The code is PARTITION_CHANGED, DONE or SINGULAR. The same step backwards in time has the same middle and thus the
-    same partition, so that a step by a symmetric tableau is symmetric in time. If a partition were used until it is
-    poor, it would depend on the direction of time.
+    Codes: PARTITION_CHANGED (the caller repeats the step), DONE (the partition was the same) or SINGULAR. The same step
+    backwards in time has the same middle and thus the same partition, so that a step by a symmetric tableau is
+    symmetric in time. If a partition were used until it is poor, it would depend on the direction of time.
 
-    The middle is the mean of `state` and `new_state`, the end of the attempt with the current partition. After the step
-    is repeated with the new partition, the choice is not checked again. So the step backwards may choose another
-    partition if two partitions are equally good within the difference of the two attempts, O(h^(p+1)).
+    The middle is the mean of the states at the beginning (`state`) and end (`new_state`) of the attempted step. When
+    the step is repeated, the choice is not checked again. So the step backwards may choose another partition if two
+    partitions are equally good within the difference between the attempts, O(h^(p+1)) for order p.
     """
     n = w.Q.size
     for j in range(n):
@@ -305,7 +310,7 @@ def _is_same_set(a, b):
 
 @compiled
 def choose_oriented_partition(f, w, t, q):
-    """Choose a partition at an accepted state, and store the sign of det C_qd as ORIENTATION; return a code."""
+    """Choose a partition at an accepted state; store sign(det C_qd) (0: unknown) in w.orientation; return a code."""
     code = choose_partition(f, w, t, q)
     w.orientation = 0.0
     if code != DONE:
@@ -319,7 +324,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| in w.minimum of an independent row in a redundant row, for rows scaled to 1."""
+    """Return the largest |coefficient| of an independent row in a redundant row, with rows scaled to maxima of 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
@@ -337,12 +342,12 @@ def _largest_coefficient(w):
 
 @compiled
 def partition_is_poor(w):
-    """Return whether the dependent coordinates have become so sensitive that a new partition is needed.
+    """Return True if the dependent coordinates have become so sensitive that a new partition is needed.
 
-    The sensitivity to the independent coordinates is max|C_qd^-1 C_qi|, from w.D. It is near 1 after full pivoting, and
-    grows without bound where the independent coordinates stop being valid. A partition is also poor if the largest
-    coefficient of an independent row in a redundant row has grown: this coefficient grows where the independent rows
-    become dependent, although the rank stays the same.
+    Their sensitivity to the independent coordinates is max|C_qd^-1 C_qi|, from w.D; C_qd and C_qi are the columns of
+    the dependent and independent coordinates in C_q. It is near 1 after full pivoting, and grows without bound where
+    the independent coordinates stop being valid. Also return True if the largest coefficient of an independent row in a
+    redundant row has grown: it grows where independent rows become dependent while the rank stays the same.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
@@ -351,7 +356,7 @@ def partition_is_poor(w):
         w.sensitivity = max(largest, 1.0)
     if not largest <= SENSITIVITY_GROWTH * w.sensitivity:
         return True
-    # the fixed-order form chooses its independent rows at every state
+    # only redundant rows have coefficients; the fixed-order form (w.factors not empty) checks rows when it factors them
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     coefficient = _largest_coefficient(w)
@@ -360,20 +365,23 @@ def partition_is_poor(w):
     return not coefficient <= SENSITIVITY_GROWTH * w.max_coefficient
 
 
-MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
-CONTRACTION = 0.5  # an iteration counts as convergent if each correction is at most this fraction of the previous one
-ROUNDING_OF_CORRECTIONS = 1e-12  # rounding may cause corrections up to this size, relative to the largest coordinate
-# factor on ROUNDING_OF_CORRECTIONS if all constraints are satisfied up to rounding, because small bodies amplify
-# errors: the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, and a chain of rods by more
+MAX_ITERATIONS = 25  # largest number of Newton iterations for positions; quadratic convergence needs 2 to 5
+CONTRACTION = 0.5  # Newton's method converges if each correction is at most this fraction of the previous one
+ROUNDING_OF_CORRECTIONS = 1e-12  # corrections of positions up to this size, relative to max|q|, may be due to rounding
+# if all constraints hold up to rounding, the limit ROUNDING_OF_CORRECTIONS is multiplied by this factor, because small
+# bodies amplify errors: the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, a chain by more
 AMPLIFICATION = 1e3
-ROUNDING_OF_ROWS = 2e-15  # |C_i| counts as a rounding error up to this fraction of the largest |G_ij q_j|
-MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.rounded, the rounding error of q
-MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
+# constraint i holds up to rounding if |C_i| is at most this fraction of the largest |G_ij q_j| over j; G: Jacobian C_q
+ROUNDING_OF_ROWS = 2e-15
+MIN_CORRECTION = 10.0  # smallest tolerance of the corrections in a projection, in rounding errors of q (w.rounded)
+# a constraint is violated if |C_i| exceeds this fraction of max(1, |q_j|) times the largest entry of its Jacobian row,
+# or if |(C_q v + C_t)_i| exceeds this fraction of max(1, |v_j|) times this entry
+MAX_VIOLATION = 1e-7
 
 
 @compiled
 def _factor_in_new_order(w, t, q):
-    """Factor the dependent columns of w.G in a new order of elimination; return DONE, SINGULAR or NOT_FINITE."""
+    """Factor the dependent columns of the Jacobian w.G in a new order; return DONE, SINGULAR or NOT_FINITE."""
     record_entries(w)
     if not finite(w.G):
         return not_finite(w, JACOBIAN, t, q)
@@ -385,20 +393,20 @@ def _factor_in_new_order(w, t, q):
 
 @merged
 def factor_dependent_columns(w, t, q):
-    """Factor the dependent columns of w.G; return DONE, SINGULAR or NOT_FINITE."""
+    """Factor the dependent columns of the Jacobian w.G by the programs in w; return DONE, SINGULAR or NOT_FINITE."""
     w.factored = 0.0
     ratio = factor(w.entries, w.index, w.values)
     w.n_factorizations += 1
     if w.Rate.size > w.C.size:
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
         w.n_factorizations += 1
-    # a small ratio may also be due to NaN, or to an order of elimination that does not suit the values
+    # if pivots differ too much, the cause may be a NaN or an unsuitable order of elimination, not a singular matrix
     return DONE if ratio > RANK_TOLERANCE else _factor_in_new_order(w, t, q)
 
 
 @merged
 def evaluate_and_factor_columns(f, w, t, q):
-    """Store C_q and A at (t, q) in w.G, and factor the dependent columns; return DONE, SINGULAR or NOT_FINITE."""
+    """Store the Jacobian at (t, q) in w.G, and factor its dependent columns; return DONE, SINGULAR or NOT_FINITE."""
     w.has_gamma = 0.0
     clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
@@ -407,14 +415,14 @@ def evaluate_and_factor_columns(f, w, t, q):
 
 @compiled
 def is_rounding_of_positions(w, q, correction):
-    """Return whether a correction of q may be due to rounding, see ROUNDING_OF_CORRECTIONS and AMPLIFICATION."""
+    """Return True if `correction`, the largest change of a position, may be due to rounding, see AMPLIFICATION."""
     limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
     return correction <= limit or (correction <= AMPLIFICATION * limit and _is_on_constraints(w, q))
 
 
 @compiled
 def _is_on_constraints(w, q):
-    """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
+    """Return True if all values C_i of constraints in w.C are rounding errors, see ROUNDING_OF_ROWS."""
     for i in range(w.C.size):
         largest_term = 0.0
         for p in range(w.row_entries[i], w.row_entries[i + 1]):
@@ -426,10 +434,10 @@ def _is_on_constraints(w, q):
 
 @merged
 def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
-    """Solve C(t, q) = 0, eq. (15), by Newton's method for the dependent positions in q; return a code.
+    """Solve C(t, q) = 0, eq. (15) of the paper, by Newton's method for the dependent positions in q; return a code.
 
-    The iteration ends after a correction of at most `tolerance`. On return, w has the rows and factors at q or, if the
-    last correction was at most `reuse_limit`, at q before this correction. The callback `kinematics` also stores Gamma.
+    The iteration ends after a correction of at most `tolerance`. Then the Jacobian and its factors in w are renewed at
+    q, unless the last correction was at most `reuse_limit`. The callback `kinematics`, if given, also stores Gamma.
     """
     last_correction = np.inf
     has_converged = w.C.size == 0
@@ -460,8 +468,8 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
             return DONE
         has_converged = correction <= tolerance
         if not has_converged and correction > CONTRACTION * last_correction:
-            # accept a correction that is due to rounding; otherwise Newton's method has left its region of convergence,
-            # and could converge to another assembly of the mechanism
+            # accept a correction that is due to rounding; otherwise report failure: Newton's method has left its region
+            # of convergence, and could converge to another assembly of the mechanism
             has_converged = is_rounding_of_positions(w, q, correction)
             if not has_converged:
                 return INNER_DIVERGED
@@ -471,7 +479,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
 
 @merged
 def find_null_space(f, w, t, q):
-    """Compute the null space of G, and the velocities that drives prescribe, by the factors in w; store them in w.D."""
+    """Store in w.D the null space of the Jacobian w.G and, in its last row, the dependent velocities due to drives."""
     if f.kinematics_given == 0 or w.has_gamma == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
@@ -481,9 +489,11 @@ def find_null_space(f, w, t, q):
 
 @merged
 def restore_velocities(f, w, t, q, v, reuse_limit):
-    """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, by the factors in w.
+    """Compute the dependent velocities v_d in v from the independent ones, v_i, by the factors in w.
 
-    If no velocity changes by more than `reuse_limit`, HAS_GAMMA stays set: w.Gamma from `kinematics` is still valid.
+    They solve G_d v_d = -(C_t, b) - G_i v_i, eq. (14) of the paper. G_d and G_i are the dependent and independent
+    columns of [C_q; A]; A v + b = 0 are the non-holonomic constraints. If a velocity changes by more than
+    `reuse_limit`, set w.has_gamma to 0: w.Gamma from the callback `kinematics` is no longer valid.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size
@@ -513,9 +523,10 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
 
 @compiled
 def check_all_rows(f, w, t, q, v):
-    """Return DONE if the accepted state (q, v) satisfies all rows, including redundant ones, else ROWS_CONTRADICT.
+    """Return DONE if the accepted state (q, v) satisfies all constraints, including redundant ones.
 
-    w.G must already contain [C_q; A] at this state. Positions and velocities are checked.
+    If one is violated by more than MAX_VIOLATION, store its index in w.contradiction; return ROWS_CONTRADICT. On entry,
+    w.G must contain the Jacobian of all constraints at this state, and w.Rate their rates (C_t, b).
     """
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)

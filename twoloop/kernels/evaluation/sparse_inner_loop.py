@@ -1,22 +1,22 @@
 """Do the tasks of the inner loop for large systems, by sparse factors in an order of elimination that is chosen once.
 
-There is no partition: all coordinates are integrated, and evaluated without a projection. Where other forms compute
-dependent coordinates, tasks move all coordinates to the nearest state on the constraints, in the metric of M. If sparse
-factors do not show which rows are independent, a task returns NEEDS_DENSE, and the run continues with the forms of
-saddle_point.py, which methods with a partition always use. If callbacks return values of entries, no array has n_c
-times n_q numbers. Callbacks may also fill dense matrices, from which the entries are copied.
+There is no partition: steps integrate all coordinates, and the stages need not satisfy the constraints. Tasks that
+compute dependent coordinates in other forms move all coordinates to the nearest state on the constraints here, in the
+metric of M. If sparse factors do not show which rows are independent, a task returns NEEDS_DENSE, and the run continues
+with the forms of linalg/saddle_point.py, which methods with a partition always use. Callbacks may return the nonzero
+entries of C_q; then no array has n_c times n_q numbers. They may also fill dense matrices; then entries are copied.
 
-If rows are redundant, multipliers have the least norm. Of all lam with G^T lam = b, the shortest is G x for some
-x, and both solve
+If rows of G = C_q are redundant, many multipliers lam have the same reactions b = G^T lam. The shortest lam is used. It
+is G x for some x, and both solve
 
     [0  G^T] [ x ]   [b]
     [G  -1 ] [lam] = [0]
 
 This matrix is singular, because the constraints leave some motion free. If a small positive diagonal matrix W replaces
 0, the matrix is quasi-definite, and can be factored in any order (Vanderbei 1995, doi 10.1137/0805005), so also by the
-program for M and G. Refined solutions converge to lam of least norm, because b is a combination of rows of G: along a
-direction in which G x is s, relative to the sizes of its columns, each refinement divides the error by
-1 + s^2 / REGULARIZATION.
+program for [M G^T; G 0]. Iterative refinement converges to the shortest lam, because b is a combination of rows of G:
+let s be a singular value of G with its columns scaled to norm 1; then each refinement divides the error along the
+singular vector by 1 + s^2 / REGULARIZATION.
 """
 
 import numpy as np
@@ -65,17 +65,18 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-SUSPECT_PIVOT = 1e-6  # a row is checked if its pivot, which may be a rounding error, is below this fraction of its size
-MIN_PIVOT = 1e-10  # factors by 1-by-1 pivots are accurate if each pivot is at least this fraction of its row's size
-MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows is at most this
+# limits of the squared sine of the angle between a row of G and previous rows: pivot / (squared norm of the row)
+SUSPECT_PIVOT = 1e-6  # up to this limit, the pivot may be a rounding error: check whether the row is redundant
+MIN_PIVOT = 1e-10  # factors are accurate if the squared sines of all independent rows exceed this
+MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular near a singular position, where stages must be projected
-# solutions are refined once or twice if the smallest pivot, relative to the size of its row, is at most this
+# if the smallest squared sine of a row is at most the first limit, solutions are refined once; second limit: twice
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
 
 @compiled
 def fill_mass_values(f, w, t, q):
-    """Store the entries of M(t, q) in w.mass_values; the entries of a constant dense M are stored there already."""
+    """Store the entries of M(t, q) in w.mass_values; those of a constant dense M have been there since the start."""
     if f.mass_values_given == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
@@ -90,7 +91,7 @@ def fill_mass_values(f, w, t, q):
 
 @compiled
 def fill_jacobian_values(f, w, t, q):
-    """Store the entries of C_q(t, q) in w.jacobian_values."""
+    """Store the nonzero entries of the constraint Jacobian C_q(t, q) in w.jacobian_values."""
     if f.jacobian_values_given == 1:
         w.jacobian_values[:] = 0.0
         f.jacobian_values(t, q, f.p, w.jacobian_values)
@@ -106,7 +107,7 @@ def fill_jacobian_values(f, w, t, q):
 
 @compiled
 def _factor_entries(f, w, min_sine_square):
-    """Factor [M G^T; G 0] from the entries in w; return the smallest squared sine, see `factor` of sparse_ldl.py."""
+    """Factor [M G^T; G 0] from its entries in w; return the smallest squared sine of a row of G, see SUSPECT_PIVOT."""
     w.n_factorizations += 1
     stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
     fill_saddle_matrix(f.ldl_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
@@ -118,7 +119,7 @@ def _factor_entries(f, w, min_sine_square):
 
 @compiled
 def _failure_of_factorization(w, t, q):
-    """Return the code of a failed factorization: NOT_FINITE, NEEDS_DENSE (singular M) or SINGULAR (dependent rows)."""
+    """Return the code of a failed factorization: NOT_FINITE, NEEDS_DENSE (M not definite) or SINGULAR (other cases)."""
     if not finite_vector(w.mass_values):
         return not_finite(w, MASS, t, q)
     if not finite_vector(w.jacobian_values):
@@ -128,7 +129,7 @@ def _failure_of_factorization(w, t, q):
 
 @compiled
 def factor_equations_at(f, w, t, q):
-    """Store the entries of M and G at (t, q), and factor the equations of the independent rows; return a code."""
+    """Evaluate M and G = C_q at (t, q), and factor [M G^T; G 0] with the independent rows of G; return a code."""
     if f.constant_mass == 0:
         fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -137,14 +138,14 @@ def factor_equations_at(f, w, t, q):
         return _failure_of_factorization(w, t, q)
     if _count_independent(w.is_independent) == w.rows_v.size:
         return DONE
-    w.n_partitions += 1  # independent rows have become dependent: other rows may replace them
+    w.n_partitions += 1  # some independent rows have become dependent: search for other rows that replace them
     code = _choose_rows(f, w, t, q)
     return _adopt_rows(w) if code == DONE else code
 
 
 @compiled
 def solve_unknowns(f, w, n_corrections):
-    """Replace the right-hand side in w.unknowns by the solution, corrected `n_corrections` times by refinement."""
+    """Replace the right-hand side in w.unknowns by the solution, with `n_corrections` steps of iterative refinement."""
     n = f.ldl_program[N_PIVOTS]
     scratch = w.solutions
     return solve_refined(
@@ -164,7 +165,7 @@ def solve_unknowns(f, w, n_corrections):
 
 @compiled
 def n_refinements(w):
-    """Return how many times solutions with the factors in w must be refined: 0, 1 or 2."""
+    """Return how many steps of iterative refinement (0, 1 or 2) solutions with the factors in w need."""
     smallest = w.smallest
     return 0 if smallest > REFINE_ONCE_BELOW else 1 if smallest > REFINE_TWICE_BELOW else 2
 
@@ -173,17 +174,17 @@ def n_refinements(w):
 def _sine_to_independent_rows(f, w, row, square):
     """Return the sine of the angle between a row g of G and the independent rows, in the metric of M^-1.
 
-    `row`: index of g in G; `square`: g M^-1 g^T.
+    `row`: index of g in G; `square`: g M^-1 g^T, the squared norm of g.
     """
     x, part = w.unknowns, 0.0
     x[:] = 0.0
     rows, columns, _ = jacobian_entries_of(f.ldl_program)
-    for k in range(rows.size):  # set x to [g, 0]
+    for k in range(rows.size):  # set the right-hand side x to [g, 0]
         if rows[k] == row:
             x[columns[k]] += w.jacobian_values[k]
     solve_unknowns(f, w, 2)
     rows, columns, _ = mass_entries_of(f.ldl_program)
-    for k in range(rows.size):  # add up x^T M x
+    for k in range(rows.size):  # x^T M x is the squared norm of the part of g orthogonal to the independent rows
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
 
@@ -198,7 +199,7 @@ def _count_independent(is_independent):
 
 @compiled
 def _choose_rows(f, w, t, q):
-    """Store in w.is_independent 1 for each chosen independent row, else 0; factor their equations; return a code.
+    """Set w.is_independent to 1 for rows of G that are independent, else 0; factor [M G^T; G 0] so; return a code.
 
     Rows with small pivots are left out at first, then added one by one if they are independent of the chosen rows.
     """
@@ -206,7 +207,7 @@ def _choose_rows(f, w, t, q):
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
         return _failure_of_factorization(w, t, q)
     order, n_q = pivot_order_of(f.ldl_program), w.Q.size
-    copy(w.is_independent, w.z)  # w.z: 0 for rows that must be checked
+    copy(w.is_independent, w.z)  # w.z: 0 for rows with small pivots, which must be checked
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
@@ -237,7 +238,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose and store the independent rows at (t, q); return a code: RANK_DIFFERS if w has another rank."""
+    """Choose and store the independent rows at (t, q); return a code: RANK_DIFFERS if w is too small or too large."""
     w.n_partitions += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -252,15 +253,19 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-REGULARIZATION = 1e-11  # diagonal entries of W (module docstring), relative to the sums of squares of the columns of G
-CONVERGED_RESIDUAL = 1e-14  # the refinement ends if the residual of G^T lam = b is at most this fraction of max|b|
-MAX_RESIDUAL = 1e-9  # residuals of G^T lam = b that no longer decrease are accepted up to this fraction of max|b|
-MAX_SOLUTIONS = 30  # largest number of linear solutions in the refinement of multipliers of least norm
+# for multipliers lam of least norm with the reactions b = G^T lam, in the notation of the module docstring:
+REGULARIZATION = 1e-11  # diagonal entry j of W, relative to the sum of squares of column j of G
+CONVERGED_RESIDUAL = 1e-14  # the refinement ends if max|b - G^T lam| is at most this fraction of max|b|
+MAX_RESIDUAL = 1e-9  # if max|b - G^T lam| no longer decreases, lam is accepted up to this fraction of max|b|
+MAX_SOLUTIONS = 30  # largest number of refinements
 
 
 @compiled
 def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
-    """Store the entries of the matrix [W G^T; G -1] in `values`, in the slots of the program; `weights` is scratch."""
+    """Store [W G^T; G -1], the matrix for multipliers of least norm, in `values`, as `factor` expects it.
+
+    `jacobian`: entries of G; W: small diagonal entries, see REGULARIZATION; `weights`: scratch.
+    """
     rows, columns, slots = jacobian_entries_of(program)
     for j in range(n_q):
         weights[j] = 0.0
@@ -281,7 +286,10 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store r = [b - G^T lam, lam - G x] for the force b and unknowns [x, lam]; return max|b - G^T lam| / max|b|."""
+    """Store the residual r = [b - G^T lam, lam - G x] of the unknowns x = [x, lam]; return max|b - G^T lam| / max|b|.
+
+    b: the argument `force`, the reactions that the multipliers lam must have; G: the Jacobian with entries `jacobian`.
+    """
     n_q, largest, residual = force.size, 0.0, 0.0
     copy(force, r[:n_q])
     for i in range(n_q, x.size):
@@ -298,7 +306,7 @@ def _fill_residual(program, jacobian, force, x, r):
 
 @compiled
 def least_norm(f, w, lam):
-    """Replace lam by the multipliers of least norm with the same reactions G^T lam; return DONE, or NEEDS_DENSE."""
+    """Replace lam by the multipliers of least norm with the same reactions G^T lam; return NEEDS_DENSE on failure."""
     program, n_q = f.ldl_program, w.Q.size
     n = program[N_PIVOTS]
     n_factors = n + program[N_OFF_DIAGONAL] + 1
@@ -337,7 +345,7 @@ def least_norm(f, w, lam):
 
 @compiled
 def _add_jacobian_times(f, w, x, out):
-    """Add G x to `out` in place."""
+    """Add G x to `out` in place, where G is the constraint Jacobian."""
     rows, columns, _ = jacobian_entries_of(f.ldl_program)
     for k in range(rows.size):
         out[rows[k]] += w.jacobian_values[k] * x[columns[k]]
@@ -345,7 +353,7 @@ def _add_jacobian_times(f, w, x, out):
 
 @compiled
 def _fill_gamma(f, w, t, q, v):
-    """Store Gamma (of G a = Gamma) in w.Gamma; return DONE, or NEEDS_DENSE if only differences could compute Gamma."""
+    """Store Gamma (of G a = Gamma) in w.Gamma; return NEEDS_DENSE if neither callback nor program can compute it."""
     w.Gamma[:] = 0.0
     if f.gamma_given == 1:
         f.gamma(t, q, v, f.p, w.Gamma)
@@ -355,7 +363,7 @@ def _fill_gamma(f, w, t, q, v):
 
 @compiled
 def _failure_of_accelerations(w, t, q):
-    """Store in w the callback whose values made an acceleration non-finite; return NOT_FINITE."""
+    """Record which callback returned the values that made an acceleration non-finite; return NOT_FINITE."""
     if not finite_vector(w.Gamma):
         return not_finite(w, GAMMA, t, q)
     if not finite_vector(w.Q):
@@ -377,7 +385,7 @@ def _solve_system(f, w, r, c, a, lam):
 
 @compiled
 def _compute_accelerations(f, w, t, q, v, a):
-    """Compute accelerations and multipliers at (q, v) by the factors in w; store them in `a`, w.z; return a code."""
+    """Store accelerations at (q, v) in `a` and multipliers in w.z, by the factors in w; return a code."""
     w.n_evaluations += 1
     code = _fill_gamma(f, w, t, q, v)
     if code != DONE:
@@ -397,7 +405,7 @@ def _compute_multipliers(f, w, lam):
 
 @compiled
 def _find_least_correction(f, w):
-    """Store in w.unknowns[:n] the least correction x, in the metric of M, with G x = w.g; return max|x|, or inf."""
+    """Store in w.unknowns[:n] the least x, in the metric of M, with G x = w.g; return max|x|, or inf if not finite."""
     n = w.unknowns.size - w.g.size
     w.unknowns[:n] = 0.0
     copy(w.g, w.unknowns[n:])
@@ -407,7 +415,7 @@ def _find_least_correction(f, w):
 
 @compiled
 def _is_on_constraints(f, w, q):
-    """Return whether all C_i in w.C are rounding errors: at most ROUNDING_OF_ROWS times the largest |G_ij q_j|."""
+    """Return True if all values C_i of constraints in w.C are rounding errors, see ROUNDING_OF_ROWS."""
     rows, columns, _ = jacobian_entries_of(f.ldl_program)
     largest_terms = w.solutions[: w.g.size]
     largest_terms[:] = 0.0
@@ -421,7 +429,10 @@ def _is_on_constraints(f, w, q):
 
 @compiled
 def _project_state(f, w, t, q, v, theta):
-    """Project (q, v) in place; return a code. On return, the factors in w belong to q before the last correction."""
+    """Project (q, v) onto the constraints in place, until corrections are at most theta; return a code.
+
+    On return, the factors in w belong to q before the last correction.
+    """
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.rounded)
     for _ in range(MAX_ITERATIONS):
@@ -450,7 +461,7 @@ def _project_state(f, w, t, q, v, theta):
         is_last = is_last or correction_q <= w.pivot * theta
         if not is_last and correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            # omit this correction, which is noise: it would move light bodies by much more than others
+            # do not apply this correction: it is noise, or due to divergence. Noise would move light bodies most
             return (
                 DONE
                 if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))
@@ -466,7 +477,7 @@ def _project_state(f, w, t, q, v, theta):
 
 @compiled
 def _check_redundant_rows(f, w, t, q, v):
-    """Return DONE if the accepted state (q, v) satisfies all rows (w has their entries at q), else ROWS_CONTRADICT."""
+    """Return DONE if (q, v) satisfies all constraints, else ROWS_CONTRADICT; w must contain C_q and C_t there."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
@@ -503,7 +514,7 @@ def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
 
 @kernel(INNER)
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task`, a number from tasks.py, by sparse factors; return a code. For SOLVE, q and v are r and c."""
+    """Do `task` (see tasks.py) by sparse factors; return a code. For SOLVE, q and v are right-hand sides r and c."""
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
         code = STOPPED if w.time_is_up == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.nearly_singular == PROJECT_STAGES:

@@ -14,5 +14,5 @@
     ADOPT_MIDPOINT,
     VERIFY_PATTERN,
     CHECK_REDUNDANT,
-    SOLVE,  # this task exists only for large systems, see sparse_inner_loop.py
+    SOLVE,  # only the inner loop for large systems has this task, see sparse_inner_loop.py
 ) = range(14)
