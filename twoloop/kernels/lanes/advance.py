@@ -1,7 +1,8 @@
 """Integration loop of runs in lanes: each lane has its own step size, and starts a new run when its run has ended.
 
-If a condition of the generated code does not hold, or many successive steps are rejected, a run is removed from its
-lane, and repeated outside the lanes later. The method's function `code.step` takes the steps. For `work` see layout.py.
+If the generated code is not valid at a state, or if many successive steps are rejected, a run is removed from its lane,
+and repeated outside the lanes later. The method's function `code.step` takes the steps. `work` is the memory of all
+lanes, see layout.py; STATE is the state at the beginning of a step, and NEW the state at its end.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
     n_fresh, n_running = 0, 0
     for k in range(LANES):
         previous_run = int(work[at.RUN * LANES + k])
-        # the generated code of a Taylor method ends a run by RUNNING = 0 only: store the reason in `status` here
+        # the generated code of a Taylor method only sets RUNNING = 0 to end a run: store the reason in `status` here
         if work[at.RUNNING * LANES + k] == 0.0 and previous_run >= 0 and status[previous_run] == at.UNDECIDED:
             status[previous_run] = at.MANY_REJECTIONS if work[at.N_REJECTED * LANES + k] < np.inf else at.NO_VALUES
         work[at.ACTIVE * LANES + k] = work[at.IS_NEW * LANES + k] = 0.0
@@ -54,7 +55,7 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
 
 @compiled
 def _write_states_in_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
-    """Store the states at output times within accepted steps in out_q and out_v; NaN if the projection fails."""
+    """In lanes with an accepted step, store the states at output times within it, or NaN if their projection fails."""
     while True:
         n_requested = 0
         for k in range(LANES):
@@ -83,7 +84,7 @@ def _write_states_in_steps(code, settings, control, options, work, n, new, times
 
 @compiled
 def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
-    """End the runs whose accepted step ends at t1, the output time `last`; copy the final states to the outputs."""
+    """End the runs whose accepted step ends at t1, which is the output time number `last`; store their final states."""
     for k in range(LANES):
         if work[at.ACCEPTED * LANES + k] == 0.0 or work[at.H * LANES + k] != control[at.T1] - work[at.T * LANES + k]:
             continue
@@ -97,16 +98,16 @@ def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, ou
 
 @compiled
 def _count_evaluations(settings, work, n_evaluations):
-    """For each lane, add the number of evaluations in the last step to the run's entry of `n_evaluations` (n_runs)."""
+    """In `n_evaluations` (n_runs), add to each running run the number of evaluations in its last step."""
     for k in range(LANES):
         if work[at.RUNNING * LANES + k] == 1.0:
             n_within = settings[at.N_EVALUATIONS] + int(work[at.EVALUATED * LANES + k])
-            n_evaluations[int(work[at.RUN * LANES + k])] += n_within + 1  # 1: the evaluation at the end of the step
+            n_evaluations[int(work[at.RUN * LANES + k])] += n_within + 1  # the last one is at the end of the step
 
 
 @compiled
 def _advance_time(work, control, n_steps):
-    """In lanes whose step was accepted, add the step size to T, and 1 to the entry of `n_steps` (n_runs) of the run."""
+    """In lanes whose step was accepted, add its size to the time T; count the step in `n_steps` (n_runs)."""
     for k in range(LANES):
         if work[at.ACCEPTED * LANES + k] == 1.0:
             h, t = work[at.H * LANES + k], work[at.T * LANES + k]
@@ -124,12 +125,12 @@ _ADVANCE_SIGNATURE = types.void(
 def advance_lanes(
     code, settings, control, options, times, numbers, q0, v0, out_q, out_v, out_a, status, n_steps, n_evaluations, work
 ):
-    """Integrate runs, one for each row of `numbers`, from t0 to t1.
+    """Integrate runs, one for each row of `numbers`, from t0 to t1; for `settings`, `control`, `work` see layout.py.
 
     options : options of the method, see control.py; times : (n_t,) output times, the last of which is t1; numbers :
     (n_runs, n_numbers) data of the generated code; q0, v0 : (n_runs, n) initial states. Results are stored in out_q and
-    out_v : (n_runs, n, n_t); out_a : (n_runs, n + n_rows) accelerations and multipliers at t1; status and n_steps :
-    (n_runs,); n_evaluations : (n_runs,) increased by the number of evaluations.
+    out_v : (n_runs, n, n_t) states at `times`; out_a : (n_runs, n + n_rows) accelerations and multipliers at t1;
+    status : (n_runs,) codes, such as ENDED; n_steps, n_evaluations : (n_runs,) numbers that are increased.
     """
     n, n_rows, order = settings[at.N], settings[at.N_ROWS], settings[at.ORDER]
     _, new, _, _, a, _, _, _ = offsets_in_work(n, n_rows, numbers.shape[1])

@@ -1,7 +1,8 @@
 """Steps of explicit methods in lanes, and step-size control of Runge-Kutta methods for each lane.
 
-As in `explicit_step`, only the end of a step of DOP853 is projected onto the constraints, and its stages are not. The
-step-size control of Taylor series is part of the code generated for the mechanism, see generate/lane_code.py.
+As in steps/explicit_step.py, only the end of a step of DOP853 is projected onto the constraints; its stages are not.
+The step-size control of Taylor series is part of the code generated for the mechanism, see generate/lane_code.py. Names
+in capitals, such as NEW and ERROR, are vectors in `work` with one number for each lane, see layout.py.
 """
 
 import numpy as np
@@ -20,26 +21,28 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, between the step-size rule (N_RULE numbers) and the options of the method in a single run
+# indices in `options`, which contains the step-size rule (N_RULE numbers), these, and the method's options as in a run
+# outside the lanes (from N_HEAD on)
 # - JUMP_RATIO: largest ratio of true error to error estimate in a step in which a force jumps
 # - FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest tolerance of a coordinate
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
 SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
-MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to a rejected step size, as in advance.py
-# a step is lengthened to end at t1 if it is shorter than the time left by at most this fraction, see `size_off_grid`
+MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to a rejected step size
+# if a step would end before t1 by at most this fraction of the time left, it is lengthened to end at t1
 END_ROUNDING = 1e-10
-LIMIT_FACTOR = 0.7  # ratio of H_LIMIT to the size of the last failed step, as in `Plan`
-LIMIT_MEMORY = 10.0  # number of accepted steps during which H_LIMIT applies, as in `Plan`
+# a failed step (its stages or its end cannot be computed) of size h limits step sizes to LIMIT_FACTOR h; the limit,
+# H_LIMIT, applies to this number of accepted steps. The values are those of `Plan`
+LIMIT_FACTOR = 0.7
+LIMIT_MEMORY = 10.0
 LEAST_FIRST_STEP = 20.0 * at.SHORTEST  # lower bound of the first step size, relative to |t0|
-# number of successive rejected steps after which a run leaves its lane, because the motion may be stiff
-MAX_REJECTED = 30
+MAX_REJECTED = 30  # after more successive rejected steps, a run leaves its lane, because the motion may be stiff
 MAX_STEPS = 100_000  # largest number of steps of a run in a lane: the user cannot interrupt runs in lanes
 
 
 @inlined
 def _history_view(work, k):
-    """Return a view (N_PAST) of the history of step-size control in lane k."""
+    """Return a view (N_PAST numbers) of lane k's history of step-size control: size and error of the last step."""
     return work[at.PAST * LANES + N_PAST * k : at.PAST * LANES + N_PAST * (k + 1)]
 
 
@@ -64,7 +67,7 @@ def _first_step_size(options, control, work, n, state, a, k):
 
 @compiled
 def begin_control(options, control, work, n, state, a, start):
-    """In lanes with IS_NEW = 1, initialize step-size control, and copy accelerations from offset `a` to `start`."""
+    """In lanes that begin a run, initialize step-size control, and copy accelerations from offset `a` to `start`."""
     for k in range(LANES):
         if work[at.IS_NEW * LANES + k] == 1.0:
             for j in range(n):
@@ -78,7 +81,10 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Store the next step size, at most control[GAP], in H and X (lanes without a run: 0); set ACTIVE to RUNNING."""
+    """Store the size of the next step, at most control[GAP] (s), in H and X; remove runs whose steps are too short.
+
+    In lanes without a run, H, X and ACTIVE become 0; ACTIVE becomes 1 in the others. Runs with MAX_STEPS steps end.
+    """
     t1 = control[at.T1]
     for k in range(LANES):
         work[at.H * LANES + k], t = 0.0, work[at.T * LANES + k]
@@ -102,7 +108,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set T_NEW, the time of NEW, to T + X (X: time since the beginning of the step), or to exactly t1 at the end."""
+    """Set T_NEW, the time of the new state, to T + X (beginning of the step plus time since then), or to exactly t1."""
     for k in range(LANES):
         t, x = work[at.T * LANES + k], work[at.X * LANES + k]
         work[at.T_NEW * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x
@@ -110,9 +116,10 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW onto the constraints; raise ERROR to the change that this causes, in tolerances, if it is larger.
+    """Project NEW, the state at the end of the step, onto the constraints; include the changes in the error estimate.
 
-    Velocities change by more than the tolerances if a drive jumps or bends between stages. `predicted_v` is scratch.
+    If a change of velocities, in tolerances, or PREDICTION_ERROR, for positions, is larger than ERROR, it replaces
+    ERROR: so a step is rejected if a drive jumps or bends between its stages. `predicted_v`: offset of scratch.
     """
     n, order = settings[at.N], settings[at.ORDER]
     state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -134,13 +141,13 @@ def end_steps(code, settings, control, work, predicted_v):
 
 @merged
 def _accept_or_shorten(options, work, k):
-    """Store the size of the next step in lane k in H_NEXT; return whether the last step in this lane is accepted."""
+    """Return True if the step just taken in lane k is accepted; store the size of the next step in H_NEXT."""
     h, t, error = work[at.H * LANES + k], work[at.T * LANES + k], work[at.ERROR * LANES + k]
     if work[at.ACTIVE * LANES + k] == 0.0 or not np.isfinite(error):
         work[at.H_NEXT * LANES + k], work[at.H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[at.LIMIT_AGE * LANES + k] = 0.0
         return False
-    # near a jump of a force, the error estimate may be small by chance: multiply it by JUMP_RATIO until JUMP_END
+    # near a jump of a force, the error estimate may be small by chance: multiply it by JUMP_RATIO until time JUMP_END
     error_factor = options[JUMP_RATIO] if t < work[at.JUMP_END * LANES + k] else 1.0
     is_accepted = error * error_factor <= 1.0
     if error > SUDDEN_ERROR and not is_accepted:
@@ -162,7 +169,11 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED according to ERROR and ACTIVE; after accepted steps, copy the accelerations `a` to `start`."""
+    """Set ACCEPTED to 1 in lanes whose step succeeded with a small error; there, copy accelerations to `start`.
+
+    In other lanes, count the rejected steps; after too many, remove the run. `a`, `start`: offsets of accelerations at
+    the end of this step, and at the beginning of the next one.
+    """
     for k in range(LANES):
         work[at.ACCEPTED * LANES + k] = 0.0
         if work[at.RUNNING * LANES + k] == 0.0:
@@ -178,15 +189,15 @@ def judge_steps(options, work, n, a, start, status):
 
 
 def memory_size(s: int, n: int) -> int:
-    """Return the length of the method's memory, in vectors, for s stages and n coordinates."""
+    """Return the length of the memory of an explicit method, in vectors, for s stages and n coordinates."""
     return (at.SLOPES + s) * n
 
 
 @kernel(STEP)
 def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of DOP853 in each lane, at most as long as control[GAP].
+    """Take a step of DOP853 in each lane, at most as long as control[GAP] (s).
 
-    If `within`, take no step: compute the states at the time X after the beginning of the last accepted step.
+    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
     """
     n = settings[at.N]
     state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -207,7 +218,7 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 def step_by_series(code, settings, control, options, work, status, n_steps, within):
     """Take a step in each lane, by the Taylor series about the beginning of the step.
 
-    If `within`, take no step: compute the states at the time X after the beginning of the last accepted step.
+    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
     """
     order = settings[at.ORDER]
     if within:
@@ -215,12 +226,12 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
             work[at.X * LANES + k] = work[at.X * LANES + k] / work[at.UNIT * LANES + k]
         code.evaluate_series(order, control, work)
         return
-    for k in range(LANES):  # end runs with too many steps: stiff motion may need many at any tolerance
+    for k in range(LANES):  # remove runs with too many steps: stiff motion may need many at any tolerance
         if work[at.RUNNING * LANES + k] == 1.0 and n_steps[int(work[at.RUN * LANES + k])] >= MAX_STEPS:
             remove_run(work, status, k, at.MANY_STEPS)
     code.compute_series(order, control, work)
     code.choose_sizes(order, control, work)
-    for k in range(LANES):  # count the evaluations of the defect within the step
+    for k in range(LANES):  # store the number of evaluations of the defect within the step
         if work[at.ACTIVE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
             work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0
     code.check_defect_within(order, control, work)

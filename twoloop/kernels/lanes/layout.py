@@ -21,26 +21,27 @@ UNDECIDED, ENDED = 0, 1  # status of a run: not ended yet; ended at t1
 (
     NO_START,  # the generated code could not compute the accelerations at the start
     NO_STATE,  # a state at an output time could not be projected
-    NO_VALUES,  # the equations have no values in a step
+    NO_VALUES,  # accelerations in a step are not finite, or the generated code is not valid there
     MANY_REJECTIONS,  # too many successive steps were rejected
     MANY_STEPS,  # the run takes too many steps
-    CALLBACKS_DIFFER,  # callbacks disagree with the generated code
+    CALLBACKS_DIFFER,  # the final state does not satisfy the equations as the user's callbacks evaluate them
 ) = range(-6, 0)
 
 LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of doubles in a SIMD register
 
-# offsets in `work` of the fields, each a vector; after the fields, `work` contains the arrays of `array_offsets`
+# offsets in `work` of the fields, vectors with one number for each lane. The arrays of `array_offsets` follow, such as
+# STATE, the state at the beginning of the step, and NEW, the state at its end or within it
 (
     T,  # time of STATE (s)
     T_NEW,  # time of NEW (s)
     UNIT,  # unit of time in which a Taylor series is computed (s)
     H,  # size of the step (s)
-    X,  # time (s) from the beginning of the step to the state to be computed
+    X,  # time (s) from the beginning of the step to NEW; during tasks of a Taylor series, in units of UNIT
     ACTIVE,  # 1 in lanes where the next task has to run; a task that fails in a lane sets 0 there
     DEFECT,  # defect at the end of the step, relative to the allowed defect
     PREDICTION_ERROR,  # difference of predicted and projected positions, relative to its limit, see step_size.py
-    LENGTH,  # step size that a Taylor series allows, in units of UNIT
-    LONGEST,  # largest allowed step size (s)
+    LENGTH,  # step size that the last terms of a Taylor series allow, in units of UNIT
+    LONGEST,  # largest step size (s) that a Taylor method allows after the last step
     REQUESTED,  # 1 in lanes that begin a run, or need a state within the step
     WORST_DEFECT,  # largest defect within the step, relative to the allowed defect
     N_REJECTED,  # number of successive rejected steps
@@ -48,7 +49,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     RUN,  # index of the run in this lane
     N_OUTPUTS,  # number of output times that the run has reached
     UNCONVERGED,  # 1 in lanes whose projection has not converged yet
-    LAST_CORRECTION,  # largest change of a position by the previous pass of a projection
+    LAST_CORRECTION,  # largest change of a position by the last correction of a projection
     ACCEPTED,  # 1 in lanes whose step was accepted
     IS_NEW,  # 1 in lanes whose run has not taken a step yet
     ERROR,  # error estimate of the step, in units of the tolerances
@@ -56,14 +57,14 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     H_NEXT,  # size of the next step (s)
     H_LIMIT,  # upper limit of step sizes after a failed step (s); infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
-    JUMP_END,  # end (s) of the last step that was rejected with an error above SUDDEN_ERROR
+    JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
-    EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
-    PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
+    EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
+    PAST,  # size and error of the last accepted step, for step-size control; stored lane by lane
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# names of generated functions (order, control, work); methods of the same names in generate/lane_code.py describe them
+# names of generated functions of (order, control, work); generate/lane_code.py has a method of this name for each
 TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_prediction_error", "commit")
 TASKS_OF_STARTS, TASKS_OF_STAGES, TASKS_OF_EXPLICIT = ("compute_rows",), ("compute_accelerations",), ("compute_stages",)
 TASKS_OF_SERIES = (
@@ -73,14 +74,16 @@ TASKS_OF_SERIES = (
 CODE = Reference("LaneKit", {})  # numba's type for objects of the class LaneKit
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
-# signature of a method's step, (code, settings, control, options, work, status, n_steps, within): in each lane with a
-# run, take a step H, set ACCEPTED, and compute NEW, A and LAM at the end of the step. If `within`, take no step: in
-# lanes with ACTIVE = 1, compute NEW at the time X after the beginning of the last accepted step, without a projection
+# signature of a method's step (code, settings, control, options, work, status, n_steps, within). In lanes with a run it
+# takes a step of size H, sets ACCEPTED, and stores the final state in NEW, accelerations in A, multipliers in LAM. If
+# `within`, it takes no step: where ACTIVE = 1, NEW becomes the state X s after the beginning of the last accepted step,
+# not projected
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
-# offsets in the memory of an explicit method, in units of n vectors. START: accelerations at STATE; BEGIN, _BEGIN_V: q
-# and v at the beginning of the step; PREDICTED_V: velocities before the projection; SLOPES: accelerations of the stages
+# offsets in the memory of an explicit method, in units of n vectors (n: number of coordinates). START: accelerations at
+# the beginning of the next step; BEGIN, _BEGIN_V: q and v at the beginning of this step; PREDICTED_V: velocities at its
+# end before the projection; SLOPES: accelerations at the stages
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
 # indices in `settings`, whole numbers that describe the mechanism and the method
@@ -89,13 +92,13 @@ START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
     N_ROWS,  # number of constraints
     ORDER,  # order of the Taylor series
     CHECKS_REDUNDANT,  # 1: redundant rows must be checked at the end of each step
-    N_NUMBERS,  # number of numbers that the generated code reads
-    N_EVALUATIONS,  # number of evaluations within a step
+    N_NUMBERS,  # number of coefficients that the generated code reads
+    N_EVALUATIONS,  # number of evaluations of accelerations within a step
 ) = range(6)
 # indices in `control`: start, end (s), longest time (s) between evaluations, rtol, first of the n absolute tolerances
 T0, T1, GAP, RTOL, ATOL = range(5)
 
-SHORTEST = 1e-13  # smallest step size, relative to the larger of |t| at its beginning and |t1|
+SHORTEST = 1e-13  # smallest step size, relative to max(|t|, |t1|); if a step is shorter, the run leaves its lane
 
 
 class LaneKit:
@@ -117,8 +120,8 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 def array_offsets(n, n_rows, n_numbers):
     """Return the offsets in `work`, in vectors, of the arrays that follow its fields.
 
-    The arrays are STATE and NEW (q, v), PREDICTED (q), SERIES_A (accelerations by a series), A, LAM, the data of the
-    generated code (n_numbers), and the memory of the method.
+    The arrays are STATE and NEW (q, v); PREDICTED (q before a projection); SERIES_A (accelerations by a Taylor series);
+    A (accelerations) and LAM (multipliers); the data of the generated code (n_numbers); the memory of the method.
     """
     state = N_FIELDS
     new = state + 2 * n
@@ -168,7 +171,7 @@ def copy_vectors(work, source, target, count):
 
 @merged
 def _add_product_in_four_lanes(work, t, p, q, sign):
-    """Add sign * x * y to a vector in four adjacent lanes; t, p and q are indices in `work` of the vector, x and y."""
+    """Add sign * work[p] * work[q] to work[t], and do the same for the three indices after t, p and q (other lanes)."""
     t0, t1 = work[t] + sign * work[p] * work[q], work[t + 1] + sign * work[p + 1] * work[q + 1]
     t2, t3 = work[t + 2] + sign * work[p + 2] * work[q + 2], work[t + 3] + sign * work[p + 3] * work[q + 3]
     work[t], work[t + 1], work[t + 2], work[t + 3] = t0, t1, t2, t3
@@ -176,21 +179,21 @@ def _add_product_in_four_lanes(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign * x * y to the vector `target`; read four lanes before writing any of them, as vectors might overlap."""
+    """Add sign * x * y to the vector `target`; read four lanes before any of them is written, to allow SIMD code."""
     for k in range(0, LANES, 4):
         _add_product_in_four_lanes(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return the value that `raise_to_ratio` stores in one lane; all arguments but `factor` are indices in `work`."""
+    """Return the value that `raise_to_ratio` stores in one lane; arguments up to `after` are indices in `work`."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """Set `target` to |error| * factor / (atol + rtol * max(|before|, |after|)) in lanes where `target` is smaller."""
+    """In each lane, raise `target` to |error| * factor / (atol + rtol * max(|before|, |after|)) if it is smaller."""
     for k in range(0, LANES, 4):
         m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k
         m0 = _raised_value(work, m, e, f, x, y, atol, rtol)
@@ -202,9 +205,9 @@ def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
 
 @merged
 def _multiply_number(work, target, imaginary_target, x, imaginary):
-    """Multiply the number `target` by x in each lane; if `imaginary` > 0, both numbers are complex.
+    """Multiply the number `target` by the number x in each lane; if `imaginary` > 0, both are complex.
 
-    The imaginary part is `imaginary_target` vectors after the real part of `target`, and `imaginary` vectors after x.
+    Then the imaginary part of `target` is `imaginary_target` vectors after its real part; that of x, `imaginary`.
     """
     for k in range(LANES):
         t, p = target * LANES + k, x * LANES + k
@@ -220,7 +223,7 @@ def _multiply_number(work, target, imaginary_target, x, imaginary):
 def _subtract_product(work, target, x, y, imaginary, imaginary_y):
     """Subtract the product x * y from the number `target` in each lane; if `imaginary` > 0, all three are complex.
 
-    Imaginary parts are `imaginary` vectors after the real part in x, and `imaginary_y` after it in y and `target`.
+    Then the imaginary part of x is `imaginary` vectors after its real part; those of y and `target`, `imaginary_y`.
     """
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:
@@ -244,9 +247,9 @@ def _pivot_magnitude(work, entry, imaginary, k):
 
 @compiled
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
-    """Exchange rows so that the pivot (c, c) is the largest entry of column c in row c or below; store its inverse.
+    """In each lane, exchange row c with the row below that has the largest entry in column c; invert this pivot.
 
-    Clear ACTIVE in lanes where the pivot is zero.
+    Store the index of the exchanged row in `pivots`. In lanes where the pivot is zero, set ACTIVE to 0.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)
@@ -306,12 +309,12 @@ def solve_systems(work, matrix, pivots, n, imaginary, x):
         _multiply_number(work, x + i, imaginary_x, matrix + i * n + i, imaginary)
 
 
-MAX_PASSES = 10  # largest number of passes of a projection, each with the task "correct_state"
+MAX_PASSES = 10  # largest number of times that a projection calls the generated function `correct_state`
 
 
 @compiled
 def project_lanes(code, order, control, work):
-    """Project NEW onto the constraints in lanes with ACTIVE = 1; clear ACTIVE where projections do not converge."""
+    """Project the state NEW onto the constraints in lanes with ACTIVE = 1; set ACTIVE to 0 where this fails."""
     code.correct_positions(order, control, work)
     for _ in range(MAX_PASSES):
         code.correct_state(order, control, work)

@@ -1,12 +1,12 @@
-"""Steps of implicit Runge-Kutta methods in lanes by Newton's method, as in `newton_step`, for stiff motion.
+"""Steps of implicit Runge-Kutta methods in lanes by Newton's method, as in steps/newton_step.py, for stiff motion.
 
 The unknowns are the accelerations a_j of all coordinates at the stages,
 
     F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
-where F are the accelerations at a state that is not projected: stages violate the constraints by the error of the
-formula, and only the end of the step is projected. In each step, the derivatives of F are computed anew, by finite
-differences, for all lanes at once. Offsets are positions in `work`, see layout.py.
+with the matrix A and the nodes c of the tableau. F are accelerations at a state that is not projected: stages violate
+the constraints by the error of the formula, and only the end of the step is projected. In each step, derivatives of F
+are computed anew, by finite differences. Offsets and names in capitals belong to arrays in `work`, see layout.py.
 """
 
 import numpy as np
@@ -47,45 +47,45 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 (
     ITERATING,  # 1 in lanes whose iteration has not ended
     DONE,  # 1 in lanes whose iteration has converged
-    CHANGE_BEFORE,  # correction by the iteration before, relative to SCALE_Q and SCALE_V
+    CHANGE_BEFORE,  # largest correction by the previous iteration, relative to SCALE_Q and SCALE_V
     SCALE_Q,  # largest absolute position at the stages, at least 1
     SCALE_V,  # largest absolute velocity at the stages, at least 1
-    LARGEST_Q,  # largest correction of positions, divided by the square of the step size
-    LARGEST_V,  # largest correction of velocities, divided by the step size
+    LARGEST_Q,  # largest correction of a stage's position by this iteration, divided by the square of the step size
+    LARGEST_V,  # largest correction of a stage's velocity by this iteration, divided by the step size
     H_PREVIOUS,  # size (s) of the step whose accelerations are in PREVIOUS; 0: there is no such step
     CONSTANT,  # 1: the predicted accelerations of all stages equal the accelerations at the beginning; else 0
-    DURATION,  # duration of an error of the velocities (s), see velocity_errors.py; 0: not known
+    DURATION,  # time (s) for which a velocity error keeps its sign, see velocity_errors.py; 0: not known
     N_SINGLE_VECTORS,
 ) = range(11)
-# indices of the blocks of n vectors
+# indices of blocks of n vectors in the method's memory (n: number of coordinates)
 (
-    START,  # accelerations at STATE
-    BEGIN_Q,  # q, v and a at the beginning of the step
+    START,  # accelerations at the beginning of the next step
+    BEGIN_Q,  # q, v and a at the beginning of this step
     BEGIN_V,
     BEGIN_A,
     SUMS,  # scratch
     MIDDLE_Q,  # q, v and a in the middle of the step
     MIDDLE_V,
     MIDDLE_A,
-    E_Q,  # estimated errors of q and v
+    E_Q,  # estimated errors of q and v at the end of the step
     E_V,
     UNFILTERED,  # estimated error of v before filters
     FILTERED_ONCE,  # estimated error of v after one filter
-    COMPLEX,  # real part of a complex vector
-    _IMAGINARY,  # imaginary part of this vector
+    COMPLEX,  # scratch: real part of the right-hand side and solution of a linear system
+    _IMAGINARY,  # imaginary part of the same
     N_VECTORS,
 ) = range(15)
-# indices of the blocks (s, n): stage accelerations of this step, stage accelerations of the previous step, residuals of
-# Newton's method, and its corrections. The weights (s, s) follow the blocks
+# indices of blocks (s, n), for s stages: accelerations at the stages of this step; the same for the previous step;
+# residuals of Newton's method; its corrections of the accelerations. The weights (s, s) follow these blocks
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
-# indices of the matrices (n, n): derivatives of the accelerations by q and by v; then, for each linear system, its real
-# and its imaginary part. The pivots follow the matrices
+# indices of matrices (n, n): derivatives of the accelerations by q and by v; then, for each linear system of Newton's
+# method, the real and the imaginary part of its matrix. The pivots follow the matrices
 DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
-    """Return the length of the method's memory, in vectors; each real eigenvalue or complex pair of A has a system."""
-    n_systems = (s + 1) // 2
+    """Return the length of the method's memory, in vectors, for s stages and n coordinates."""
+    n_systems = (s + 1) // 2  # a linear system for each complex pair of eigenvalues of the tableau, or real eigenvalue
     return N_SINGLE_VECTORS + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
 
 
@@ -109,13 +109,13 @@ def _weights_offset(memory, n, s):
 
 @merged
 def matrix_offset(memory, n, s, index):
-    """Return the offset of matrix (n, n) number `index`: DERIVATIVE_Q, DERIVATIVE_V, or SYSTEMS + 2 k for system k."""
+    """Return the offset of a matrix (n, n); `index`: DERIVATIVE_Q, DERIVATIVE_V, or SYSTEMS + 2 k for system k."""
     return _weights_offset(memory, n, s) + s * s + index * n * n
 
 
 @merged
 def pivots_offset(memory, n, s, n_systems, k):
-    """Return the offset of the pivots (n) of system k."""
+    """Return the offset of the pivots (n) of linear system number k."""
     return matrix_offset(memory, n, s, SYSTEMS + 2 * n_systems) + k * n
 
 
@@ -123,7 +123,7 @@ def pivots_offset(memory, n, s, n_systems, k):
 def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
     """Store in MIDDLE_Q, MIDDLE_V and MIDDLE_A a state in the middle of the step, and its accelerations.
 
-    The state is extrapolated from the beginning of the step, and its positions are moved towards the constraints.
+    The state is extrapolated from the beginning of the step. One correction moves its positions to the constraints.
     """
     n, order = settings[at.N], settings[at.ORDER]
     node, begin = middle_node(c), vector_offset(memory, n, BEGIN_Q)
@@ -143,7 +143,7 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 
 @compiled
 def compute_derivatives(code, settings, control, c, work):
-    """In lanes with ACTIVE = 1, store the derivatives of accelerations by q and v in the middle of the step.
+    """Store DERIVATIVE_Q and DERIVATIVE_V, derivatives of accelerations by q and v, in the middle of the step.
 
     "Middle" is the time of a stage, because forces that act only between two stages must not affect the step.
     """
@@ -168,7 +168,11 @@ def compute_derivatives(code, settings, control, c, work):
 
 @compiled
 def factor_systems_of_lanes(settings, method_options, s, work):
-    """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and one of each complex pair; X: step size."""
+    """Factor the matrices I - (X l)^2 J_q - X l J_v of Newton's method in each lane.
+
+    l: an eigenvalue of the tableau's matrix A, one of each complex pair; J_q and J_v: derivatives of the accelerations
+    by q and v; X: size of the step (s).
+    """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_index(s)
@@ -192,10 +196,10 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Store predicted stage accelerations in STAGES: values of the polynomial through the accelerations in PREVIOUS.
+    """Store in STAGES a prediction of the stage accelerations: the polynomial through those in PREVIOUS.
 
-    If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, the prediction is constant. `begins` is 1 if
-    PREVIOUS belongs to the last step, and 0 if PREVIOUS belongs to this step.
+    If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, all are equal to those at the beginning of the
+    step. `begins` is 1 if PREVIOUS belongs to the last step, and 0 if it belongs to this step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -227,7 +231,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations in STAGES; clear ACTIVE if a value is invalid."""
+    """Store the residuals F - a of the stage accelerations a in RESIDUAL; update SCALE_Q, SCALE_V; F: the equations."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -260,7 +264,7 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
 
 @compiled
 def _correct_stages(settings, method_options, s, work):
-    """Store the corrections of the stage accelerations in CHANGES; add them to STAGES in lanes with ITERATING = 1."""
+    """Store Newton's corrections of stage accelerations in CHANGES; add them to STAGES in lanes with ITERATING = 1."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     n_systems, offset = count_systems(method_options, s), newton_options_index(s)
@@ -301,7 +305,7 @@ def _raise_to_largest_value(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store in LARGEST_Q and LARGEST_V the largest changes of q and v by CHANGES, divided by X^2 and by X."""
+    """Store in LARGEST_Q and LARGEST_V the largest changes of q and v due to CHANGES, divided by X^2 and by X."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = A.shape[0]
@@ -344,7 +348,7 @@ def _has_iteration_ended(options, work, memory, iteration, k):
 
 @compiled
 def solve_stages(code, settings, control, options, method_options, A, A2, c, work):
-    """Iterate the predicted STAGES of a step of size X in lanes with ACTIVE = 1; clear ACTIVE on divergence."""
+    """Compute stage accelerations by Newton's method from the prediction in STAGES; set ACTIVE to 0 on divergence."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     iterating, done = memory + ITERATING, memory + DONE
@@ -371,7 +375,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store the state at the time X after the beginning of the step in NEW, computed from STAGES."""
+    """Store in NEW the state at the time X after the beginning of the step, given the stage accelerations STAGES."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
@@ -396,7 +400,7 @@ def _allowed_error(control, work, state, new, j, entry, k):
 
 @compiled
 def _store_embedded_estimate(settings, method_options, A, work, memory):
-    """Store the unfiltered error estimate of the embedded formula in E_Q and E_V."""
+    """Store the errors of q and v that the embedded formula estimates in E_Q and E_V, before filters."""
     n, s = settings[at.N], A.shape[0]
     offset = newton_options_index(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
@@ -420,7 +424,10 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
 
 @compiled
 def _filter_errors(settings, method_options, s, work, memory):
-    """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), with z = gamma0 H and the Jacobian J of (v, F) by (q, v)."""
+    """Filter the estimated errors e = (E_Q, E_V) of q and v, to reduce stiff components: replace e by (I - z J)^-1 e.
+
+    z = gamma0 H (s), with an eigenvalue gamma0 of the tableau; J: derivative of (v, accelerations) by (q, v).
+    """
     n = settings[at.N]
     gamma0 = method_options[newton_options_index(s) + GAMMA0]
     e_q, e_v, scratch = vector_offset(memory, n, E_Q), vector_offset(memory, n, E_V), vector_offset(memory, n, COMPLEX)
@@ -440,7 +447,7 @@ def _filter_errors(settings, method_options, s, work, memory):
 
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
-    """Return the error, in tolerances, that the estimated velocity error in lane k causes, see velocity_errors.py."""
+    """Return the largest error of q or v, in tolerances, that the velocity error E_V causes; see velocity_errors.py."""
     raw, once, twice = (
         vector_offset(memory, n, UNFILTERED),
         vector_offset(memory, n, FILTERED_ONCE),
@@ -453,7 +460,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
         largest_error = max(largest_error, abs(work[(twice + j) * LANES + k]))
         difference = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
-        largest_difference = max(largest_difference, abs(difference))  # |(z J)^2 e| for the velocity error e
+        largest_difference = max(largest_difference, abs(difference))  # |(z J)^2 e|; e: velocity error, J: Jacobian
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]
@@ -487,7 +494,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
-    """If the slowly changing part of E_V causes a larger error than ERROR, store it in ERROR; see newton_step.py."""
+    """Raise ERROR to the error, in tolerances, that the slowly changing part of E_V causes; see velocity_errors.py."""
     n = settings[at.N]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
@@ -524,7 +531,7 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
 
 @compiled
 def _estimate_error(settings, control, method_options, A, work):
-    """Store in ERROR the error estimate of the step, in tolerances; filters suppress stiff components."""
+    """Store the error estimate of the step, in tolerances, in ERROR; filters reduce components of stiff vibrations."""
     n, s = settings[at.N], A.shape[0]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     offset = newton_options_index(s)
@@ -552,7 +559,7 @@ def _estimate_error(settings, control, method_options, A, work):
 
 @compiled
 def _store_stages(work, memory, n, s):
-    """Copy STAGES of accepted steps to PREVIOUS, to predict stages of the next step, or of a state within this step."""
+    """In lanes with an accepted step, copy STAGES to PREVIOUS, to predict stages for later or intermediate states."""
     stages, previous = block_offset(memory, n, s, STAGES), block_offset(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if work[at.ACCEPTED * LANES + k] == 1.0:
@@ -563,9 +570,9 @@ def _store_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of an implicit Runge-Kutta method in each lane, at most as long as control[GAP].
+    """Take a step of an implicit Runge-Kutta method in each lane, at most as long as control[GAP] (s).
 
-    If `within`, take no step: compute the states at the time X after the beginning of the last accepted step.
+    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
     """
     n = settings[at.N]
     state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
