@@ -391,7 +391,7 @@ def arrays_of(
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = DependentColumns(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.choose else (none, none, 0, np.zeros(0), none, none)
-    nonzero = np.flatnonzero(memory.view(np.int64))  # indices of numbers with nonzero bits (also -0.0), to restore
+    nonzero = np.flatnonzero(memory.view(np.int64))  # indices of nonzero numbers (also -0.0), which each run restores
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     start_constants: tuple[float, ...]
     start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.checks_within else 1.0
@@ -564,7 +564,7 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
         run.fixed_order is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
     )
     start = t0, q0.tobytes(), v0.tobytes()
-    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # in compiled code
+    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # by compiled code
     idle: list[CachedIntegrator] | None = [] if can_start else None
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 

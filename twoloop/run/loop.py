@@ -205,7 +205,7 @@ class IntegrationLoop:
         if self.request.store.append_only:
             self._store_step_fields()
         self.n_filled = np.zeros(2, dtype=np.int64)
-        may_end_before_t1 = has_terminal_event or time_limit is not None  # then t1 may be far too late
+        may_end_before_t1 = has_terminal_event or time_limit is not None  # then t1 may be an upper bound
         self.stall_detector = StallDetector(run.t0, np.inf if may_end_before_t1 else MAX_STEPS_LEFT)
         self.stiffness_monitor = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)

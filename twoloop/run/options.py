@@ -19,7 +19,7 @@ SMALLEST_TOLERANCE = 1e-15  # rtol and atol must not both be smaller: rounding w
 
 @lru_cache(maxsize=1024)
 def _unique_key(*_: Any) -> object:
-    """Return one object for equal arguments, the same at each call: a dict finds it faster than a tuple as its key."""
+    """Return the same object whenever the arguments are equal; as a key of a dict, it is found faster than a tuple."""
     return object()
 
 

@@ -29,7 +29,7 @@ from twoloop.run.workspace import fixed_order_form, make_kit, workspace
 
 Array = NDArray[np.float64]
 
-MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle between a row of C_q and the other rows is below this
+MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle from a row of C_q to the span of the others is smaller
 # MAX_CORRECTIONS: largest number of Newton iterations; they end when a correction is at most ROUNDING times max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
 # a displaced guess leads to the same assembly if the position predicted by C_q, to first order, differs from its
@@ -379,10 +379,11 @@ def _projected_position(
 def _describe_other_assembly(
     system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Project other guesses, as far from `q1` as `guess`; if one leads to another assembly, describe it, else None.
+    """Project other guesses, as far from the position `q1` as `guess`; describe one that leads to another assembly.
 
-    A guess leads to the same assembly if its projection is near the point that C_q predicts to first order, and the
-    determinant of the dependent columns keeps its sign. Two assemblies may differ in the dependent coordinates alone.
+    Return None if there is none. A guess leads to the same assembly if its projection is near the point that C_q
+    predicts to first order, and the determinant of the dependent columns keeps its sign. Two assemblies may differ in
+    the dependent coordinates alone.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -406,8 +407,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # perhaps the curvature of the constraints explains the distance. If so, a guess with the dependent coordinates
-        # of `projected` and the other coordinates of q1 is projected back to q1
+        # perhaps only the curvature of the constraints makes the prediction inaccurate. Then a guess with the dependent
+        # coordinates of `projected` and the other coordinates of q1 is projected back to q1
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)

@@ -179,7 +179,7 @@ class Recorder:
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         """Record times and states [q, v, a, lam] at the ends of steps, and the kind of interval of each step.
 
-        `kinds` is empty unless states between steps are requested.
+        `kinds` (codes of kernels/data/indices.py) is empty unless states between steps are requested.
         """
         self._store_output(t, rows, kinds)
         if not self.request.between_steps:

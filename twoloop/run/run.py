@@ -156,7 +156,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to the state q, v at t, forget past steps, compute accelerations; return DONE or an error."""
+        """Set the run to the state q, v at t, forget past steps, compute accelerations; return DONE or another code."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -286,7 +286,7 @@ class Run:
         if code == indices.RANK_DIFFERS:  # keep the rank of the start: rows dependent there may be independent here
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # convert it to the new form's scale of pivots
+        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # convert largest_pivot to the new form's scale
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
@@ -424,7 +424,7 @@ class Run:
 
         Rounding may have changed velocities there.
         """
-        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT  # pivots of this form vary more
+        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT  # fixed-order pivots vary more
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 
     def n_attempts(self) -> int:
