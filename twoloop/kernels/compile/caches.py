@@ -1,8 +1,8 @@
 """Cache machine code on disk: choose folders, detect files that are out of date, and check who can write files.
 
-Numba's own cache has three shortcomings. It notices changes of the file in which a function is defined, but not changes
-of helpers in other files or of the values of globals, which numba freezes. It raises an error if no folder can be
-written or if a file is damaged. And it runs code that other users have put into its folder.
+Numba's own cache has three shortcomings. It recompiles a function when the file that defines it changes, but not when
+globals change, whose values are part of the machine code, nor when called functions in other files change. It raises an
+error if no folder can be written, or if a file is damaged. And it runs code that other users have put into its folder.
 
 Here each function and key has its own file with a checksum. Code is loaded only from files and folders that belong to
 the user or root, and that no other user can write; SSH requires the same of its key files. The reason: whoever can
@@ -46,13 +46,13 @@ ADVICE = (
 
 
 class UntrustedFile(OSError):
-    """Error for a file that another user could have written; the message gives the reason."""
+    """Error: another user could have written this file; the message says why."""
 
 
 def read_trusted(path: Path) -> bytes:
-    """Return the content of a file in a folder that `trusted_folder` has returned.
+    """Return the content of a file; the folder must be one that `trusted_folder` has returned.
 
-    Raises OSError if there is no such file. Raises UntrustedFile, and warns, if another user could have written it.
+    Raise OSError if there is no such file. Warn and raise UntrustedFile if another user could have written the file.
     """
     with path.open("rb") as file:
         if reason := _reason_of_mode(os.fstat(file.fileno())):
@@ -62,7 +62,7 @@ def read_trusted(path: Path) -> bytes:
 
 
 def replace_trusted(path: Path, content: bytes) -> None:
-    """Write `content` to a file, which replaces an old one at once; no other user can write it, whatever the umask."""
+    """Write `content` to a new file that replaces `path` at once; only the user can write it, whatever the umask."""
     make_trusted_folder(path.parent)
     unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
     try:
@@ -74,7 +74,7 @@ def replace_trusted(path: Path, content: bytes) -> None:
 
 
 def make_trusted_folder(folder: Path) -> None:
-    """Create a folder and the missing folders above it; no other user can write these folders, whatever the umask."""
+    """Create a folder and the missing folders above it, which only the user can write, whatever the umask."""
     for each in [*reversed(folder.parents), folder]:
         if not each.exists():
             each.mkdir(0o755, exist_ok=True)
@@ -82,9 +82,9 @@ def make_trusted_folder(folder: Path) -> None:
 
 @cache
 def trusted_folder(folder: Path) -> Path:
-    """Return `folder` if no other user can write this folder or a folder above it; otherwise, return a replacement.
+    """Return `folder` if no other user can write to it or to a folder above it; otherwise, return a replacement.
 
-    The replacement is in the user's cache folder or, if others can write this, too, in a temporary folder.
+    The replacement is in the user's cache folder; if others can write to that, too, it is in a temporary folder.
     """
     reason = reason_to_distrust(folder)
     if not reason:
@@ -98,7 +98,7 @@ def trusted_folder(folder: Path) -> Path:
 
 
 def reason_to_distrust(folder: Path) -> str:
-    """Return why another user could have written to a folder or a folder above it, or "" if nobody could."""
+    """Return the reason why another user could have written to a folder or a folder above it; "" if nobody could."""
     if os.name != "posix":  # on other systems, the mode does not contain the access rights
         return ""
     real_path = Path(os.path.realpath(folder))
@@ -109,7 +109,7 @@ def reason_to_distrust(folder: Path) -> str:
             continue
         except OSError as error:
             return f"{each} cannot be examined ({error.strerror})"
-        # in a sticky folder, a file or folder can be replaced only by the user who owns the file or folder
+        # all users may write to a sticky folder, such as /tmp, but each entry can be replaced by its owner only
         is_sticky = each != real_path and status.st_mode & stat.S_ISVTX
         reason = _reason_of_owner(status) if is_sticky else _reason_of_mode(status)
         if reason:
@@ -118,7 +118,7 @@ def reason_to_distrust(folder: Path) -> str:
 
 
 def _reason_of_mode(status: os.stat_result) -> str:
-    """Return why another user can write a file or folder with this status, or "" if no other user can."""
+    """Return the reason why another user can write a file or folder with this status; "" if no other user can."""
     if os.name != "posix":
         return ""
     if reason := _reason_of_owner(status):
@@ -131,19 +131,19 @@ def _reason_of_mode(status: os.stat_result) -> str:
 
 
 def _reason_of_owner(status: os.stat_result) -> str:
-    """Return "belongs to user N" for a file or folder of another user N, or "" if the user or root owns it."""
+    """Return "belongs to user N" if another user N owns a file or folder; "" if the user or root owns it."""
     return "" if status.st_uid in (0, os.geteuid()) else f"belongs to user {status.st_uid}"
 
 
 @cache
 def _is_private_group(gid: int) -> bool:
-    """Return whether a group is root's or the user's own, and has no other members than root and the user."""
+    """Return True if a group is root's or the user's own, and only root and the user are members."""
     import grp  # not available on Windows
     import pwd
 
     try:
         user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(gid)
-    except KeyError:  # the user or the group has no entry in the system's databases, as in containers
+    except KeyError:  # the system has no entry for the user or the group, which happens in containers
         return False
     is_own = gid == 0 or (gid == user.pw_gid and group.gr_name == user.pw_name)
     return is_own and set(group.gr_mem) <= {"root", user.pw_name}
@@ -155,7 +155,7 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="twoloop-")
 
 
-_warnings: list[str] = []  # the warning that `_warn_first` has printed; empty: none yet
+_warnings: list[str] = []  # the warning that `_warn_first` has printed; empty if none
 
 
 def _warn_first(text: str) -> None:
@@ -165,15 +165,15 @@ def _warn_first(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-MAX_ON_DISK = 500  # largest number of files on disk for each kind of functions generated for mechanisms
+MAX_ON_DISK = 500  # largest number of files on disk for each kind of generated functions; the oldest are removed
 CHECKSUM_SIZE = hashlib.sha256().digest_size  # length (bytes) of the checksum at the beginning of a file
 
 
 class CodeFiles:
     """Store the machine code of a function on disk, in one file with a checksum for each key.
 
-    Only the user can write these files. A file that is damaged or out of date counts as missing. Unlike numba's cache,
-    this class has no index of files, in which two processes that write it at the same time might confuse functions.
+    Only the user can write these files. A file that is damaged or out of date counts as missing. Numba's cache has an
+    index of its files, which two processes may spoil if they write it at the same time; this class has no index.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, is_limited: bool = False):
@@ -189,7 +189,7 @@ class CodeFiles:
                 old.unlink(missing_ok=True)
 
     def has_file(self, key: Any) -> bool:
-        """Return whether the file for a key exists; it may be damaged or out of date."""
+        """Return True if there is a file for a key; the file may be damaged or out of date."""
         return self._path_for_key(key).exists()
 
     def load(self, key: Any) -> Any:
@@ -216,7 +216,7 @@ class CodeFiles:
 
 
 def _time_written(path: Path) -> float:
-    """Return the time (s) when a file was written, or 0 if another process has removed the file."""
+    """Return the time (s) at which a file was written; 0 if another process has removed the file."""
     try:
         return path.stat().st_mtime
     except OSError:
@@ -228,7 +228,7 @@ UNWRITABLE_CACHE_WARNING = (
     "that only you can write"
 )
 MAX_IN_MEMORY = 50  # largest number of entries of a BoundedCache, in memory
-# numba's class that finds the cache folder in NUMBA_CACHE_DIR; it has a private name in numba 0.61
+# numba's class that chooses subfolders of the folder NUMBA_CACHE_DIR; its name is private in numba 0.61
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 
@@ -242,9 +242,9 @@ def compile_cached(
 ) -> Dispatcher:
     """Compile a function for one signature, or read its machine code from the disk; return numba's dispatcher.
 
-    digests : two digests of everything on which the machine code depends, see `digests_of`. A file whose first digest
-        differs is out of date. The second digest is part of the key of a file, because functions with the same source
-        may have different closure variables. None: the machine code is not stored on disk.
+    digests : two digests of everything on which the machine code depends, see `digests_of`. If the first digest differs
+        from that of a file, the file is out of date. The second one, of closure variables, is part of the name of the
+        file: functions with the same source may have different values. None: no machine code is stored on disk.
     announcement : text printed on stderr before the first compilation of this process.
     **options : options of numba.njit.
     """
@@ -253,7 +253,7 @@ def compile_cached(
     if digests is not None:
         try:
             dispatcher._cache = _CodeCache(function, *digests, announcement)
-        except RuntimeError:  # numba finds no folder, for example for functions typed at a prompt
+        except RuntimeError:  # there is no folder for machine code, for example of a function typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 warn_once(UNWRITABLE_CACHE_WARNING)
     with garbage_collection_off():
@@ -265,7 +265,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Return a context without garbage collection, which would free nothing, but take a sixth of the compile time."""
+    """Return a context without garbage collection, which frees nothing, but takes a sixth of the compile time."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -276,7 +276,7 @@ def garbage_collection_off() -> Iterator[None]:
 
 
 class BoundedCache(dict[Any, Any]):
-    """Dictionary of the newest MAX_IN_MEMORY entries; without a limit, it would grow with each run of a sweep."""
+    """Dictionary that keeps only the newest MAX_IN_MEMORY entries, so that it does not grow with each run."""
 
     def __setitem__(self, key: Any, value: Any) -> None:
         super().__setitem__(key, value)
@@ -309,9 +309,9 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
     """Return a copy of a nested function or lambda with a unique name; return any other function unchanged.
 
-    Numba names machine code by the qualified name of a function and the number of functions compiled so far in the
-    process. If two processes compile closures with the same qualified name, these names may be equal; a process that
-    loads both from the disk would then run the code that it loaded first for both.
+    Numba makes the name of machine code from the qualified name of the function and the number of functions that the
+    process has compiled so far. So closures compiled by two processes may get the same name. A process that loads both
+    from the disk would then run the same code for both.
     """
     if digests is None or "<" not in function.__qualname__:
         return function
@@ -326,11 +326,11 @@ def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | No
 
 
 class _CodeCache(FunctionCache):
-    """Numba's cache of a function, with twoloop's digests and files. If a file cannot be read, numba compiles again."""
+    """Numba's cache of a function, but with twoloop's digests and files. If a file is invalid, numba compiles again."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if cache_dir:  # created here, because numba would leave its access rights to the umask
+        if cache_dir:  # numba would create a folder that others may write
             with suppress(OSError):
                 make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
@@ -341,7 +341,7 @@ class _CodeCache(FunctionCache):
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        """Return the key of the file for a signature: the signature, the processor and the second digest."""
+        """Return the key of the file for a signature: signature, processor, and digest of closure variables."""
         return sig, codegen.magic_tuple(), self._key
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -355,7 +355,7 @@ class _CodeCache(FunctionCache):
         return overload
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Store machine code, or warn that this is impossible."""
+        """Store machine code on disk; warn if this is impossible."""
         try:
             super().save_overload(sig, data)
         except OSError:
@@ -363,7 +363,7 @@ class _CodeCache(FunctionCache):
 
 
 def sources_folder() -> Path:
-    """Return the folder of generated code: in NUMBA_CACHE_DIR if this is set, otherwise in the user's cache folder.
+    """Return the folder of generated code, in NUMBA_CACHE_DIR if this is set, otherwise in the user's cache folder.
 
     If other users can write this folder, return a replacement, see `trusted_folder`.
     """
@@ -379,13 +379,13 @@ def warn_once(text: str) -> None:
 
 
 def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Return a decorator like numba.njit(**options), with a cache on disk; the first call compiles the function."""
+    """Return a decorator like numba.njit(**options), but with twoloop's cache on disk. The first call compiles."""
 
     def decorate(function: Callable[..., Any]) -> Dispatcher:
         digests = digests_of(function)
         dispatcher = njit(**options)(give_unique_name(function, digests))
         if digests is not None:
-            # a callback that uses this function as a closure variable need not compile the function again
+            # `_use_twoloop_cache`, called if a callback calls this function, does not recompile code with these digests
             _COMPILED_DIGESTS[dispatcher] = digests
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _CodeCache(dispatcher.py_func, *digests, "")
@@ -395,12 +395,12 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 
 
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
-    """Return two digests of everything on which the machine code of a function depends; replace its helpers' caches.
+    """Return two digests of all values on which the machine code of a function depends; set up its helpers' caches.
 
-    The first digest covers the code, defaults and globals of the function, and the attributes of modules that it uses;
-    the second, its closure variables. If one of these values is a compiled helper, the values that the helper uses are
-    hashed, too, and twoloop's cache replaces numba's cache of the helper. Return None if a value may change without a
-    change of the digest.
+    The first digest is of the code, defaults and globals of the function, and of attributes of modules that it uses.
+    The second digest is of its closure variables. Compiled functions among these values are called helpers. The digests
+    include the values that a helper uses, and twoloop's cache replaces numba's cache of the helper. Return None if a
+    value could change without a change of the digests.
     """
     digests, helpers = _digests_and_helpers(function)
     for each in helpers:
@@ -409,9 +409,9 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the digests of `digests_of`, and the compiled helpers in an order in which callees come before callers."""
+    """Return the digests of `digests_of`, and the helpers; a helper comes after the helpers that it calls."""
     code, closure = Digest(), Digest()
-    closure.names = reachable_names(function)  # names of attributes of modules that the function may use
+    closure.names = reachable_names(function)  # if a value is a module, attributes with these names are hashed
     try:
         code.add_function(function, enclosed=False)
         closure.add(closure_values(function))
@@ -422,10 +422,10 @@ def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] 
 
 
 def helper(function: Callable[..., Any]) -> Any:
-    """Decorate a function that compiled callbacks call, like numba's `njit` with the cache of twoloop.
+    """Compile a function that compiled callbacks call, like numba's `njit`, but with twoloop's cache.
 
-    The function must not allocate arrays. So it does not need numba's runtime, whose counting of references would take
-    longer than the computation of a row of C_q.
+    The function must not allocate arrays. Then numba need not count references to arrays, which would take longer than
+    the computation of a row of C_q.
     """
     options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
     dispatcher = njit(**options)(function)
@@ -434,15 +434,15 @@ def helper(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-# digests of helpers at the time of their compilation
+# digests that helpers had when they were compiled
 _COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 
 
 def _use_twoloop_cache(helper: Any) -> None:
     """Replace numba's cache of a helper by twoloop's cache, and recompile the helper if its digests have changed.
 
-    Numba's cache does not notice changes in other files of functions that the helper calls. If numba has already loaded
-    outdated code of the helper, functions compiled later would use this code.
+    Numba's cache ignores changes of functions in other files that the helper calls, and numba may have loaded outdated
+    code from it. Without recompilation, callbacks compiled later would contain this code.
     """
     digests, compiled = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
     has_changed = compiled is not None and compiled != digests

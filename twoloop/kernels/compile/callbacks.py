@@ -3,9 +3,9 @@
 All kinds are defined in the table `KINDS`. Its entries determine the signature that numba compiles, the fields of
 `Functions` in the kernels, the methods and the documentation of `ConstrainedSystem`, and adapters for Python functions.
 
-If a function computes an index, for example into a table, every call checks all its indices. Without this check,
-machine code might read memory beyond the end of an array, or crash the process. A function whose indices are constants
-or loop counters is not checked in this way: its first call shows whether the indices are valid.
+If a callback computes an index, for example into a table, its machine code checks every index at every call. Without
+this check it might read memory beyond the end of an array, or crash the process. If all indices are constants or loop
+counters, there is no such check, because they are the same at every call: the first call shows whether they are valid.
 """
 
 import ast
@@ -33,15 +33,16 @@ from twoloop.kernels.compile.dependencies import (
 )
 from twoloop.kernels.compile.linking import add_signature, options_of
 
-BOUNDS_CHECK = {"boundscheck": True}  # numba's option to check all indices
-# built-in functions whose result counts as a constant or loop counter if all arguments are constants or loop counters
+BOUNDS_CHECK = {"boundscheck": True}  # option of numba: machine code raises IndexError for an invalid index
+# built-in functions: if all arguments are constants or loop counters, so is the result
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
 def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return the function to compile in place of `function`, and numba's options, with bounds checks if needed.
+    """Return the function to compile in place of `function`, and options of numba that check indices if necessary.
 
-    If a helper computes indices, this is a copy of `function` that calls bounds-checked copies of its helpers.
+    If a compiled helper of `function` computes indices, the returned function is a copy of `function`, which calls
+    copies of all its helpers; these copies check their indices.
     """
     helpers = [helper for place in frozen_locations(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
@@ -50,7 +51,7 @@ def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any],
 
 
 def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
-    """Compile `copy` with bounds checks if `original` is a compiled helper; otherwise, return `copy`."""
+    """If `original` is a compiled helper, compile `copy` so that it checks its indices; otherwise, return `copy`."""
     helper = python_function(original)
     if helper is None:
         return copy
@@ -59,7 +60,7 @@ def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
-    """Return whether a function may use indices other than constants and loop counters; True if there is no source."""
+    """Return True if a function may have other indices than constants and loop counters, or if it has no source."""
     if is_twoloop(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
@@ -71,7 +72,7 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
 
 
 def _computed_names(tree: ast.AST) -> set[str]:
-    """Return the names of variables in a function that may hold more than constants, loop counters and array sizes."""
+    """Return the variables of a function whose values may be other than constants, loop counters and array sizes."""
     computed = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
         n_before = len(computed)
@@ -92,7 +93,7 @@ def _computed_names(tree: ast.AST) -> set[str]:
 
 
 def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
-    """Return whether an expression contains only constants, loop counters and sizes of arrays."""
+    """Return True if an expression contains only constants, array sizes, and variables that are not in `computed`."""
     if node is None or isinstance(node, ast.Constant):
         return True
     if isinstance(node, ast.Name):
@@ -106,17 +107,17 @@ def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
     if isinstance(node, ast.Subscript):
         return _is_safe_index(node.value, computed) and _is_safe_index(node.slice, computed)
     if isinstance(node, ast.BinOp | ast.UnaryOp | ast.Tuple | ast.List | ast.Slice):
-        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # nodes that are not expressions
+        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # these nodes are no expressions: skip them
         return all(_is_safe_index(each, computed) for each in ast.iter_child_nodes(node) if not isinstance(each, kinds))
     return False
 
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # has the same memory layout as VECTOR
+READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # in memory, the same as VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
-# attribute of a system that gives the size of each vector that callbacks receive; lam: the multipliers of C = 0
+# for each vector that callbacks receive, the attribute of a system that is its size; lam: the multipliers of C = 0
 STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
@@ -124,16 +125,16 @@ STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 class CallbackKind:
     """Describe one kind of callback.
 
-    state : names of the arguments between t and p, which are keys of `STATE_SIZES`.
+    state : names of the arguments between t and p, such as ("q", "v"); keys of `STATE_SIZES`.
     output : name of the array that the callback fills.
-    shape : sizes of this array, as names of attributes of a system, such as "n_q".
+    shape : shape of this array, as names of attributes of a system, such as ("n_c", "n_q").
     meaning : meaning of the output in a few words, for messages.
     note : remarks for the documentation.
-    absent : what replaces a callback that is not given. "": nothing, because the callback must be given; "zeros":
-        a callback that changes nothing; "differences": a callback that computes differences of C, see `jacobian.py`;
-        "kernels": nothing, because the kernels compute differences themselves.
-    needed_by : name of a size of the system, "n_c" or "n_a"; the callback must be given if this size is above zero.
-    more : names and shapes of further arrays that the callback fills. Such a callback must be compiled.
+    absent : what replaces a callback that is not given. "": nothing, the callback is required; "zeros": a callback that
+        leaves its outputs at zero; "differences": a callback that computes finite differences of C (jacobian.py);
+        "kernels": nothing, because kernels compute finite differences themselves.
+    needed_by : "n_c" or "n_a": the callback is required if this size of the system is above zero; "": no condition.
+    more : names and shapes of further arrays that the callback fills. A callback with such arrays must be compiled.
     """
 
     state: tuple[str, ...]
@@ -147,7 +148,7 @@ class CallbackKind:
 
     @property
     def optional(self) -> bool:
-        """Return whether a system may be defined without this callback."""
+        """Return True if a system may be defined without this callback."""
         return self.absent != ""
 
     @cached_property
@@ -162,16 +163,16 @@ class CallbackKind:
 
     @cached_property
     def signature(self) -> Any:
-        """Return the signature with which kernels call a callback; in it, all arrays are writable."""
+        """Return the signature with which kernels call a callback: all arrays are writable."""
         return self._signature(VECTOR)
 
     @property
     def read_only_signature(self) -> Any:
-        """Return the signature that numba compiles, in which all arrays except for the outputs are read-only."""
+        """Return the signature for which numba compiles a callback: all arrays except the outputs are read-only."""
         return self._signature(READ_ONLY_VECTOR)
 
     def _signature(self, input_type: Any) -> Any:
-        """Return the signature in which all arrays except for the outputs have the type `input_type`."""
+        """Return a signature in which all input arrays have the type `input_type`, and all outputs are writable."""
         output_types = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
         return numba.types.void(f8, *[input_type] * len(self.state), input_type, *output_types)
 
@@ -363,7 +364,7 @@ if callback.__doc__:  # python -OO removes docstrings
     )
 
 
-# options of numba: a division by zero yields an infinity, as in the kernels
+# option of numba for callbacks: a division by zero yields an infinity or NaN, and no exception
 _NUMBA_OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 
 
@@ -374,9 +375,10 @@ def compile_callback(
     named_function: Callable[..., Any] | None = None,
     allocates: bool = True,
 ) -> Dispatcher:
-    """Compile, as a callback, a function that fills its arrays in place; raise TypeError if this is impossible.
+    """Compile a function as a callback, which fills its output arrays; raise TypeError if this is impossible.
 
-    `digests`: see `compile_cached`; `named_function`: function that error messages name; `allocates`: see `callback`.
+    `digests`: see `compile_cached`. `named_function`: function to name in error messages, if it is not `function`.
+    `allocates`: see `callback`.
     """
     compiled, more = add_bounds_checks(function)
     options = {**_NUMBA_OPTIONS, **more} if allocates else {**_NUMBA_OPTIONS, **more, "_nrt": False}
@@ -384,12 +386,12 @@ def compile_callback(
         digests = f"{digests[0]} {options}", digests[1]
     try:
         dispatcher = compile_cached(compiled, KINDS[kind].read_only_signature, digests, **options)
-    except Exception as error:  # numba raises its own errors, but its assertions may fail, too
+    except Exception as error:  # an error of numba, or a failed assertion in numba
         dispatcher = _compile_with_writable_inputs(kind, compiled, digests, named_function or function, error, options)
     else:
         add_signature(dispatcher, KINDS[kind].signature)
     if digests is not None:
-        # register the digest now, because values that the function uses may change later, but not its machine code
+        # register the digest now: values that the function uses may change later, but the machine code will not
         register_digest(dispatcher, f"{kind} {digests}")
     frozen_values(dispatcher, function)
     return dispatcher
@@ -403,9 +405,9 @@ def _compile_with_writable_inputs(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a callback with writable inputs, because its helpers may not accept read-only arrays.
+    """Compile a callback with writable input arrays, because its helpers may not accept read-only arrays.
 
-    Raise TypeError if the callback itself writes to its inputs. `error`: what compiling with read-only inputs raised.
+    Raise TypeError if the callback itself writes to its inputs. `error`: exception of compiling with read-only inputs.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)
@@ -420,13 +422,13 @@ def _compile_with_writable_inputs(
     ) from None
 
 
-# pattern of numba's message if a helper does not accept read-only arrays
+# numba's message matches this pattern if a helper does not accept read-only arrays
 _HELPER_REJECTS_READ_ONLY = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 
 @cache
 def zero_callback(kind: str) -> Dispatcher:
-    """Return a compiled callback that leaves its outputs at zero, to replace a missing optional callback."""
+    """Return a compiled callback that leaves its outputs at zero, in place of an optional callback that is missing."""
 
     def leave_zeros(t, q, p, out):
         pass
@@ -455,9 +457,9 @@ def _name_and_location(function: Callable[..., Any]) -> str:
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
-# pattern of an excerpt from a source file in numba's messages; the excerpt ends with a line that contains only ^
+# pattern of source excerpts in numba's messages; such an excerpt ends with a line that contains only ^
 _SOURCE_EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
-# pattern of the beginnings of lines in numba's messages that give no reason
+# lines of numba's messages that begin like this give no reason of an error
 _UNINFORMATIVE_LINE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"
@@ -465,14 +467,14 @@ _UNINFORMATIVE_LINE = re.compile(
 
 
 def _remove_colours(error: Exception) -> str:
-    """Return the text of an error without the codes that colour it in a terminal."""
+    """Return the message of an error without the control codes that colour it in a terminal."""
     return re.sub(r"\x1b\[[0-9;]*m", "", str(error))
 
 
 def _informative_line(error: Exception) -> str:
-    """Return the type of an error, and the last line of numba's message that gives a reason."""
+    """Return the type of an error, and the last line of numba's message that states a reason."""
     message = _remove_colours(error)
-    message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # >>> marks a signature without a match
+    message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # >>> precedes a rejected signature
     lines = [line.strip() for line in message.splitlines() if line and not line.startswith("    ")]
     useful = [line for line in lines if line and not _UNINFORMATIVE_LINE.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {useful[-1] if useful else message.strip()[:200]}"

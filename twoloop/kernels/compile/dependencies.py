@@ -1,8 +1,9 @@
 """Find the values on which the machine code of a function depends, to hash, compare or replace them.
 
-Numba freezes values when it compiles a function: globals, closure variables, defaults, attributes of modules, items of
-tuples, and compiled helpers. `Digest` hashes these values, `frozen_values` lists where they are stored, and
-`FunctionCopier` copies a function with other helpers.
+When numba compiles a function, it makes values part of the machine code, which we call frozen: globals, closure
+variables, defaults, attributes of modules, items of tuples, and compiled functions that it calls (helpers). `Digest`
+hashes these values, `frozen_values` lists where they are stored, and `FunctionCopier` copies a function with other
+helpers.
 """
 
 from __future__ import annotations
@@ -24,28 +25,28 @@ from numba.core.types import Type
 
 from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, options_of
 
-# libraries whose functions are hashed by name only; files of machine code also record the versions of numba and numpy
+# functions of these libraries are hashed by their names only; with other versions of numba or numpy, no file is valid
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-# largest number of code objects whose loaded names are cached. Runs create new functions with the same code; to read
-# the instructions of each again would take most of the time of tracing
+# the names that a code object loads are cached for at most this number of code objects. Runs create new functions with
+# the same code object; without the cache, reading its instructions would take most of the time of tracing
 MAX_CODES = 2000
-DIGEST_VERSION = 2  # part of all digests: increase it if machine code cached by earlier versions may be wrong
+DIGEST_VERSION = 2  # part of all digests: increase it to make all machine code cached by earlier versions invalid
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
-    """Return a digest of a text and of files, given as paths or modules."""
+    """Return one digest of a text and of the contents of source files, given by their paths or as modules."""
     digest = hashlib.sha256(text.encode())
     for source in sources:
         digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())
     return digest.hexdigest()
 
 
-_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # texts registered by `register_digest`
+_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # see `register_digest`
 
 
 def register_digest(callback: Dispatcher, text: str) -> None:
-    """Register a text; digests then hash this text in place of the callback's code and the values that it uses."""
+    """Register a text for a callback: digests hash this text, not the callback's code and the values that it uses."""
     _DIGEST_TEXTS[callback] = text
 
 
@@ -55,7 +56,7 @@ def closure_values(function: Any) -> list[Any]:
 
 
 class NotDigestible(Exception):
-    """Error for a value that may change without a change of its digest."""
+    """Error: a value cannot be hashed, because it may change without a change of its digest."""
 
 
 class Digest:
@@ -63,12 +64,12 @@ class Digest:
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
-        self.names: set[str] = set()  # names of the attributes of modules that the current function may use
-        self.positions: dict[tuple[int, str], int] = {}  # position of each value added so far, by its id and name
-        self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it calls
+        self.names: set[str] = set()  # attributes of modules to hash: names that the function being hashed may use
+        self.positions: dict[tuple[int, str], int] = {}  # serial number of each value added so far, by its id and name
+        self.helpers: list[Any] = []  # compiled helpers added so far; a helper comes after the helpers that it calls
 
     def add(self, value: Any) -> None:
-        """Add a value to the hash; raise NotDigestible if it may change without a change of the hash."""
+        """Add a value to the hash; raise NotDigestible if the value may change later without changing the hash."""
         self.hash.update(f"<{type(value).__qualname__}>".encode())
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
             self.hash.update(repr(value).encode())
@@ -116,7 +117,7 @@ class Digest:
                 self.helpers.append(helper)
 
     def _add_module(self, module: types.ModuleType) -> None:
-        """Add the name of a module; unless it is a library, also add its attributes that are listed in `names`."""
+        """Add a module's name and, unless it is a library, those of its attributes whose names are in `self.names`."""
         self.hash.update(module.__name__.encode())
         if not is_library(module.__name__):
             for name in sorted(self.names & set(vars(module))):
@@ -136,7 +137,7 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
-        """Register a value and return True if it is new; else hash the position of its first occurrence."""
+        """If a value is new, register it and return True; else hash the serial number of its first occurrence."""
         key = (id(value), name)
         if key in self.positions:
             self.hash.update(f"<again {self.positions[key]}>".encode())
@@ -146,19 +147,19 @@ class Digest:
 
 
 def names_of_code(code: types.CodeType) -> set[str]:
-    """Return the names of all globals and attributes that a code object and the functions within it use."""
+    """Return the names of all globals and attributes in a code object and in functions nested in it."""
     inner_codes = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*map(names_of_code, inner_codes))
 
 
 def globals_of(function: Any) -> dict[str, Any]:
-    """Return the globals that a function and functions within it load, by name; `math.log` loads the global `math`."""
+    """Return the values, by name, of the globals that a function and functions nested in it use."""
     names = {each.name for each in _loaded_names(function.__code__) if not each.free} & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
 
 def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names of all globals and attributes that a function and its compiled helpers use."""
+    """Return the names of all globals and attributes in a function and its compiled helpers; `seen`: ids to skip."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_of_code(function.__code__)
@@ -171,29 +172,30 @@ def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
 
 
 def is_library(module: str) -> bool:
-    """Return whether a module belongs to LIBRARIES, whose functions are identified by name."""
+    """Return True if a module belongs to LIBRARIES."""
     return module.partition(".")[0] in LIBRARIES
 
 
 def is_twoloop(module: str) -> bool:
-    """Return whether a module is part of twoloop or generated, so that its globals are constant and indices valid."""
+    """Return True if a module is part of twoloop or generated by it: its globals are constant, its indices valid."""
     return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
 
 
-# names of Python's instructions that load a global, or an attribute; LOAD_NAME occurs within a class
+# Python's bytecode instructions that load a global (LOAD_NAME in the body of a class), and that load an attribute
 LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
-FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback with the result of `frozen_values`
-NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that ignore the value that was loaded last
+FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback that stores the result of `frozen_values`
+# bytecode instructions that may stand between loading a variable and loading its attribute
+NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")
 
 
 class FrozenValue(NamedTuple):
     """Describe a value that a function uses, and where it is stored.
 
-    holder : cell or dict that contains the value, where another value may replace it later. None: the value cannot be
-        replaced, because it is a default or an item of a tuple.
+    holder : closure cell or dict that contains the value; another value may be stored there later. None: the value is a
+        default or an item of a tuple, which cannot be replaced.
     key : key of the value if the holder is a dict.
-    name : name in messages, such as "package.module.K" or "TABLES[0]".
+    name : name of the value in messages, such as "package.module.K" or "TABLES[0]".
     """
 
     holder: CellType | dict[str, Any] | None
@@ -203,7 +205,7 @@ class FrozenValue(NamedTuple):
 
 
 class _LoadedName(NamedTuple):
-    """Global (if `free`, closure) variable that a code object loads, and the attributes loaded from the variable."""
+    """Global (closure variable if `free`) that a code object loads, and the attributes that it loads from it."""
 
     free: bool
     name: str
@@ -211,10 +213,10 @@ class _LoadedName(NamedTuple):
 
 
 def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue, bytes | None]]:
-    """Return the values that numba has frozen in a compiled function, with the bytes of each value that is an array.
+    """Return the values that are part of the machine code of a compiled function.
 
-    The first call, just after the compilation, stores this list in an attribute of `compiled`. `function`: the original
-    function, if a copy of it was compiled. Other values have None in place of bytes.
+    Each value comes with its bytes if it is an array, else with None. The first call, just after the compilation,
+    stores the list in an attribute of `compiled`. `function`: the original function, if a copy of it was compiled.
     """
     values: list[tuple[FrozenValue, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
     if values is None:
@@ -228,9 +230,9 @@ def _array_bytes(value: Any) -> bytes | None:
 
 
 def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[FrozenValue]:
-    """Yield the values in a function and its helpers that numba freezes: numbers, arrays, text, functions, modules.
+    """Yield the values in a function and its helpers that become part of machine code, such as numbers and arrays.
 
-    Values in functions of twoloop are constants, and not yielded; but helpers that these functions call are searched.
+    Omit values in functions of twoloop, which never change; but search helpers that these functions call.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
@@ -247,7 +249,7 @@ def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[Fr
 
 
 def python_function(value: Any) -> FunctionType | None:
-    """Return the Python function of a compiled helper (`njit`, `register_jitable`, `vectorize`, `cfunc`), else None."""
+    """Return the Python function of a helper compiled by `njit`, `vectorize` etc.; None if `value` is no helper."""
     if isinstance(value, Dispatcher):
         return value.py_func  # type: ignore[no-any-return]
     if isinstance(value, FunctionType):
@@ -259,7 +261,7 @@ def python_function(value: Any) -> FunctionType | None:
 
 
 def _is_frozen(value: Any) -> bool:
-    """Return whether numba freezes a value of this type."""
+    """Return True if numba makes a value of this type part of machine code."""
     if isinstance(value, ModuleType):
         return not is_library(value.__name__)
     if isinstance(value, (np.ndarray, np.void)):
@@ -269,7 +271,7 @@ def _is_frozen(value: Any) -> bool:
 
 
 def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
-    """Yield a frozen value; if it is a tuple, also yield its items that can change."""
+    """Yield a value; if it is a tuple, also yield its items that can change: arrays, functions and tuples."""
     yield location
     if not isinstance(location.value, tuple) or id(location.value) in seen:
         return
@@ -299,10 +301,10 @@ def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
 
 
 def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
-    """Yield the attributes of a user's module, and of modules within this module, that a function uses.
+    """Yield the attributes of a user's module (`location`), and of modules within this module, that a function uses.
 
-    `attributes`: names loaded one after another, such as ("inner", "K") for `module.inner.K`. If there are none, the
-    module itself is assigned to a variable or passed to a helper; then all attributes listed in `names` are yielded.
+    `attributes`: names loaded one after another, such as ("inner", "K") for `module.inner.K`. If it is empty, the
+    module is assigned to a variable or passed to a helper; then yield all attributes whose names are in `names`.
     """
     if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
         return
@@ -316,7 +318,7 @@ def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], nam
 
 @lru_cache(MAX_CODES)
 def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
-    """Return the globals and closure variables that a code object and the functions within it load."""
+    """Return the globals and closure variables that a code object and functions nested in it load."""
     loaded_names: dict[_LoadedName, None] = {}
     current_name = None
     for each in dis.get_instructions(code):
@@ -333,10 +335,10 @@ def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
 
 
 class FunctionCopier:
-    """Copy functions, and replace the compiled helpers in their globals, defaults and closure variables.
+    """Copy functions; in copies, replace the compiled helpers in globals, defaults and closure variables.
 
     `wrap(copy, original)` returns the replacement of the helper `original`; `copy` is a copy of its Python function.
-    After the call of `wrap`, helpers that `copy` uses are replaced, too.
+    After this call, helpers that `copy` uses are replaced, too.
     """
 
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
@@ -344,7 +346,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value, or the value itself; `names`: attributes of modules to be replaced."""
+        """Return the replacement of a value, if any, else the value; replace attributes `names` of modules."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -356,11 +358,11 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return whether a copied function gets a replacement of this value: here, if it is a compiled helper."""
+        """Return True if copied functions get a replacement of this value; a derived class may choose other values."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
-        """Return a copy of a module with replacements of the attributes listed in `names`."""
+        """Return a copy of a module in which the attributes listed in `names` are replaced."""
         key = (id(module), names)
         if key not in self.copies:
             self.copies[key] = copy = types.ModuleType(module.__name__)
@@ -371,19 +373,19 @@ class FunctionCopier:
         return self.copies[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
-        """Return the replacement of a Python function that is not a compiled helper."""
+        """Return the copy of a Python function, as `wrap` returns it."""
         self._add_copy(function)
         return self.copies[id(function)]
 
     def _add_copy(self, helper: Any) -> None:
-        """Store the replacement of a helper or function in `self.copies`."""
+        """Store the replacement of a helper or Python function in `self.copies`, by the id of the original."""
         function = getattr(helper, "py_func", helper)
         used_names, names = names_of_code(function.__code__), frozenset(reachable_names(function))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.copies[id(helper)] = self.wrap(copy, helper)  # stored first: the values may include the helper itself
+        self.copies[id(helper)] = self.wrap(copy, helper)  # stored now: `copy` may use the helper itself
         for name in used_names & set(own_globals):
             own_globals[name] = self.replacement_of(own_globals[name], names)
         if function.__defaults__ is not None:

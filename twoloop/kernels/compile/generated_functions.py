@@ -1,8 +1,8 @@
-"""Compile LLVM functions generated for one mechanism, cache them on disk, and load them, without numba.
+"""Compile functions that twoloop generates for one mechanism as LLVM code; cache them on disk; do not use numba.
 
-For each function, numba would write, parse and optimise about a thousand additional lines of code, and its front end
-would take ten milliseconds for each line of source. Generated code consists of arithmetic on numbers in memory, already
-in a good order, so that LLVM can emit machine code after few optimisations.
+Numba would add about a thousand lines of code to each function, and take ten milliseconds for each line of its source.
+Generated code consists only of arithmetic on numbers in memory, already in a good order, so that LLVM can emit machine
+code after few optimisations.
 """
 
 from collections import defaultdict
@@ -15,17 +15,14 @@ from numba.core.registry import cpu_target
 
 from twoloop.kernels.compile.caches import UNWRITABLE_CACHE_WARNING, BoundedCache, CodeFiles, sources_folder, warn_once
 
-# whether this version of llvmlite can run chosen passes of LLVM instead of all passes
+# True if this version of llvmlite can run single optimisation passes of LLVM; False if it can only run all passes
 HAS_SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
 class GeneratedFunctions:
-    """Machine code of generated functions in memory, which is freed together with this object.
+    """Machine code of generated functions, in memory as long as this object exists.
 
-    content : result of `object_code`.
-
-    Fields:
-    addresses : addresses of the functions by name.
+    `content`: object code from `object_code`. The field `addresses` has the address of each function, by its name.
     """
 
     def __init__(self, names: list[str], content: bytes):
@@ -37,35 +34,35 @@ class GeneratedFunctions:
 
 
 class DeferredFunctions:
-    """Functions that are generated when one of their addresses is first used, because many runs do not use them."""
+    """Functions that are generated only when one of their addresses is first read: many runs do not use them."""
 
     def __init__(self, generate: Callable[[], GeneratedFunctions]):
         self._generate = generate
 
     @cached_property
     def functions(self) -> GeneratedFunctions:
-        """Generate the functions at the first access; they stay in memory as long as this object."""
+        """Functions, generated at the first access; they stay in memory as long as this object."""
         return self._generate()
 
     @property
     def addresses(self) -> dict[str, int]:
-        """Return the addresses by name."""
+        """Address of each function, by its name."""
         return self.functions.addresses
 
 
-_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # generated functions by kind, then by key
+_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # functions by kind, then by key
 
 
 def generated_functions(
     kind: str, stamp: str, key: str, write: Callable[[], tuple[list[str], str]], optimise: bool = True
 ) -> GeneratedFunctions:
-    """Return the functions of a module from memory or from the disk, or compile the text that `write` returns.
+    """Return the functions of one LLVM module from memory or from the disk; if they are not there, compile them.
 
     kind : name of the cache, which contains the newest MAX_ON_DISK modules on disk.
-    stamp : digest of the Python code that generates the functions.
+    stamp : digest of the Python code that generates the functions; a file with another stamp is out of date.
     key : digest of the expressions that the functions compute.
-    write : function that returns the names of the functions and the text of the LLVM module.
-    optimise : whether LLVM optimises the code.
+    write : function that returns the names of the functions, and the text of the LLVM module to compile.
+    optimise : True if LLVM has to optimise the code.
     """
     if (functions := _FUNCTIONS_IN_MEMORY[kind].get(key)) is not None:
         return functions  # type: ignore[no-any-return]
@@ -87,22 +84,22 @@ def generated_functions(
 
 
 def are_cached(kind: str, stamp: str, key: str) -> bool:
-    """Return whether the functions that `generated_functions` would return are in memory or on disk."""
+    """Return True if `generated_functions` need not compile: the functions are in memory or on disk."""
     return key in _FUNCTIONS_IN_MEMORY[kind] or _code_files(kind, stamp).has_file(_disk_key(key))
 
 
 def _code_files(kind: str, stamp: str) -> CodeFiles:
-    """Return the files of the cache `kind` on disk; `stamp`: see `generated_functions`."""
+    """Return the files on disk of one kind of functions; for `kind` and `stamp` see `generated_functions`."""
     return CodeFiles(sources_folder(), kind, (binding.llvm_version_info, stamp), True)
 
 
 def _disk_key(key: str) -> Any:
-    """Return the key of a file: numba's description of the processor, and the key of the functions."""
+    """Return the key of a file: numba's description of the processor, then `key` of `generated_functions`."""
     return (*cpu_target.target_context.codegen().magic_tuple(), key)
 
 
 def object_code(text: str, optimise: bool = True) -> bytes:
-    """Compile the text of an LLVM module to object code for this processor; optimise the module if `optimise`."""
+    """Compile the text of an LLVM module to object code for this processor; if `optimise`, optimise it first."""
     machine = _shared_target_machine()
     target = f'target triple = "{_target_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
@@ -120,9 +117,10 @@ def _shared_target_machine() -> Any:
 
 @cache
 def _two_pass_manager() -> tuple[Any, Any]:
-    """Return LLVM's pass manager with two passes, and its pass builder; cached, because LLVM leaks 300 kB per pass.
+    """Return a pass manager of LLVM with two optimisation passes, and its pass builder.
 
-    The two passes make the code of small mechanisms a tenth faster; all other passes together gain no further speed.
+    They make the code of small mechanisms a tenth faster; all other passes together gain no further speed. The result
+    is cached, because LLVM leaks 300 kB for each pass that is created.
     """
     manager = binding.create_new_module_pass_manager()
     manager.add_reassociate_pass()
@@ -131,7 +129,7 @@ def _two_pass_manager() -> tuple[Any, Any]:
 
 
 def _all_pass_manager() -> tuple[Any, Any]:
-    """Return LLVM's pass manager with all passes, and its pass builder, for one module; for llvmlite 0.44 only."""
+    """Return a pass manager with all passes of LLVM, and its pass builder, for one module; needed by llvmlite 0.44."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 
@@ -146,13 +144,13 @@ def _target_triple() -> str:
 
 
 def _new_target_machine() -> Any:
-    """Return a new LLVM description of the processor for which numba compiles; each engine needs its own."""
-    options: dict[str, Any] = {"opt": 1}  # level 2 takes a quarter longer and gains nothing in straight-line code
+    """Return a new LLVM target machine for the processor for which numba compiles; engines cannot share one."""
+    options: dict[str, Any] = {"opt": 1}  # level 2 takes a quarter longer, and code without branches gains nothing
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_target_triple()).create_target_machine(**options)
 
 
 def has_wide_vectors() -> bool:
-    """Return whether the processor for which numba compiles has vectors of eight doubles."""
+    """Return True if the processor for which numba compiles has vectors of eight doubles (AVX-512)."""
     _, _, features = cpu_target.target_context.codegen().magic_tuple()
     return "+avx512f" in features.split(",")

@@ -1,15 +1,16 @@
 """Compile each kernel together with its helpers; no machine code is emitted for helpers alone.
 
+A kernel is a compiled function with its own machine code, which Python can call; only compiled functions call helpers.
 By default, numba optimises each function together with all functions that it calls, and emits machine code for each. So
-a helper at depth five is optimised six times, and the machine code for the helper alone is never called. Here, helpers
-remain LLVM's intermediate code, and only the kernel that calls them is optimised. Passes of numba's front end that find
+a helper at depth five would be optimised six times, and the machine code for the helper alone would never be called.
+Here, helpers remain LLVM's intermediate code, and only kernels are optimised. Passes of numba's front end that find
 nothing to do in kernels, but take half of its time, are skipped. Loops are neither unrolled nor vectorised, unless a
 kernel requests it: most loops in kernels are short, so that tests of their length would cost more than is gained.
 
-While a kernel is compiled, `kernel_rules` replaces some of numba's functions; other functions compiled at that time are
-not affected. One replacement leaves out the code for negative indices, which kernels do not use: this code would hide
-from LLVM that elements are adjacent. The other replacements yield the same machine code in less time, by caching what
-numba's Python code would compute again and again during half of the compile time.
+While a kernel is compiled, `kernel_rules` replaces some functions of numba. One replacement leaves out the code for
+negative indices, which kernels do not use: this code would hide from LLVM that elements are adjacent. It has no effect
+on other functions compiled at that time. The other replacements yield the same machine code in less time: they cache
+results that numba would compute again and again.
 
 Modules that need private parts of numba to generate code import these parts from this module.
 """
@@ -43,9 +44,9 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "discard_compiled_code", "j
 
 
 def jitable_templates(function: Any) -> list[Any]:
-    """Return numba's templates of a function decorated by `register_jitable`, or an empty list for other functions.
+    """Return numba's implementations (templates) of a function decorated by `register_jitable`, else an empty list.
 
-    Numba compiles a function with this decorator again for each function that calls it.
+    Numba compiles such a function again for each function that calls it.
     """
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
@@ -53,34 +54,34 @@ def jitable_templates(function: Any) -> list[Any]:
     context.refresh()  # include functions registered since numba last compiled
     try:
         templates = list(getattr(context.resolve_value_type(function), "templates", ()))
-    except ValueError:  # numba does not support this function
+    except ValueError:  # numba cannot compile calls of this function
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     is_own = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
-    return templates if all(is_own) else []  # otherwise, another implementation may replace the function
+    return templates if all(is_own) else []  # [] if numba calls another implementation in place of the function
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
-    """Add a second signature to a compiled function, which can then be called with arguments of both signatures.
+    """Let a compiled function accept also the argument types of `signature`, without compiling it again.
 
-    The arguments of both signatures must have the same layout in memory.
+    These arguments must have the same layout in memory as those for which the function was compiled.
     """
     dispatcher: Any = function
     (compiled,) = dispatcher.overloads.values()
     dispatcher._insert([each._code for each in signature.args], compiled.entry_point, False)
     dispatcher.overloads[signature.args] = compiled._replace(signature=signature)
-    description = copy(compiled.fndesc)  # from this description, numba takes the types of arguments in calls
+    description = copy(compiled.fndesc)  # tells numba the types of arguments when compiled code calls the function
     description.argtypes = signature.args
     dispatcher.targetctx.insert_user_function(compiled.entry_point, description, [compiled.library])
 
 
 def options_of(helper: Any) -> dict[str, Any]:
-    """Return numba's options of a compiled helper, or of a function decorated by `register_jitable`."""
+    """Return the options with which numba compiles a helper (decorated by `njit` or `register_jitable`)."""
     return helper.targetoptions if isinstance(helper, Dispatcher) else jitable_templates(helper)[0]._jit_options
 
 
 def discard_compiled_code(function: Any) -> None:
-    """Discard the compiled code of a function decorated by `register_jitable`: numba compiles it at the next call."""
+    """Discard the compiled code of a function decorated by `register_jitable`, so that numba compiles it anew."""
     for template in jitable_templates(function):
         template._impl_cache.clear()
 
@@ -89,7 +90,7 @@ _numba_fix_index = arrayobj.fix_integer_index
 
 
 def _emit_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
-    """Emit code for an index of an array; in kernels and helpers, code for negative indices is left out."""
+    """Emit code that computes an array index; in kernels and helpers, omit the code for negative indices."""
     if kind.signed and isinstance(context.active_code_library, _HelperLibrary | _KernelLibrary):
         return context.cast(builder, index, kind, types.intp)
     return _numba_fix_index(context, builder, kind, index, size)
@@ -101,9 +102,9 @@ _numba_basic_indexing: Any = arrayobj.basic_indexing
 def _emit_element_address(
     context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any
 ) -> Any:
-    """Emit code for the address of an element of a contiguous array, without the code that only slices need.
+    """Emit code for the address of one element of a contiguous array; it is shorter than numba's general code.
 
-    For slices and other arrays, numba's own function emits the code.
+    In all other cases (slices, arrays that are not contiguous, bounds checks) call numba's own function.
     """
     is_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not is_element or options.get("boundscheck"):
@@ -116,21 +117,21 @@ def _emit_element_address(
 
 _numba_call_type: Any = BaseFunction.get_call_type
 _call_signatures: dict[Any, tuple[Any, Any]] = {}
-# options of numba and their texts, by the id of the options; while they are stored, no other object gets their id
+# objects with options of numba, and their texts, by the id of the object; stored objects keep their ids
 _option_texts: dict[int, tuple[Any, str]] = {}
 
 
 def _options_text(options: Any) -> str:
-    """Return the text of numba's options of a compilation, from a cache."""
+    """Return the options of a compilation as text, from a cache; the text is part of keys of other caches."""
     if id(options) not in _option_texts:
         _option_texts[id(options)] = options, repr(options and options._values)
     return _option_texts[id(options)][1]
 
 
 def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return the signature of a call of a function that numba implements, from a cache by argument types and options.
+    """Return the signature that a call of a function or operator of numba gets, from a cache by argument types.
 
-    Without this cache, numba tries all implementations of an operator at each call: a tenth of the compile time.
+    Without this cache, numba would try all implementations for each call, which takes a tenth of the compile time.
     """
     key = self, args, tuple(kws.items()), _options_text(ConfigStack.top_or_none())
     if key not in _call_signatures:
@@ -145,7 +146,7 @@ _type_sizes: dict[str, int] = {}
 
 
 def _cached_type_size(self: Any, kind: Any) -> Any:
-    """Return the size of a type in bytes, from a cache; without it, LLVM would parse a module for each variable."""
+    """Return the size (bytes) of an LLVM type, from a cache; otherwise LLVM would parse a module for each variable."""
     name = str(kind)
     if name not in _type_sizes:
         _type_sizes[name] = _numba_type_size(self, kind)
@@ -157,20 +158,20 @@ _inlined_code: dict[Any, Any] = {}
 
 
 def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """Return the intermediate code of an inlined function, from a cache; without it, numba analyses it at each call."""
+    """Return numba's intermediate code of an inlined function, from a cache, which saves an analysis for each call."""
     if (function, enable_ssa) not in _inlined_code:
         _inlined_code[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
     code = copy(_inlined_code[function, enable_ssa])
-    code.func_id = FunctionIdentity.from_function(function)  # each copy needs its own, for unique names of variables
+    code.func_id = FunctionIdentity.from_function(function)  # makes names of variables unique in each copy
     return code
 
 
-_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types of parts of a statement that contain no variables
+_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # parts of a statement that have these types contain no variables
 
 
 def _variables_of_statement(self: Any, part: Any) -> list[Any]:
-    """Return the variables in a statement or a part of it, with fewer calls of functions than numba's own code."""
+    """Return the variables in a statement or part of it; faster than numba's own function, with the same result."""
     if isinstance(part, ir.Var):
         return [part]
     if isinstance(part, ir.Inst):
@@ -189,9 +190,9 @@ _numba_load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_registries_once(self: Any) -> None:
-    """Install numba's implementations of Python and NumPy functions once; numba would import them for each function.
+    """Install numba's implementations of Python and NumPy functions in a copy of a compilation context.
 
-    All copies of a context share numba's registries of implementations, which also get new intrinsics.
+    Import their registries only for the first copy; numba would do so for each. All copies share these registries.
     """
     if self._registries:
         for registry in list(self._registries):
@@ -204,11 +205,11 @@ _LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of events tha
 
 
 def _skip_lock_events(report: Any) -> Any:
-    """Return a function that reports all events except events of locks, of which each kernel would cause thousands."""
+    """Return a function that reports events as `report` does, but omits those of locks: thousands for each kernel."""
     return lambda kind, *args, **named: None if kind in _LOCK_EVENTS else report(kind, *args, **named)
 
 
-# functions of numba that are replaced, as attributes of their owner: owner, name and replacement
+# functions of numba that `kernel_rules` replaces: owner (class or module), name of the attribute, replacement
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (Function, "get_call_type", _cached_call_type),
     (arrayobj, "fix_integer_index", _emit_index),
@@ -220,8 +221,8 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _skip_lock_events(event.start_event)),
     (event, "end_event", _skip_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # stands for an attribute that the owner inherits, but does not have itself
-_depth = [0]  # number of nested compilations of kernels
+_MISSING_ATTRIBUTE = object()  # original value of an attribute that the owner inherits, and does not define itself
+_depth = [0]  # number of contexts `kernel_rules` that are active; they may be nested
 
 
 @contextmanager
@@ -245,7 +246,7 @@ def kernel_rules() -> Iterator[None]:
 
 
 class _CodegenWithoutEnvironment:
-    """Wrapper of numba's code generator that stores no addresses of environments, because helpers are never loaded."""
+    """Numba's code generator, but without environments (Python data of loaded functions): helpers are not loaded."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -254,11 +255,11 @@ class _CodegenWithoutEnvironment:
         return getattr(self._codegen, name)
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Ignore the environment."""
+        """Do nothing."""
 
 
 class _HelperLibrary(CPUCodeLibrary):
-    """Intermediate code of a helper, which is linked into its callers."""
+    """LLVM's intermediate code of a helper, which becomes part of its callers."""
 
     @property
     def codegen(self) -> Any:
@@ -271,7 +272,7 @@ class _HelperLibrary(CPUCodeLibrary):
         pass  # the code is optimised as part of the callers
 
     def _get_module_for_linking(self) -> Any:
-        """Return the module itself; numba's own method returns a copy, but nothing else uses this module."""
+        """Return the module for linking, and no copy as numba's own method does: nothing else uses this module."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:
@@ -297,21 +298,21 @@ class _KernelLibrary(JITCodeLibrary):
 
 
 class _VectorizedLibrary(_KernelLibrary):
-    """Machine code of a kernel with long loops, which are vectorised."""
+    """Machine code of a kernel with long loops, which LLVM unrolls and vectorises."""
 
     vectorized = True
 
 
-# passes of numba that find nothing to do in kernels: for nested functions, expressions of whole arrays, overloads that
-# replace calls before code is generated, and code that is not allowed in compiled functions
+# passes of numba that would find nothing to do in kernels: they treat nested functions, expressions of whole arrays,
+# inlined overloads, and code that is not allowed in compiled functions
 _SKIPPED_PASSES = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
 
 class _Compiler(Compiler):
-    """Numba's compiler without the passes that kernels do not need."""
+    """Numba's compiler without the passes in _SKIPPED_PASSES."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return numba's pipelines without _SKIPPED_PASSES."""
+        """Return numba's lists of compiler passes without those in _SKIPPED_PASSES."""
         pipelines: list[Any] = super().define_pipelines()
         for pipeline in pipelines:
             pipeline.passes = [each for each in pipeline.passes if each[0] not in _SKIPPED_PASSES]
@@ -319,14 +320,14 @@ class _Compiler(Compiler):
 
 
 class HelperCompiler(_Compiler):
-    """Compile a helper, which only compiled functions may call; a call from Python would crash."""
+    """Compile a helper, which only compiled functions may call; a call from Python would crash the process."""
 
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
         super().__init__(typing_context, target_context, _HelperLibrary(target_context.codegen(), "helper"), *others)
 
 
 class KernelCompiler(_Compiler):
-    """Compile a kernel, and optimise it once, together with its helpers."""
+    """Compile a kernel; optimise it once, together with all helpers that it calls."""
 
     library: type[_KernelLibrary] = _KernelLibrary
 
@@ -336,7 +337,7 @@ class KernelCompiler(_Compiler):
         super().__init__(typing_context, target_context, library, *others)
 
     def compile_extra(self, function: Any) -> Any:
-        """Compile a function and all functions that it calls."""
+        """Compile a kernel while `kernel_rules` are active."""
         with kernel_rules():
             return super().compile_extra(function)
 
@@ -349,20 +350,20 @@ class VectorizingCompiler(KernelCompiler):
 
 @cache
 def entry_point(function: Dispatcher) -> Any:
-    """Return a callable for a compiled function that does not check the types of its arguments.
+    """Return a function that calls a compiled function without checking the types of arguments.
 
-    The check would take as long as two steps of a small mechanism. Arguments of wrong types crash the process.
+    Checking them would take as long as two steps of a small mechanism. Arguments of wrong types crash the process.
     """
     compiled: Any = next(iter(function.overloads.values()))
     return compiled.entry_point
 
 
-# addresses of the machine code of compiled functions; each function has one signature
+# addresses of machine code by compiled function; each function has one signature
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 
 def machine_code_address(function: Dispatcher, signature: Any) -> int:
-    """Return the address of the machine code of a compiled function, to be called with numba's calling convention."""
+    """Return the address of a compiled function's machine code; callers must use numba's calling convention."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
         _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

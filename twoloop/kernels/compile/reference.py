@@ -1,7 +1,7 @@
-"""Types of structures that are passed to kernels by reference, as one pointer to a table of addresses and lengths.
+"""Define types of structures of arrays and functions, which kernels receive as one pointer to a table of addresses.
 
-Numba passes a named tuple by value: a workspace of forty arrays becomes about three hundred arguments, which every call
-that LLVM does not inline writes to memory. A `Reference` has the members as attributes, but is a single argument.
+Numba would pass a named tuple of forty arrays as about three hundred arguments, and write them to memory at every call
+that LLVM does not inline. A structure of the type `Reference` also has named fields, but is a single argument.
 """
 
 import hashlib
@@ -22,24 +22,24 @@ from twoloop.kernels.compile.caches import BoundedCache
 from twoloop.kernels.compile.linking import machine_code_address
 
 NO_ELEMENTS: Mapping[str, Mapping[str, int]] = {}
-_REFERENCES: dict[str, Any] = {}  # all types `Reference`, by name
+_REFERENCES: dict[str, Any] = {}  # all objects `Reference`, by name
 
 
 def _reference_named(name: str) -> Any:
-    """Return the `Reference` of this name; pickle calls this function, so that it creates no copies of types."""
+    """Return the `Reference` of a given name; pickle calls this function, so that it never creates a second one."""
     return _REFERENCES[name]
 
 
 class Reference(types.Type):
-    """Type of a structure that is passed as a pointer to a table.
+    """Type of a structure of arrays and functions, which is passed as a pointer to a table.
 
-    The table contains the address and shape of each array, and the address of each function. Functions are compiled by
-    numba, or generated as LLVM code (see generated_functions.py). Arguments of generated functions that are arrays are
-    passed as addresses, and generated functions report no errors.
+    The table contains the address and shape of each array, and the address of each function. A function is compiled by
+    numba, or generated as LLVM code (see generated_functions.py). A generated function receives arrays as addresses of
+    their first elements, without shapes, and reports no errors.
 
     name : unique name of the type.
-    arrays : types of the fields that are arrays: contiguous, with one or two dimensions.
-    elements : for some arrays, the indices of elements that kernels read and write as attributes, by attribute names.
+    arrays : type of each array, by field; all arrays are contiguous, with one or two dimensions.
+    elements : for some arrays, by field: {name: index}. In kernels, `structure.name` is the element at this index.
     """
 
     def __init__(
@@ -49,13 +49,13 @@ class Reference(types.Type):
         _REFERENCES[name] = self
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
-        # (array, index) of each element that is an attribute
+        # for each element that is an attribute, by its name: the field of its array, and its index
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
-        self.llvm_functions: set[str] = set()  # names of the generated functions among `functions`
+        self.llvm_functions: set[str] = set()  # those names in `functions` that belong to generated functions
         self.offsets: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = BoundedCache()  # keys: tuples of functions; cached, because finding addresses is slow
+        self._addresses: Any = BoundedCache()  # addresses by tuple of functions; a cache, because finding them is slow
         for field, kind in self.arrays.items():
             self.offsets[field] = self.n_words
             self.n_words += 1 + kind.ndim
@@ -64,7 +64,7 @@ class Reference(types.Type):
         return _reference_named, (self.name,)
 
     def __repr__(self) -> str:
-        """Return the name and a digest of the layout; both become part of the keys of machine code on disk."""
+        """Return the name and a digest of the fields, for the keys of machine code on disk that uses this type."""
         fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
         fields += self.elements.items()
         fields += [
@@ -73,16 +73,16 @@ class Reference(types.Type):
         return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
     def add_function(self, field: str, signature: Signature) -> None:
-        """Add a field for a function compiled by numba, whose signature may contain this type."""
+        """Add a field for a function compiled by numba; its arguments may be of this type, too."""
         self.functions[field] = signature
         self.offsets[field] = self.n_words
         self.n_words += 1
         _define_call(self, field, signature)
 
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add fields for generated functions, whose signatures are given by name.
+        """Add fields for generated functions; `signatures`: signature of each function, by field.
 
-        A kernel has to check, before it calls such a function, that the function is not missing.
+        A structure may lack such functions (address 0): a kernel must check this before it calls one.
         """
         for field, signature in signatures.items():
             self.functions[field] = signature
@@ -92,15 +92,15 @@ class Reference(types.Type):
             _define_llvm_call(self, field, signature)
 
     def llvm_signature(self, field: str) -> tuple[str, list[str]]:
-        """Return the LLVM types, as text, of the result and of the arguments of a generated function."""
+        """Return the LLVM types, as text, of the result of a generated function and of its arguments."""
         signature = self.functions[field]
         return str(_llvm_type(signature.return_type)), [str(_llvm_type(kind)) for kind in signature.args]
 
     def table(self, values: Any) -> Any:
-        """Return the table (int64) for the object `values`, whose attributes are the arrays and functions of this type.
+        """Return the table (int64) of the structure whose arrays and functions are attributes of the object `values`.
 
-        The object must exist as long as the table is used. It holds function objects for functions compiled by numba
-        (None if missing), but addresses for generated functions (0 if missing).
+        An attribute is a function compiled by numba (None: missing), or the address of a generated function (0:
+        missing). The object `values` must exist as long as the table is used.
         """
         words: list[int] = []
         for field, kind in self.arrays.items():
@@ -128,9 +128,10 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Emit code that converts an argument from Python to a pointer.
+    """Emit code that converts a Python argument of a `Reference` type to a pointer.
 
-    The argument is an object with an attribute `address`, or the address itself: that saves a tenth of a microsecond.
+    The argument is the address of a table, or an object with this address as its attribute `address`. Passing the
+    address saves a tenth of a microsecond.
     """
     python_type = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -149,7 +150,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any) -> Any:
-    """Emit code that loads a word of a table; LLVM may assume that this word never changes."""
+    """Emit code that loads the word `offset` of a table; LLVM may assume that the word never changes."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), offset)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -158,7 +159,7 @@ def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any)
 
 @infer_getattr
 class _FieldTypes(AttributeTemplate):
-    """Types of the attributes of a `Reference`, for numba."""
+    """Tell numba the type of each field or element of a `Reference`."""
 
     key = Reference
 
@@ -178,7 +179,7 @@ class _FieldTypes(AttributeTemplate):
 
 
 def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    """Emit code for the address of the array element that the attribute `field` stands for."""
+    """Emit code for the address of the array element that kernels access as the attribute `field`."""
     array, index = typ.elements[field]
     item_type = context.get_data_type(typ.arrays[array].dtype)
     data = _load_word(context, builder, pointer, typ.offsets[array], item_type.as_pointer())
@@ -187,17 +188,17 @@ def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: 
 
 @lower_setattr_generic(Reference)
 def _store_element(context: Any, builder: Any, sig: Any, args: Any, field: str) -> None:
-    """Emit code that stores a number in the array element that the attribute `field` stands for."""
+    """Emit code that stores a number in the array element that kernels access as the attribute `field`."""
     pointer, value = args
     builder.store(value, _element_address(context, builder, sig.args[0], pointer, field))
 
 
 @lower_getattr_generic(Reference)
 def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    """Emit code that returns the value of a field: numba's structure of an array or, for a function, the pointer."""
+    """Emit code for reading an attribute of a structure: an array element, an array, or (for a call) a function."""
     if field in typ.elements:
         return builder.load(_element_address(context, builder, typ, pointer, field))
-    if field in typ.functions:  # `lower_call` loads the address of the function from the table
+    if field in typ.functions:  # return the table: `lower_call` loads the address of the function from it
         return pointer
     kind, offset = typ.arrays[field], typ.offsets[field]
     item_type = context.get_data_type(kind.dtype)
@@ -216,7 +217,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # stays in registers; numba's helper would use memory
+    for name, value in fields.items():  # keeps the values in registers; numba's own function would use memory
         index = model.get_field_position(name)
         element = ir.Constant(array.type.elements[index], None) if value is None else value
         array = builder.insert_value(array, element, index)
@@ -224,7 +225,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
 
 
 def _define_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define how numba calls the function in the field `field` of a `Reference`, if numba compiled this function."""
+    """Define the code of calls of the function in a field of a `Reference`, if the function is compiled by numba."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
@@ -238,7 +239,7 @@ def _define_call(typ: Reference, field: str, signature: Signature) -> None:
         return value
 
 
-_LLVM_TYPES = {  # LLVM types by numba's types
+_LLVM_TYPES = {  # LLVM types by types of numba
     types.float64: ir.DoubleType(),
     types.int64: ir.IntType(64),
     types.boolean: ir.IntType(1),
@@ -252,7 +253,7 @@ def _llvm_type(kind: Any) -> Any:
 
 
 def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define how numba calls the function in the field `field` of a `Reference`, if this function was generated."""
+    """Define the code of calls of the function in a field of a `Reference`, if the function is generated."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
