@@ -178,7 +178,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # result of `_shared_sums`; until then an empty dict, because `_shared_sums` calls `_factors`, which reads it
+        # result of `_shared_sums`; until then an empty dict: `_shared_sums` calls `_factors`, which reads this dict
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -340,7 +340,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code that computes coefficient 0 of the results, and stores coefficient 0 of factors in `row`."""
+        """Write code for coefficient 0 of the results of `operations`; store coefficient 0 of factors in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -471,14 +471,14 @@ class _Row:
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store `value`, a coefficient of the factor `key`; `when` = "if used": only if products have this factor."""
+        """Store a coefficient of the factor `key`; if `when` is "if used", only if products have this factor."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value
             self.emit.store(value, self.base, index)
 
     def load(self, index: int) -> Value:
-        """Return the coefficient of factor number `index`."""
+        """Return the coefficient of a factor in this row; `index`: index of the factor."""
         return self._stored[index] if index in self._stored else self.emit.load(self.base, index)
 
 

@@ -96,7 +96,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Return the value of a polynomial at x; `coefficients`: lowest power first. Pairs of terms run in parallel."""
+        """Return the value of a polynomial at x, by pairs of terms in parallel; `coefficients`: lowest power first."""
         square, terms = self.builder.operation("fmul", x, x), [self.load_constant(each) for each in coefficients]
         pairs = [self.fma(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -270,7 +270,7 @@ def write(
     emit: Callable[..., Any],
     emitter: Callable[..., Emitter] = Emitter,
 ) -> None:
-    """Add the function `name` to a module; `kind`: types of its result and arguments; `emit`: writes its body."""
+    """Add the function `name` to a module; `kind`: types of its result and arguments; `emit` writes its body."""
     builder = module.function(name, *kind)
     builder.ret(emit(emitter(builder), *builder.arguments))
 

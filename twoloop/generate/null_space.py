@@ -43,7 +43,7 @@ class Factors:
     conditions : for each row of G (index `n` and later), a pair of positive expressions: the magnitude of its pivot,
         and the magnitude that this pivot would have if G had no other rows. If the first is less than a small fraction
         of the second, the row nearly depends on other rows, and results are invalid.
-    mass_pivots : pivots of the rows of M (index below `n`). If M is positive definite, they are positive or constants.
+    mass_pivots : pivots of the rows of M (index below `n`). If M is positive definite, all but constants are positive.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -73,7 +73,7 @@ class Factors:
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a pivot block; `own_pivots`: pivot of a row if G had only this row; None for M."""
+        """Return the inverse of a pivot block; `own_pivots`: pivot of each row of G alone, None for rows of M."""
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -121,7 +121,7 @@ def solve(blocks: Sequence[Block], rhs: Sequence[Affine]) -> list[Affine]:
 
 
 def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products; if all first factors are multiples of one expression, multiply only once by it."""
+    """Return the sum of products; products whose first factors are multiples of each other share a multiplication."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -318,7 +318,7 @@ class DependentCoordinates:
 def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations (n_q,), and pairs of expressions: T^T M T is regular if the first is larger in each."""
+    """Return the accelerations, and pairs of expressions; the reduced mass matrix is regular if first > second."""
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]

@@ -27,7 +27,7 @@ CANCELLATION_LIMIT = 8.0 * 2.0**-52
 NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY_FUNCTIONS, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # keys: names in NumPy; values: functions by Python's operators only
+OPERATORS: dict[str, Callable[..., Any]] = {  # names in NumPy; functions in terms of Python's operators
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,
@@ -108,7 +108,7 @@ class ParameterTape(SymbolicObject):
         return ((self._atom_indices[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """Return a number as a sum of terms: a dict from the Powers of each term to its coefficient."""
+        """Return a number as a sum of terms; keys: Powers (products of powers of atoms); values: coefficients."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (i, exponent), *other_powers = number.powers
@@ -123,7 +123,7 @@ class ParameterTape(SymbolicObject):
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates Powers for the values `parameters` of all parameters.
+        """Return a function that evaluates Powers (products of powers of atoms) for given values of all `parameters`.
 
         If `parameters` is (n_runs, n_p), the function returns an array (n_runs,), or one number for all runs.
         """
@@ -255,7 +255,7 @@ def _product(a: float, b: float) -> float:
 
 
 def _power(base: float, exponent: float) -> float:
-    # a power with a fractional exponent becomes an atom: multiplying exponents would make (x^2)^0.5 x, not |x|
+    # a power with a fractional exponent becomes an atom: (x^2)^0.5 is |x|, but the product of exponents would yield x
     if type(exponent) is Parameter or not exponent.is_integer():
         return _record_function("power", base, exponent)
     assert isinstance(base, Parameter)
@@ -291,7 +291,7 @@ def apply_function(name: str, *arguments: Any) -> Any:
 def _record_function(name: str, *numbers: float) -> Parameter:
     tape = _tape_of(*numbers)
     arguments = tuple((x.powers, x.scale) if isinstance(x, Parameter) else ((), x) for x in numbers)
-    with np.errstate(all="ignore"):  # a generic value may be outside the domain of the function
+    with np.errstate(all="ignore"):  # the function may be undefined at the random value
         value = float(FUNCTIONS[name](*map(float, numbers)))
     return Parameter(value, tape, 1.0, tape.atom((name, arguments)))
 

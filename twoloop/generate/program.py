@@ -178,7 +178,7 @@ class OperationTable(NamedTuple):
 
     @classmethod
     def from_results(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
-        """Return the table that computes `results` from `n_inputs` inputs; keys: indices of results."""
+        """Return the table that computes the expressions `results` (keys: their indices) from `n_inputs` inputs."""
         needed = graph.quantities_for(results.values())
         node_of = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node_of[i]) for i in needed]  # type: ignore[misc]
@@ -284,7 +284,7 @@ class Coefficients:
         return self._formulas
 
     def indexed_terms(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
-        """Return terms and a constant in which each number is a literal (0, 1 or -1), or a Coefficient in an array."""
+        """Return terms and a constant in which each number is a literal (0, 1, -1), or a Coefficient (in an array)."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
         numbers = self._indexed_terms.get(key)
         if numbers is None:

@@ -1,7 +1,7 @@
 """Write the program for the Taylor series of a mechanism's motion.
 
 The motion satisfies G v + (C_t, b) = 0 and M a + G^T lam = Q. G = [C_q; A] are the rows of all constraints, C_t
-and b their rates at v = 0, and lam the multipliers. taylor_step.py solves these equations order by order.
+and b the parts of their rates that do not depend on v, and lam the multipliers. taylor_step.py solves these equations.
 
 An operation is "early" if it depends on time and coordinates only, as for G and M, and "late" if it depends on
 velocities, too. In G v and G^T lam + M a, terms that share a factor become one product.
@@ -136,7 +136,7 @@ def series_program(
 ) -> SeriesProgram:
     """Trace the callbacks of a system and return its series program.
 
-    `equations`: traces to which the products are added; None: new traces. `independent`: indices of the rows of G that
+    `equations`: traces whose graph the program extends; None: new traces. `independent`: indices of the rows of G that
     the program contains; None: all rows.
 
     Raise Untraceable if a callback cannot be traced; the message names the callback and the reason.
@@ -226,7 +226,7 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return key, scale, first, second: factor * multiplier = scale * (first * second); multiples have equal keys."""
+    """Return key, scale, first, second: factor * multiplier = scale * first * second; multiples share a key."""
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier
 
@@ -294,7 +294,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: index of each quantity there."""
+    """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: quantities in the program."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)

@@ -83,7 +83,7 @@ def forces_may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bo
 
 
 def _dependence(system: ConstrainedSystem, force_was_traced: bool) -> Dependence | None:
-    """Return the cached analysis of a system; None if callbacks cannot be traced, or might store the symbols."""
+    """Return the cached analysis of a system; None if callbacks cannot be traced, or might store symbols."""
     if system.called_in_python and not force_was_traced:
         return None
     try:

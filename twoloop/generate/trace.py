@@ -1,8 +1,8 @@
 """Trace callbacks: run them in Python on symbols; functions of `math` and `numpy` are replaced by symbolic ones.
 
 A callback must do with symbols exactly what it does with numbers. So a function that may treat symbols differently
-raises an exception if it is called with a symbol; the message names the function. Even if the callback catches the
-exception, it is not traced. Differences that tracing cannot detect, such as a changed global variable, are found by
+raises an exception if it is called with a symbol; the message names the function. A callback that catches this
+exception is not traced, either. Differences that tracing cannot detect, such as a changed global variable, are found by
 comparing numbers (`traced_values.py`).
 
 `Equations` returns the result of every callback of one system as an array of expressions. If a callback is missing,
@@ -81,7 +81,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
 
 
 def convert_to_expressions(graph: Graph, values: Any) -> Any:
-    """Convert the entries of an array that a callback filled or returned to expressions, in place; return the array."""
+    """Replace the entries of an array, which a callback filled or returned, by expressions; return the array."""
     for index in np.ndindex(values.shape):
         entry = values[index]
         if type(entry) is not Affine:
@@ -382,7 +382,7 @@ class Equations:
         return symbol_array(time_derivative.differentiate(expr) for expr in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return gamma = -d/dt(G v + r) at constant v; `rows`, `rates`: kinds of G and r (C_q, C_t, or A, b)."""
+        """Return -d/dt(G v + r) at constant v; `rows`, `rates`: callbacks for G and r (C_q and C_t, or A and b)."""
         direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
         gamma = self.expressions(rates)
@@ -459,7 +459,7 @@ class TraceCache:
         self._results: dict[Any, Any] = {}
         # results of `_scaled_products`; keys: id(array); the arrays are stored, too, so that no other gets the same id
         self._arrays: dict[int, tuple[Any, ScaledProducts]] = {}
-        self._tracing_lock = RLock()  # one lock for all traces, because they record on one tape
+        self._tracing_lock = RLock()  # one lock for all traces, because they share one ParameterTape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
         """Return the traced callbacks of a system, with their own copy of the graph, which the caller may extend."""
@@ -469,7 +469,7 @@ class TraceCache:
         return traced.copy()
 
     def magnitudes(self, parameters: Array) -> Array:
-        """Return the magnitude of the parameters of each class; class k (or -k) has the index k - 1."""
+        """Return the common magnitude of the parameters of each class, see TraceCache; class k has the index k - 1."""
         return np.abs(parameters[self._first_of_class])
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
@@ -539,7 +539,7 @@ def derive_cached(
 
 
 def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return what `make` derives from `cache`, specialized for `system`; if this fails, return the exception."""
+    """Return what `make` derives from `cache`, specialized for `system`; if this fails, return an Untraceable."""
     try:
         result = cache.remembered(key, partial(make, cache))
         return result.specialize(
@@ -565,7 +565,7 @@ def share_checked_bounds(system: ConstrainedSystem) -> None:
 
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the result of `trace_cache_of`; the system stores it at the first call."""
+    """Return the trace cache that a system shares with others, see `trace_cache_of`; the system keeps it."""
     return system.remembered(("trace cache", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
@@ -599,7 +599,7 @@ def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
 
 
 class ParameterArrays:
-    """Arrays of numbers that replace arrays of expressions; `write` updates all of them to new parameters."""
+    """Arrays of numbers that replace arrays of expressions in parameters; `write` updates them to new parameters."""
 
     def __init__(self) -> None:
         # keys: id(array of expressions); values: this array, which must exist as long as its id is used; its numbers

@@ -41,17 +41,17 @@ MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run:
 # Between them, `_is_systematic` decides
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 CLEAR_DIFFERENCE = 1e-6
-# `_is_systematic` compares at N_NEIGHBOURS states near a state; their relative distance from it is up to PERTURBATION
+# `_is_systematic` compares at N_NEIGHBOURS states, at relative distances up to PERTURBATION from a given state
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
-MARGIN = 0.01  # a CheckedRegion extends beyond the checked states by this fraction of their range, less than most steps
-MARGIN_AT_REST = 1e-9  # further extension, as a fraction of the largest range, for coordinates that do not move
+MARGIN = 0.01  # a CheckedRegion exceeds the checked states by this fraction of their range; most steps are longer
+MARGIN_AT_REST = 1e-9  # fraction of the largest range that is added to this, for coordinates at rest, whose range is 0
 
 
 class CallbackTraces:
     """Traces of callbacks as an operation table, to be compared with calls of the callbacks.
 
     graph : the graph of the trace, whose first inputs are t, q and v.
-    exprs : arrays of expressions by kind of callback. None: `graph.traced`, for the callbacks that the system has.
+    exprs : arrays of expressions by kind of callback; None: those in `graph.traced`, for callbacks that the system has.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, exprs: Mapping[str, Any] | None = None):
@@ -260,7 +260,7 @@ class CheckedRegion:
         self.bounds = self._ranges
 
     def is_comparison_due(self) -> bool:
-        """Return whether the next run has to compare callbacks at all sampled states: runs 1, 2, 4, 8, ... have to."""
+        """Return whether calls and traces must be compared at all sampled states of the next run: in runs 1, 2, 4, 8, ..."""
         return (self._runs + 1) & self._runs == 0
 
     def count_run(self) -> None:
@@ -276,7 +276,7 @@ class CheckedRegion:
         return states[outside.any(axis=1)] if outside.any() else states[:0]
 
     def contains_parameters(self, parameters: Array) -> bool:
-        """Return whether all parameters are within the checked ranges, extended by MARGIN."""
+        """Return whether all parameters are within the checked ranges, extended by the fraction MARGIN."""
         if self._parameters is None:
             return False
         smallest, largest = self._parameters
