@@ -1,6 +1,6 @@
-"""Common parts of implicit Runge-Kutta steps: `options`, prediction of stages, error at jumps, layout of `memory`.
+"""Share functions and array layouts among implicit Runge-Kutta steps: `options`, constants of a method, and `memory`.
 
-Compiling the implicit steps takes a third of the time of the first run, so each is loaded when needed (`LazyStep`).
+Compiling these steps takes a third of the time of the first run, so each is imported when needed (`LazyStep`).
 """
 
 from importlib import import_module
@@ -13,18 +13,21 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-MAX_STEP_RATIO = 3.0  # the previous step's polynomial predicts the stages of a step at most this multiple as long
-END_ERROR_WEIGHT = 0.01  # factor on `estimate_end_error` beside Richardson's estimate, which misses jumps at ends only
+MAX_STEP_RATIO = 3.0  # the previous step's polynomial predicts the stages of a step that is at most this times as long
+# Richardson's error estimate misses a force that jumps near an end of a step. So the error of a step is the larger of
+# Richardson's estimate and this factor times `estimate_end_error`
+END_ERROR_WEIGHT = 0.01
 
-# indices of the scalars in `options`. After the scalars, `options` contains A and A @ A (s, s each), b, b @ A and c (s
-# each), and the weights (s each) that extrapolate from the nodes to 0 and to 1
+# indices of the scalars in `options` of a method with s stages and the Butcher tableau A, b, c. After the scalars,
+# `options` contains A and A @ A (s, s each), b, b @ A and c (s each), and the weights (s each) with which values at the
+# nodes c are extrapolated to the beginning and to the end of the step
 (
     STAGES,  # number of stages s
     INNER_TOL,  # tolerance of the inner loop
     OUTER_TOL,  # tolerance of the outer loop
-    EXTRAPOLATION,  # 1 / (2^order - 1); 0: no extrapolation
-    OUTER_TEST,  # 1: test (32) of the paper also covers dependent coordinates; 0: only independent ones
-    POWER,  # order - 1
+    EXTRAPOLATION,  # factor 1 / (2^order - 1) of Richardson's extrapolation; 0: the new state is not extrapolated
+    OUTER_TEST,  # coordinates whose changes test (32) of the paper limits. 1: all coordinates; 0: independent ones
+    POWER,  # order of the method minus 1, see `estimate_end_error`
     N_SCALARS,
 ) = range(7)
 
@@ -39,7 +42,7 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of an implicit Runge-Kutta method with the tableau A, b, c; see STAGES etc. above."""
+    """Return the array `options` (see STAGES) of an implicit Runge-Kutta method with the Butcher tableau A, b, c."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     vectors = (b, b @ A, c, lagrange_values(c, 0.0), lagrange_values(c, 1.0))
@@ -55,7 +58,7 @@ def lagrange_values(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]
 
 @inlined
 def tableau_of(options):
-    """Return the number of stages s, and views of `options`: A, A @ A, b, b @ A, c."""
+    """Return s, the number of stages, and views of `options`: A, A @ A, b, b @ A and c of the Butcher tableau."""
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))
@@ -66,7 +69,7 @@ def tableau_of(options):
 
 @merged
 def middle_node(c):
-    """Return the node of a tableau, an entry of c (s), that is nearest to 1/2."""
+    """Return the entry of c (s), the nodes of a Butcher tableau, that is nearest to 1/2."""
     nearest = 0
     for j in range(c.size):
         if abs(c[j] - 0.5) < abs(c[nearest] - 0.5):
@@ -76,7 +79,10 @@ def middle_node(c):
 
 @compiled
 def interpolate(c, theta, A_stage, weights, a):
-    """Store in a (n) the value at theta of the polynomial through the points (c_j, A_stage[j]); overwrite `weights`."""
+    """Interpolate the stage accelerations A_stage (s, n) at the nodes c (s); store their values at theta in a (n).
+
+    Nodes and theta are times relative to the step size. `weights` (s) is scratch.
+    """
     s = c.size
     for j in range(s):
         product = 1.0
@@ -93,13 +99,14 @@ def interpolate(c, theta, A_stage, weights, a):
 
 @compiled
 def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
-    """Estimate the error of a step, in units of the tolerances (eq. 26), from the stage accelerations (s, n).
+    """Estimate the error of a step, in units of the tolerances (eq. 26), from the stage accelerations A_stage (s, n).
 
-    The stage accelerations have a range w of order h. At the ends of the step, the polynomial through the stages
-    differs from the accelerations by e, of order h^s. If terms of successive orders decrease by a constant factor f,
-    then e = w f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, even between an end of
-    the step and the nearest stage, the terms do not decrease, and the estimate is h w: steps then shrink until the jump
-    no longer matters. Methods need a second estimate, too: e may pass through zero, with errors up to 100 tolerances.
+    Let w be the range of the stage accelerations. Let e be the largest difference, at the ends of the step, between the
+    polynomial through the stage accelerations and the accelerations. If each term of the polynomial is f times the
+    previous term, then e = w f^(s - 1), and the error of the method is about h w f^(order - 1): this is the estimate.
+    If the force jumps, even between an end of the step and the nearest stage, e is as large as w, and the estimate is
+    h w: steps then shrink until the jump no longer matters. Methods need a second estimate, too: e may be zero by
+    chance, with errors up to 100 tolerances.
     """
     s, n = A_stage.shape
     offset = N_SCALARS + 2 * s * s + 3 * s
@@ -125,54 +132,57 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     return largest
 
 
-# indices of the scalars that newton_options adds to `options`, counted from `newton_options_index`. After them,
-# `options` contains the weights e (s) of the error estimate and then, for each eigenvalue of A = T diag(eigenvalues)
-# T^-1: its real and imaginary part, its row of T^-1 and its column of T (of both, s real parts, then s imaginary parts)
+# indices of the scalars in the part of `options` for Newton's method, counted from the beginning of this part. After
+# the scalars, the part contains the weights (s) of the error estimate. Then follow, for each eigenvalue of the matrix A
+# of the Butcher tableau, A = T diag(eigenvalues) T^-1 with the eigenvectors T: its real and imaginary part, its row of
+# T^-1 and its column of T (of both, s real parts, then s imaginary parts)
 (
     N_REAL,  # number of real eigenvalues of A
-    N_PAIRS,  # number of pairs of complex eigenvalues
-    GAMMA0,  # first real eigenvalue or, if there is none, smallest absolute value of an eigenvalue
-    TESTS_VELOCITIES,  # 1: the error test includes velocities
+    N_PAIRS,  # number of pairs of conjugate complex eigenvalues of A
+    GAMMA0,  # first real eigenvalue of A; if there is none, smallest magnitude of an eigenvalue
+    TESTS_VELOCITIES,  # 1: velocity errors are compared with the tolerances; 0: their effects, see velocity_errors.py
     N_EIGEN_SCALARS,
 ) = range(5)
 
 # indices of the scalars in `memory`
 (
-    HAS_TRIAL,  # 1: TRIAL contains the stage accelerations of the last attempt; diagonal_step.py: an attempt was made
-    H_TRIAL,  # step size of the last attempt (s)
+    HAS_TRIAL,  # 1: the block TRIAL is filled by the last attempted step. In diagonal_step.py, 1: a step was attempted
+    H_TRIAL,  # size of the last attempted step (s)
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step (s)
-    HAS_JACOBIAN,  # 1: the stored derivatives may be used
+    HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
     IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at the step's end
-    PARTITION_NUMBER,  # number (GENERATION in data/indices.py) of the partition that the stored derivatives belong to
-    H_FACTORED,  # step size in the factored systems (s); 0: none are factored
-    CONTRACTION,  # ratio of the last two corrections of Newton's method
-    HAS_DAMPING,  # 1: forces depend on v; 0: J_v and D are zero
-    IS_SYMMETRIC,  # kind of factors in diagonal_step.py. 1: L D L^T of a symmetric matrix; 0: L U
-    ERROR_DURATION,  # duration (s) of an error of the velocities, see velocity_errors.py; 0: unknown
-    DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
+    PARTITION_NUMBER,  # value of w.generation, the number of a partition, when the stored derivatives were computed
+    H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
+    CONTRACTION,  # ratio of the last correction of Newton's method to the one before
+    HAS_DAMPING,  # 1: forces depend on velocities; 0: they do not, so that derivatives by velocities are zero
+    IS_SYMMETRIC,  # kind of factors in diagonal_step.py. 1: L D L^T, because the matrix is symmetric; 0: L U
+    ERROR_DURATION,  # time (s) for which a velocity error changes positions, see velocity_errors.py; 0: unknown
+    DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step; 0: it has not
     N_MEMORY_SCALARS,
 ) = range(14)
-# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous step and of the attempted step,
-# residuals, positions and velocities of the stages
+# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous step and of the attempted step; of the
+# stages, the residuals of Newton's method, the positions and the velocities
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-# indices of the vectors (n_q) after the blocks: accelerations at a displaced state, displaced positions and velocities,
-# estimated errors of positions and velocities, and positions, velocities and accelerations at the middle stage
+# indices of the vectors (n_q) after the blocks. For finite differences: accelerations at a displaced state, and the
+# positions and velocities of this state. Then estimated errors of positions and of velocities; and positions,
+# velocities and accelerations at the middle stage
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# indices of the parts of w.matrices, n_q^2 numbers each, in dense and banded storage (see newton_systems.py for J_q, K)
-# - DERIVATIVE_Q: J_q, or T^T K T if diagonal_step.py factors its own matrices; banded: the band of K, rows of C_q, w.D
-# - DERIVATIVE_V: J_v, or T^T D T; banded: the band of D
-# - FILTER: factors of the real matrix that filters errors
-# - SYSTEMS: two parts for each eigenvalue of A, the factors of its complex matrix; in diagonal_step.py, T^T M T
+# indices of the parts of w.matrices, n_q^2 numbers each. The matrices are defined in newton_systems.py: J_q and J_v
+# (derivatives of accelerations by q and v), K and D (derivatives of forces by q and v), T (velocities v = T v_i)
+# - DERIVATIVE_Q: J_q. In banded storage: the band of K, then copies of C_q and w.D. In diagonal_step.py: T^T K T
+# - DERIVATIVE_V: J_v. In banded storage: the band of D. In diagonal_step.py: T^T D T
+# - FILTER: factors of the real matrix with which error estimates are filtered
+# - SYSTEMS: two parts for each eigenvalue of A, with the factors of its complex matrix; in diagonal_step.py, T^T M T
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], tests_velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the part of `options` for Newton's method, which follows the result of `options_array`; see N_REAL.
+    """Return the part of `options` for Newton's method (see N_REAL), which follows the result of `options_array`.
 
-    A must be diagonalizable. `tests_velocities`: whether the error test includes velocities.
+    A, b, c: Butcher tableau; A must be diagonalizable. `tests_velocities`: value of TESTS_VELOCITIES.
     """
     values, T = np.linalg.eig(A)
     inverse = np.linalg.inv(T)
@@ -187,9 +197,10 @@ def newton_options(
 
 
 def _error_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
-    """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)) with stage values Y_j.
+    """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)).
 
-    The estimate is the difference between an embedded quadrature of order s and the method (Hairer & Wanner II,
+    f: right-hand side of y' = f(y). y_n: state at the beginning of the step. Y_j: stages. The estimate is the
+    difference between an embedded quadrature of order s and the method with weights b and nodes c (Hairer & Wanner II,
     (IV.8.16)). If c_1 = 0, f(Y_1) is f(y_n), and the embedded quadrature omits the last stage.
     """
     s = len(b)
@@ -205,18 +216,18 @@ def _error_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float
 
 
 def memory_size(n_systems: int, s: int, n_q: int) -> int:
-    """Return the length of `memory`: scalars, blocks, vectors, pivots, two complex scratch vectors, s weights."""
+    """Return the length of `memory` with s stages and `n_systems` linear systems (see `count_systems`)."""
     return N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + 5 + n_systems) * n_q + s
 
 
 def n_matrices(n_systems: int) -> int:
-    """Return the number of parts of w.matrices, each with n_q^2 entries, for `n_systems` linear systems."""
+    """Return the number of parts of w.matrices (see SYSTEMS) for `n_systems` linear systems of Newton's method."""
     return SYSTEMS + 2 * n_systems
 
 
-# `options` of a diagonally implicit method begin with the options of Newton's method for one stage, A = [[gamma]]; the
-# index of N_REAL is then NEWTON_OFFSET. At DIAGONAL_OFFSET follow: number of stages, A, c, b - b^, jump weights, and 1
-# if steps with an error estimate end at the result of the embedded formula, else 0 (see `diagonal_options`)
+# `options` of a diagonally implicit method begin with those of an implicit method of one stage, whose matrix A is
+# [[gamma]]; the part for Newton's method (N_REAL) begins at the index NEWTON_OFFSET. At the index DIAGONAL_OFFSET, the
+# number of stages follows, then the arguments A, c, `weights`, `jump_weights` and `embedded` of `diagonal_options`
 NEWTON_OFFSET = N_SCALARS + 2 + 5
 DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 
@@ -231,11 +242,12 @@ def diagonal_options(
     tests_velocities: bool,
     embedded: bool,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of a diagonally implicit method with the tableau A (s, s), c (s).
+    """Return the array `options` of a diagonally implicit method with the Butcher tableau A (s, s), c (s).
 
-    The first row of A is zero, the other diagonal entries are gamma, and the last row is b. `weights` (s): b - b^,
-    where b^ are the weights of the embedded formula. `jump_weights` (s): weights of the error estimate for
-    accelerations that jump. `embedded`: whether steps end at the result of the embedded formula, of higher order.
+    The first row of A is zero, the other diagonal entries are gamma, and the last row is b, the weights of the method.
+    `weights` (s): b minus the weights of the embedded formula. `jump_weights` (s): weights of the stage accelerations
+    in the error estimate for accelerations that jump. `embedded`: True if steps with an error estimate end at the
+    result of the embedded formula, which has a higher order.
     """
     A, c, weights, jump_weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, jump_weights))
     gamma = A[-1, -1]
@@ -255,13 +267,13 @@ def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
 
 @merged
 def newton_options_index(s):
-    """Return the index in `options` of N_REAL, where the part by `newton_options` begins, for s stages."""
+    """Return the index in `options` at which the part for Newton's method (see N_REAL) begins, for s stages."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
 @merged
 def count_systems(options, s):
-    """Return the number of linear systems of Newton's method: real eigenvalues of A plus pairs of complex ones."""
+    """Return the number of linear systems of Newton's method: one for each real eigenvalue of A, and for each pair."""
     offset = newton_options_index(s)
     return int(options[offset + N_REAL] + options[offset + N_PAIRS])
 
@@ -294,21 +306,21 @@ def as_matrix(numbers, m):
 
 @inlined
 def system_storage(w, n, k):
-    """Return a complex view (n^2) of the two parts of w.matrices that store the linear system for eigenvalue k of A."""
+    """Return a complex view (n^2) of the two parts of w.matrices for eigenvalue k of the tableau's A, see SYSTEMS."""
     start = (SYSTEMS + 2 * k) * n * n
     return w.matrices[start : start + 2 * n * n].view(np.complex128)
 
 
 @inlined
 def _storage_after_vectors(memory, s, n, k):
-    """Return a view (2 n) of `memory` that begins k * n entries behind the vectors."""
+    """Return a view (2 n) of `memory` that begins k * n numbers behind the end of the vectors (see A_NEW)."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view (n) of `memory`: pivot indices of the filter matrix (k = 0) or of eigenvalue k - 1 (k > 0)."""
+    """Return a view (n) of `memory`: pivot indices of the factors of the filter (k = 0), or of system k - 1 (k > 0)."""
     return _storage_after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 
@@ -320,7 +332,7 @@ def complex_vector(memory, s, n, n_systems, index):
 
 @kernel(ATTEMPT)
 def request_loading(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Return an `Attempt` with the code NOT_LOADED: the caller of the kernel then loads the step, and tries again."""
+    """Take no step, but return an `Attempt` with the code NOT_LOADED: the caller loads the method, and tries again."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
@@ -328,7 +340,7 @@ PLACEHOLDER_STEP = Step(request_loading, commit_nothing)
 
 
 class LazyStep(NamedTuple):
-    """Name of a Step and of its module in twoloop.kernels, such as "steps.newton_step", to be imported when needed."""
+    """Reference to a Step that is imported when needed: its name, and its module, such as "steps.newton_step"."""
 
     module: str
     name: str

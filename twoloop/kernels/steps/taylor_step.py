@@ -1,18 +1,18 @@
 """Step by the Taylor series of the motion, computed from the index-3 equations themselves.
 
-With G = [C_q; A] the motion satisfies G v + (C_t, b) = 0 and M a + G^T lam = Q. The coefficients of order k of a and
-lam, and of order k + 1 of v, follow from all lower ones: they solve
+Let A v + b = 0 be the non-holonomic constraints, and G = [C_q; A]. The motion satisfies G v + (C_t, b) = 0 and
+M a + G^T lam = Q. The Taylor coefficients a_k and lam_k of order k follow from those of lower order by a linear system,
 
     M_0 a_k + G_0^T lam_k = r_k,    G_0 a_k = c_k,
 
 whose matrix has already been factored for the accelerations at the beginning of the step. Each order requires one
 solution, and no derivatives of the constraints beyond G (J. D. Pryce's structural analysis, BIT 41 (2001), 364-394,
-finds these orders for any equations). The parts of r and c that depend on G, M and Q are computed by a program, see
+finds these orders for any equations). The right-hand sides r_k and c_k are computed by a program, see
 `twoloop.generate.series`, with recurrences for Taylor coefficients (R. E. Moore, Interval Analysis (1966), ch. 11).
 
 The order of the series depends on the tolerance. The step size is such that the last terms of the series equal the
-tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). The unit of time is the previous step size,
-so that no power of a short time underflows. The end of the step is projected onto the constraints.
+tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). Coefficients are scaled by a unit of time,
+about the step size, so that they neither underflow nor overflow. The end of the step is projected onto the constraints.
 
 If there is no generated code, the program of the series is interpreted, order by order. `f`: kit, `w`: workspace.
 """
@@ -39,47 +39,54 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 
-# indices of the scalars in `options`; the offsets of the program's arrays follow, then these arrays (integers: as bits)
+# indices of the scalars in `options`. After the scalars, `options` contains the offsets of the arrays of the series
+# program, then these arrays; an array of integers is stored by its bits, as if it contained floating-point numbers
 (
-    ORDER,  # order of the series of q
+    ORDER,  # order of the Taylor series of the positions q
     THETA,  # a projection has converged if its last correction is at most this, see `project`
-    N_NODES,  # number of quantities of the program
-    EARLY_WIDTH,  # number, padded, of early operations, which depend on t and q only
-    LATE_WIDTH,  # number, padded, of late operations, which depend on v, too
-    KEEP,  # 1: consecutive steps evaluate the series about the first state, to interpolate within a step
+    N_NODES,  # number of quantities of the program: inputs, unknowns and results of operations
+    EARLY_WIDTH,  # number of early operations (they depend on t and q only), rounded up to a multiple of eight
+    LATE_WIDTH,  # number of late operations (they depend on velocities, too), rounded up to a multiple of eight
+    KEEP,  # 1: all steps use the series about the first state, to interpolate in a longer step; 0: each has its own
     N_SCALARS,
 ) = range(7)
-# indices of the arrays of a table (OperationGroups) and of a list of sums (Sums), see twoloop.generate.series
+# indices of the arrays of an operation table (OperationGroups in twoloop.generate.series): its groups, and the first
+# arrays of the two lists of affine expressions (Sums) that are the arguments of its operations
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
+# indices of the arrays of a list of affine expressions (Sums)
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # index of one more array of a list of sums: where the result of each sum is stored
-# indices, among the program's arrays, at which the tables of early and late operations and the two lists of sums begin
+SUM_INDICES = N_SUMS  # index of one more array of such a list: for each expression, the index where its value is stored
+# indices, among the arrays of the series program, of the first arrays of its four parts: tables of early and of late
+# operations; lists of expressions for the rows of G v + (C_t, b) = 0, and of Q - G^T lam - M a = 0
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
-KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
+# columns of GROUPS: kind of operation; then first and end index of the group's operations, of the further terms of
+# their first arguments, and of the further terms of their second arguments
+KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
-# indices of the scalars in `memory`, before two series of q (ORDER + 1, n_q each) and the arrays of `array_views`
+# indices of the scalars in `memory`. Two series of q (ORDER + 1, n_q each) and the arrays of `array_views` follow.
+# "Current series": the series about the beginning of the step. "Attempt": a step that may be rejected
 (
     HAS_SERIES,  # 1: the current series has been computed
-    CURRENT,  # index, 0 or 1, of the current series: the series about the beginning of the step
+    CURRENT,  # index of the current series among the two stored series: 0 or 1
     UNIT,  # unit of time of the current series (s)
     NEXT_UNIT,  # unit of time (s) of the series about the end of the last attempt
-    ALLOWED_SIZE,  # step size that the current series allows, in units of UNIT
+    ALLOWED_SIZE,  # largest step size that the current series allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
-    PASSED,  # with KEEP = 1: time (s) since the state about which the series is computed
-    TARGET,  # index, 0 or 1, of the series that `compute_coefficients` computes
-    # factor on ALLOWED_SIZE that keeps ends of steps near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
+    PASSED,  # if KEEP = 1: time (s) from the state about which the series is computed to the beginning of the step
+    TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
+    # factor on step sizes after which ends of steps lie near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
-    SUSPECTED,  # 1: the run has not passed the time SUSPECT yet
+    SUSPECTED,  # 1: SUSPECT is a time that the run has not passed yet; 0: there is no such time
     SUSPECT,  # time (s) within a rejected step at which the defect was too large
     N_MEMORY_SCALARS,
 ) = range(14)
 
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
-    """Return the length of `memory`; `early` and `late`: EARLY_WIDTH and LATE_WIDTH."""
+    """Return the length of `memory`; n_rows: number of constraints; n_nodes, early, late: N_NODES and both widths."""
     n_orders = order + 2
     scratch = n_orders * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
     return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch + n_q
@@ -87,7 +94,7 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 @inlined
 def series_accelerations(memory, n):
-    """Return a view of the last n entries of `memory`, which contain accelerations computed from the series."""
+    """Return a view of the last n numbers of `memory`: the accelerations that `_evaluate_series` has computed."""
     return memory[memory.size - n :]
 
 
@@ -104,14 +111,14 @@ def _float_array(options, index):
 
 @inlined
 def series_view(memory, order, n, index):
-    """Return a flat view of series `index` (0 or 1) of q, row by row: a view as a matrix would cost a function call."""
+    """Return series `index` (0 or 1) of q as a vector, which is faster than a matrix: order k of q_j at k * n + j."""
     begin = N_MEMORY_SCALARS + int(index) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
 
 @merged
 def sum_of_products(X, Y, K, total):
-    """Store sums of X[j, m] * Y[K - j, m] over all j with 0 < j < K in total[m], for eight indices m at a time."""
+    """Store the sum of X[j, m] * Y[K - j, m] over 0 < j < K in total[m] for all m; eight sums are computed at once."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for j in range(1, K):
@@ -136,7 +143,10 @@ def sum_of_products(X, Y, K, total):
 
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
-    """Store the arguments of the operations in group g in `out`: sums of `values`, without their constants."""
+    """Store in `out` an argument of each operation of a group: an affine expression of `values` without its constant.
+
+    `sums`: index of the list of these expressions. `g`: offset of the group in `groups`. `more`: its column, see KIND.
+    """
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
@@ -148,7 +158,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store each of the `sums` of `values`, without its constant and multiplied by `scale`, in `out`."""
+    """Evaluate a list of affine expressions of `values` without their constants; store `scale` times each in `out`."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -161,9 +171,10 @@ def _store_sums(options, sums, scale, values, out):
 
 @compiled
 def start_operations(options, table, values, z, x, y):
-    """Store the Taylor coefficients of order 0 of the results z and arguments x and y of a table of operations.
+    """Store the Taylor coefficients of order 0 of z, x and y for all operations of a table.
 
-    Pending products, whose second factor depends on the accelerations, are set to zero.
+    z: results. x, y: the two series whose products give the next coefficients of z; for a product, its arguments.
+    A pending product (its second factor depends on the accelerations) is set to zero.
     """
     groups = _integer_array(options, table + GROUPS)
     constant, constant_2 = (
@@ -202,7 +213,7 @@ def start_operations(options, table, values, z, x, y):
 
 @merged
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
-    """Store the Taylor coefficients of order K > 0 of the results z and arguments x and y of a table of operations.
+    """Store the Taylor coefficients of order K > 0 of z, x and y (see `start_operations`) for operations of a table.
 
     x0 and y0 are the coefficients of order 0; `total` is the result of `sum_of_products` for order K. The second factor
     of a pending product has no coefficient of order K yet: the term with this coefficient is left out.
@@ -247,17 +258,17 @@ def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
 
 @merged
 def _fill_second_factors(options, table, values, y):
-    """Store the second factors of pending products in y: sums of `values`, which include accelerations."""
+    """Store the second factors of pending products in y, after the accelerations in `values` have been computed."""
     groups = _integer_array(options, table + GROUPS)
     _fill_arguments(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
 
 
 @inlined
 def array_views(options, memory, n, n_rows):
-    """Return views N, X1, Y1, X2, Y2, total1, total2, r and c of `memory`.
+    """Return views N, X1, Y1, X2, Y2, total1, total2, r and c of `memory`; row k of a matrix belongs to order k.
 
-    N: coefficients of the quantities. X1, Y1, total1: coefficients of both arguments of early operations, and sums of
-    their products; X2, Y2, total2: the same for late operations. r (n) and c (n_rows): right-hand sides.
+    N: coefficients of the quantities. X1, Y1, total1: the series x and y of early operations (see `start_operations`),
+    and sums of their products. X2, Y2, total2: the same for late operations. r (n), c (n_rows): right-hand sides.
     """
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
@@ -282,7 +293,7 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Store coefficients of t and q up to order 1, and of v and early operations of order 0; set r and c to zero."""
+    """Store Taylor coefficients: of t and q up to order 1; of v and early operations of order 0. Clear r and c."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -295,7 +306,7 @@ def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
 
 @merged
 def integrate_coefficients(K, unit, N, series, a):
-    """Store in N and `series` coefficient K of v and K + 1 of q: the integrals of coefficient K - 1 of a (n)."""
+    """Integrate `a` (n), the coefficients of order K - 1 of the accelerations: store order K of v and K + 1 of q."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
     for j in range(n):
@@ -306,7 +317,7 @@ def integrate_coefficients(K, unit, N, series, a):
 
 @merged
 def finish_series(w, order, series):
-    """Count the evaluations in w.counters; return DONE, or NOT_FINITE if `series` is not finite in its last order."""
+    """Count the evaluations; return DONE, or NOT_FINITE if a coefficient of the last order is not finite."""
     w.n_evaluations += order - 1
     n = series.size // (order + 1)
     for j in range(n):
@@ -317,9 +328,9 @@ def finish_series(w, order, series):
 
 @compiled
 def compute_coefficients(f, w, options, memory, t, state, unit):
-    """Compute the series about `state` at t, in the unit of time `unit` (s), as series TARGET; return a code.
+    """Compute the Taylor series TARGET about `state` at t, with the unit of time `unit` (s); return DONE or NOT_FINITE.
 
-    The linear equations of each order are solved by the factors in w.
+    The linear system of each order is solved with the factors of its matrix in w.
     """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = array_views(options, memory, n, n_rows)
@@ -359,28 +370,29 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-# distance of ends of steps from the constraints, before the projection, that step sizes aim at; 1: the allowed distance
+# step sizes are chosen so that, before the projection, the distance of a step's end from the constraints is about this
+# fraction of the allowed distance
 TARGET_PREDICTION_ERROR = 0.3
-# near the beginning of a step, the series is exact, so that its defect there is a rounding error. A later defect up to
-# MAX_NOISE allowed defects counts as a rounding error, too, if it is at most NOISE_RATIO times the defect there
+# near the beginning of a step, the series is exact, so that its defect there is a rounding error. A later defect counts
+# as a rounding error, too, if it is at most MAX_NOISE allowed defects and NOISE_RATIO times the defect at NEAR_BEGIN
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
-# the times at which the defect is checked shift by this fraction of their spacing at each attempt: multiples of the
-# golden section have evenly distributed fractional parts, so that no time within a step is missed for long
+# the defect is checked at equidistant times within a step. At each attempt, they shift by this fraction of their
+# spacing. Multiples of the golden section have evenly distributed fractional parts: so no time is missed for long
 GOLDEN_SECTION = 0.6180339887498949
 MAX_DEFECT = 1e300  # replaces an infinite defect, which means that a function has no finite value within the step
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
-TOO_SHORT = 2.0  # error that rejects a first step because the series allows a much longer step
+TOO_SHORT = 2.0  # reported error (above 1: rejected) of a first step that is much shorter than the series allows
 
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, index):
-    """Compute the series about `state` at t, the result of the last projection, as series `index`; return a code."""
+    """Compute the Taylor series about `state`, the result of the last projection, as series `index`; return a code."""
     n = w.Q.size
     memory[TARGET] = index
-    if f.is_generated == 1 and w.used_general == 0.0:  # generated code leaves no factors in w
+    if f.is_generated == 1 and w.used_general == 0.0:  # generated code, unlike general code, stores no factors in w
         q, v, a = state[:n], state[n : 2 * n], series_accelerations(memory, n)
         code = f.general(f, w, EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
         if code != DONE:
@@ -390,7 +402,7 @@ def _compute_series(f, w, options, memory, t, state, unit, index):
 
 @merged
 def _max_step(tolerances, series, unit, order, n):
-    """Return the largest step size, in units of `unit` (s), with which the last two terms are within the tolerances."""
+    """Return the largest step size, in units of `unit` (s), at which the last two terms are within the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -399,7 +411,7 @@ def _max_step(tolerances, series, unit, order, n):
         weight_v = 1.0 / (atol * unit + rtol * abs(series[n + j]))
         last = max(last, abs(series[row + j]) * max(weight_q, order * weight_v))
         before = max(before, abs(series[row_before + j]) * max(weight_q, (order - 1) * weight_v))
-    log_inverse = -np.inf  # logarithm of the reciprocal of the result
+    log_inverse = -np.inf  # logarithm of 1 / result
     if last > 0.0:
         log_inverse = np.log(last) / order
     if before > 0.0:
@@ -444,7 +456,7 @@ def _evaluate_series(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the defect at t + s h, relative to the allowed defect (infinity if evaluation fails); q, v, a: scratch."""
+    """Return the ratio of the defect at the time t + s h to the allowed defect, or infinity; q, v, a: scratch."""
     series_a = series_accelerations(memory, q.size)
     _evaluate_series(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
     if evaluate_without_projection(f, w, t + s * h, q, v, a) != DONE:
@@ -454,7 +466,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
 
 @compiled
 def _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-    """Return whether `defect` is a rounding error: at most NOISE_RATIO times the defect near the step's beginning."""
+    """Return True if `defect` (relative to the allowed defect) is a rounding error, see MAX_NOISE; q, v, a: scratch."""
     if defect > MAX_NOISE:
         return False
     noise = 0.0
@@ -465,9 +477,10 @@ def _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, 
 
 @compiled
 def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the first defect within the step that is too large, or 0; raise w.defect to the largest defect before it.
+    """Return the first defect above 1 (relative to the allowed defect) within the step, or 0 if there is none.
 
-    The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
+    The defect is evaluated at the time SUSPECT, and at times that differ from attempt to attempt. The time of a defect
+    above 1 becomes SUSPECT. w.defect becomes the largest of the other defects.
     """
     max_gap, shift = tolerances[DEFECT_GAP], memory[ATTEMPTS] * GOLDEN_SECTION % 1.0
     n_points = 0
@@ -495,7 +508,7 @@ def _factor_after_large_defect(defect, order):
 
 @kernel(COMMIT)
 def commit_taylor(f, w, options, memory, tolerances, accepted):
-    """After an accepted step, make the series about its end the current series, by which the next step is computed."""
+    """If the step was accepted, make the series about its end the current series, with which the next step begins."""
     if accepted and memory[TRIED] == 1.0:
         memory[CURRENT] = 1.0 - memory[CURRENT]
         memory[UNIT], memory[ALLOWED_SIZE] = memory[NEXT_UNIT], memory[NEXT_ALLOWED_SIZE]
@@ -525,12 +538,13 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
-        error = x / memory[ALLOWED_SIZE]  # the error is about a power of this ratio, so at most 1 if the ratio is
+        error = x / memory[ALLOWED_SIZE]  # the error of the step is about a power of this ratio: both exceed 1 together
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
-        was_near_singular = w.nearly_singular != 0.0  # true once the run has come near a singular position
-        checks_defect = w.near_now == 0.0  # near singular positions, accelerations off the constraints are wrong
+        was_near_singular = w.nearly_singular != 0.0  # True if the run has ever come near a singular position
+        # near a singular position, check no defect: the series is off the constraints, where accelerations are wrong
+        checks_defect = w.near_now == 0.0
         w.near_now = 0.0 if checks_defect else 2.0
         ratio_to_gap = gap_ratio(tolerances, h)
         if ratio_to_gap > 0.0 and was_near_singular:
@@ -554,7 +568,8 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     distance = prediction_error(w, tolerances, h, q, v, q1)
     memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
     if distance > 0.0:
-        # if MAX_GROWTH or a force ahead has shortened the step, x / ALLOWED_SIZE counts as at least 1 / MAX_GROWTH
+        # x / ALLOWED_SIZE, the ratio of the step size to the allowed one, counts as at least 1 / MAX_GROWTH: it may be
+        # small because MAX_GROWTH or a force ahead has shortened the step
         allowed_factor = (TARGET_PREDICTION_ERROR / distance) ** (1.0 / order)
         memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / MAX_GROWTH) * allowed_factor)
     if distance > 1.0:

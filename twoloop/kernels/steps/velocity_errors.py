@@ -1,13 +1,14 @@
 """Estimate the position errors that velocity errors cause, for methods whose steps are longer than vibrations.
 
-A velocity error e changes the positions until e changes its sign or decays. Its duration is sqrt(|e| / |J J e|), where
-J is the Jacobian of (v, F), with accelerations F. So an error due to a force that jumps within a step lasts long and
-counts, and an error of fast vibrations hardly counts. There are two exceptions:
+A velocity error e changes the positions until e changes its sign or decays. This takes about sqrt(|e| / |J J e|), the
+duration of e. J is the Jacobian of the equations of motion (q, v)' = (v, F), where F are the accelerations. So an error
+due to a force that jumps within a step lasts long and counts, and an error of fast vibrations hardly counts. There are
+two exceptions:
 
 - The duration belongs to the fastest component of e. If a stiff damper acts beside a contact, the component in slow
   directions lasts much longer. A filter with the time constant of several steps leaves only this component.
-- If J was computed by differences before a contact began or ended, the duration is wrong, although Newton's method
-  still converges. `derivatives_agree` detects this. (`w`: workspace, `f`: kit)
+- If J was computed by finite differences before a contact began or ended, the duration is wrong, although Newton's
+  method still converges. `derivatives_agree` detects this. (`w`: workspace, `f`: kit)
 """
 
 import numpy as np
@@ -20,22 +21,23 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# a velocity error that changes as slowly as the motion is not due to a vibration: it keeps its sign in later steps, so
-# that position errors add up. To allow for this, its duration is multiplied by up to this factor
+# if a velocity error changes as slowly as the motion, it is not due to a vibration. It keeps its sign in later steps:
+# position errors add up. To allow for this, its duration is multiplied by up to this factor
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, in units of tolerances[GAP]
+LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, relative to the longest time between evaluations
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
-FAST_DURATION = 20.0  # a velocity error may change fast if its duration is below this multiple of z = h gamma
-OUTDATED_CHANGE = 0.3  # J counts as outdated if its relative change exceeds this
+FAST_DURATION = 20.0  # a velocity error may change fast if its duration is below this many times z = h gamma
+OUTDATED_CHANGE = 0.3  # the Jacobian J counts as outdated if its relative change exceeds this
 
 
 @compiled
 def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once, filtered_twice, state, new_state, a1):
     """Return the largest effect of a velocity error, in units of the tolerances, see `velocity_error`.
 
-    `unfiltered` (n_dof) is the velocity error; `filtered_once` and `filtered_twice` (n_dof) are this error after one
-    and two filters (I - z J)^-1. `a1` (n_q) are the accelerations at the end of the step, which show how fast the
-    motion changes after a contact has begun within the step. Store the duration of the error in ERROR_DURATION.
+    `unfiltered` (n_dof) is the velocity error. `filtered_once` and `filtered_twice` (n_dof) are this error multiplied
+    once and twice by the filter (I - z J)^-1; z is the step size times a coefficient of the method, J the Jacobian.
+    `a1` (n_q): accelerations at the end of the step, which show how fast the motion changes after a contact has begun
+    within the step. The duration (s) of the error is stored in memory[ERROR_DURATION].
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
@@ -45,7 +47,8 @@ def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once,
         largest_v = max(largest_v, abs(v[w.independent[i]]))
         largest_a = max(largest_a, abs(a[w.independent[i]]), abs(a1[w.independent[i]]))
         largest = max(largest, abs(filtered_twice[i]))
-        curvature = max(curvature, abs(filtered_twice[i] - 2.0 * filtered_once[i] + unfiltered[i]))  # (z J)^2 e
+        # component i of (z J)^2 filtered_twice
+        curvature = max(curvature, abs(filtered_twice[i] - 2.0 * filtered_once[i] + unfiltered[i]))
     if largest > 0.0:
         memory[at.ERROR_DURATION] = z * np.sqrt(largest / curvature)
     duration = memory[at.ERROR_DURATION]
@@ -58,8 +61,8 @@ def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once,
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
     """Return the largest effect, in units of the tolerances, of a velocity error e_v (n_dof) that lasts `duration` (s).
 
-    The effect on a coordinate is the smaller one of two ratios: velocity error to velocity tolerance; position error,
-    |e_v| times `duration`, to position tolerance.
+    The effect on a coordinate is the smaller one of two ratios: the velocity error to the velocity tolerance; and the
+    position error, |e_v| times `duration`, to the position tolerance.
     """
     n = w.Q.size
     error = 0.0
@@ -73,7 +76,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return max|v| / max|a| (s) for `state` and accelerations a (n_q), at most LONGEST_GAPS * tolerances[GAP]."""
+    """Return the time (s) in which the motion changes: max|v| / max|a| of independent coordinates, see LONGEST_GAPS."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
@@ -85,7 +88,7 @@ def motion_time(w, tolerances, state, a):
 
 @compiled
 def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, state, new_state):
-    """Return whether outdated derivatives J might make the error estimate wrong.
+    """Return True if an outdated Jacobian J might make the error estimate wrong.
 
     There are two cases. First, the effect of the velocity error `unfiltered` (n_dof) would exceed the tolerances if it
     lasted `max_duration` (s). Second, the duration computed with J is short, and Newton's method converges so slowly
@@ -102,11 +105,12 @@ def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, 
 
 @compiled
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
-    """Return whether the stored derivatives J agree with the equations at the end of a step, t, or do not matter.
+    """Return True if the stored Jacobian J agrees with the equations at the end of a step, or cannot matter.
 
-    (e_q, e_v) is (I - z J)^-1 times an error whose velocity part is `unfiltered` (n_dof each). So the velocity part of
-    J (e_q, e_v) is (e_v - unfiltered) / z. It is compared with the difference between the accelerations at the end of
-    the step and at a state that is displaced from this end by a multiple of (e_q, e_v).
+    t: time at this end. z: step size times a coefficient of the method. (e_q, e_v) is (I - z J)^-1 times an error whose
+    velocity part is `unfiltered` (n_dof each). So the velocity part of J (e_q, e_v) is (e_v - unfiltered) / z. It is
+    compared with the difference between the accelerations at the end of the step and at a state displaced from this end
+    by a multiple of (e_q, e_v).
     """
     n = w.Q.size
     max_duration = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
