@@ -48,14 +48,14 @@ N = 9  # number of nodes
 
 
 class Tables(NamedTuple):
-    """Linear maps from values at the nodes c_0 = 0 < ... < c_8 = 1; row k of a map multiplies the value at node k.
+    """Nodes 0 = c_0 < ... < c_8 = 1 of a step, and linear maps from values at the nodes; row k belongs to node k.
 
     nodes, between : nodes 1 to 8, and the midpoints between neighbouring nodes.
     velocities, positions : single and double integrals of the polynomial from 0 to each of the nodes 1 to 8.
     values_between, velocities_between, positions_between : values of the polynomial at the midpoints, and its single
         and double integrals from 0 to the midpoints.
     spectrum : coefficients of the Legendre polynomials of degree 1 to 8 on [0, 1], which are 1 at the end.
-    begin, end : coefficients of the powers 1 to 8 of the time from the beginning, and of the time from the end.
+    begin, end : coefficients of the polynomial in powers 1 to 8 of the time since the beginning, or since the end.
     """
 
     nodes: Array
@@ -78,8 +78,8 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # value by quadrature, which is not exact for the last polynomial
-    coefficients = values[:N] * weights / norms[:, None]  # (k, node): Legendre coefficients of the Lagrange polynomials
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # squared norm by quadrature, which is not exact for the last polynomial
+    coefficients = values[:N] * weights / norms[:, None]  # row k: coefficients of P_k in the Lagrange polynomials
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
         for sign in (-1, 1)
@@ -95,7 +95,7 @@ def tables() -> Tables:
 
 
 def _nodes() -> Extended:
-    """Return the nodes on [-1, 1]: -1, the zeros of P_8', and 1."""
+    """Return the nodes on [-1, 1]: -1, the zeros of the derivative of the Legendre polynomial P_8, and 1."""
     zeros = legendre.legroots(legendre.legder([0] * (N - 1) + [1])).astype(np.longdouble)
     derivative = legendre.legder(np.array([0] * (N - 1) + [1], dtype=np.longdouble))
     for _ in range(3):
@@ -111,36 +111,38 @@ def _legendre(z: Extended) -> Extended:
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
     """Return three arrays with a row for each Lagrange polynomial: values at z, single and double integrals up to z.
 
-    `z` is on [-1, 1]; integrals are over the corresponding interval of [0, 1], from 0.
+    `coefficients`: row k contains their coefficients of P_k. `z` is on [-1, 1], but integrals are over the time from 0
+    to (z + 1) / 2, the corresponding point of [0, 1].
     """
     values = _legendre(z)
-    # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
+    # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1), and P_1 + 1 for k = 0; the double integrals follow
     single = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
     double = np.array([single[1] + single[0], *((single[k + 1] - single[k - 1]) / (2 * k + 1) for k in range(1, N))])
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
 MAX_OPERATIONS = 5000  # equations with more operations get no collocation code: this length takes 2 s to compile
-MIN_DIVISOR = 1e-300  # smallest divisor, and smallest allowed error, which replaces 0
+MIN_DIVISOR = 1e-300  # smaller divisors and allowed errors are replaced by this, so that nothing is divided by zero
 INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
-# after the program with fixed pivots (null_space.py) was not valid in a step, this number of steps eliminate M first
+# if the program with fixed pivots (null_space.py) is not valid in a step, this number of later steps eliminate M first
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step
 
-# constants of the iteration, whose contraction rho is the ratio of the changes of velocities in two successive sweeps
+# constants of the iteration; its contraction, rho, is the ratio of the changes of velocities in two successive sweeps
 KAPPA = 0.02  # sweeps end at this iteration error, in tolerances: total errors are then at most as large as DOP853's
-TARGET_SWEEPS = 6.0  # number of sweeps for which the step size is chosen; larger with predictions of degree 6 and more
-EXTRA_SWEEPS = 7  # a step is rejected if it has not converged this number of sweeps after the target
-MAX_CONTRACTION = 0.8  # a step is rejected in its fourth sweep or later if the contraction is at least this
+TARGET_SWEEPS = 6.0  # the step size is chosen for this number of sweeps; more if the prediction has degree 6 or more
+EXTRA_SWEEPS = 7  # if a step has not converged after this number of sweeps beyond the target, it is rejected
+MAX_CONTRACTION = 0.8  # if the contraction is at least this in the fourth sweep or later, the step is rejected
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
-FAST_START, SLOW_START = 0.04, 0.3  # the guess of the first step size is accepted if the contraction is between these
-STAGNATION_RATIO = 0.5  # if the contraction is larger, changes below MAX_ROUNDING times the values are rounding errors
-# values that replace KAPPA, MAX_ROUNDING and the limit of sweeps in steps of fixed size
+FAST_START, SLOW_START = 0.04, 0.3  # the guess of the first step size is kept if the contraction is between these
+STAGNATION_RATIO = 0.5  # sweeps end if the contraction is at least this, and changes may be rounding (MAX_ROUNDING)
+# values that replace KAPPA, MAX_ROUNDING and the largest number of sweeps in steps of fixed size
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
-SMALLEST_RATIO = 1e-30  # added to the ratio of the iteration error to KAPPA, because its logarithm is computed
-ERROR_WEIGHT = 0.5  # factor by which the error estimate is multiplied
-# allowed defect at midpoints between nodes, in tolerances; above 1, because most of its effect averages out in a step
+SMALLEST_RATIO = 1e-30  # added to the ratio of the iteration error to KAPPA, because the logarithm of 0 is infinite
+ERROR_WEIGHT = 0.5  # factor on the estimated error of a step, see `_estimate_error`
+# if the defect at midpoints between nodes lasted for a whole step, it might change velocities by this many tolerances;
+# the limit is above 1, because most of its effect averages out in a step
 ALLOWED_DEFECT = 16.0
 
 
@@ -155,12 +157,12 @@ class CollocationCode:
     The methods use several emitters: `emit` writes operations on vectors of LANES numbers, `num` on single numbers,
     `vec2` on vectors of two numbers, and `wide` on vectors whose numbers belong to successive coordinates.
 
-    shared : code of the equations, whose coefficients the functions use, too.
+    shared : code of the equations; the functions use the same array of coefficients.
 
     Fields:
     iterated_coordinates : coordinates on whose positions or velocities the accelerations depend.
     numbers : coefficients that the functions read.
-    structure : digest of everything that the functions depend on, except the values of `numbers`.
+    structure : key of cached code: digest of everything that the functions depend on, except the values of `numbers`.
     """
 
     def __init__(self, shared: SharedCode):
@@ -183,7 +185,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # the digest of `shared` covers the other programs
+        else:  # `shared.digest`, part of the digest below, covers the programs that are split into functions
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -201,10 +203,11 @@ class CollocationCode:
     # methods that write the functions
 
     def iterate_step(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
-        """Iterate the stages of a step; return a status code for how the iteration ended, see data/collocation.py.
+        """Write code that iterates the stages of a step; return its status, such as CONVERGED (data/collocation.py).
 
-        The program with the fewest operations computes the accelerations. Its conditions are checked once, after the
-        last sweep. If they fail, the iteration is repeated with the elimination that begins with M; so do later steps.
+        The program with the fewest operations computes the accelerations. Its conditions on pivots are checked once,
+        after the last sweep. If they fail, this step is iterated again with the elimination that begins with M, and
+        STEPS_BY_MASS_FIRST later steps use this elimination from the beginning.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
@@ -255,7 +258,7 @@ class CollocationCode:
         return self._iterate(emit, work, state, tolerances, evaluate, fallback)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of the function whose elimination begins with M, and write this function if it is missing."""
+        """Return the name of the function that iterates a step and eliminates M first; write it if it is missing."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -270,7 +273,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return the argument `evaluate` of `_iterate` that uses the program `index`, see `call_accelerations`."""
+        """Return an argument `evaluate` of `_iterate` that calls the program `index`, see `call_accelerations`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -282,12 +285,12 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, work: Value) -> list[Value]:
-        """Return the accelerations at the nodes, loaded from `work`; the compiler could not keep all in registers."""
+        """Load the accelerations of all coordinates at the nodes from `work`: there are too many for the registers."""
         return [load_lanes(emit, work, self.a_offset + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
-        """Return a context for instructions that run only if `condition` is true and return from the function."""
+        """Return a context: code written in it runs only if `condition` is true, and returns from the function."""
         builder = emit.builder
         return_block, next_block = builder.append_block(), builder.append_block()
         builder.branch(condition, return_block, next_block)
@@ -296,7 +299,7 @@ class CollocationCode:
         builder.position_at_end(next_block)
 
     def _call(self, emit: LaneEmitter, name: str, write: Callable[..., None], arguments: Sequence[Value]) -> None:
-        """Write a call of a function of the module that returns nothing; if it is missing, `write` writes its body."""
+        """Write a call of the function `name`, which returns nothing; if it is missing, `write` writes its body."""
         module = emit.builder.module
         if not module.defines(name):
             builder = module.function(name, VOID, [each.type for each in arguments], internal=True)
@@ -305,10 +308,10 @@ class CollocationCode:
         emit.builder.call_void(name, arguments)
 
     def _predict_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
-        """Store WEIGHTS, STRICTER, SIZE and POWERS, and predicted positions and velocities at the nodes.
+        """Store WEIGHTS, STRICTER, SIZE and POWERS in `work`, and predicted positions and velocities at the nodes.
 
-        rtol applies to the position (or velocity) at the beginning, or to its change in half a step if that is larger.
-        In steps of fixed size, which have no error estimate, rtol = atol = 1.
+        An allowed error is atol + rtol * x: x is |position| (or |velocity|) at the beginning or, if that is larger, its
+        change in half a step. In steps of fixed size, which have no error estimate, rtol = atol = 1.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         has_fixed_size = builder.compare("fcmp oeq", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
@@ -342,7 +345,7 @@ class CollocationCode:
         used_powers = builder.select(exponents < degree, powers, emit.constant(0.0))
         polynomial = self._polynomial_pointer(emit, work, other=False)
         nodes = np.array(tables().nodes)
-        # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
+        # single and double integrals of the powers 0 to 8 of the time from 0 to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
         with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
@@ -364,7 +367,7 @@ class CollocationCode:
         return factors[0] * factors[1] * (factors[2] * factors[3])
 
     def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """Return an emitter for vectors of coordinates, and the first coordinate of each; the last two may overlap."""
+        """Return an emitter for vectors of successive coordinates, and their first coordinates; two may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
@@ -377,11 +380,11 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         fallback: Callable[[], Value],
     ) -> Value:
-        """Sweep over the stages until they converge, or a step is rejected; return a status code, see `iterate_step`.
+        """Write sweeps over the stages until they converge, or the step is rejected; return the status of the step.
 
-        `evaluate` writes code that stores the accelerations of the iterated coordinates at [t, q]. It returns a
-        function that writes code for the other accelerations, and returns whether all are valid. If they are not, the
-        code that `fallback` writes decides the status.
+        `evaluate` writes code that stores the accelerations of the iterated coordinates, given times and positions at
+        the nodes. It returns a function that writes code for the accelerations of the other coordinates, and returns
+        the flag whether all accelerations are valid. If they are not, code that `fallback` writes yields the status.
         """
         builder, num = emit.builder, Emitter(emit.builder)
 
@@ -443,9 +446,10 @@ class CollocationCode:
 
     @contextmanager
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
-        """Return a context for instructions that compute accelerations, and run twice in each sweep if REPEATS is 1.
+        """Return a context: code written in it computes accelerations, and runs twice in each sweep if REPEATS is 1.
 
-        The context yields the velocities: first as the last sweep left them, then integrals of the new accelerations.
+        The context yields the velocities at the nodes: first those of the last sweep, then integrals of the new
+        accelerations.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
@@ -462,12 +466,12 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # memory that is free until then
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # free until Legendre coefficients are stored
         builder.jump(loop)
         builder.position_at_end(after)
 
     def _load_iterated(self, emit: LaneEmitter, pointer: Value) -> list[Value]:
-        """Return values at the nodes: those at `pointer` for the iterated coordinates, and 0 for the others."""
+        """Load the values of the iterated coordinates at the nodes from `pointer`; return them, and 0 for others."""
         values = [emit.constant(0.0)] * self.n
         for k, i in enumerate(self.iterated_coordinates):
             values[i] = load_lanes(emit, pointer, LANES * k)
@@ -476,11 +480,11 @@ class CollocationCode:
     def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Store ERROR and CURVATURE, and the ratios FACTOR and FACTOR_OF_ERROR of the next step size to this one.
 
-        The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the larger
-        coefficient of degrees 7 and 8, s the larger one of degrees 5 and 6, f the largest one of degree 3 or more. The
-        estimate is the larger of t (t / s)^1.5 and t^2 / f. In 99 % of the steps over corners and peaks of forces,
-        errors are at most 20 times the estimate. In smooth motion errors are smaller by decades, which costs few steps,
-        because the estimate is of order 12.
+        The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the
+        largest coefficient of degree 7 or 8, s the largest of degree 5 to 8, f the largest of degree 3 to 8. The
+        estimate is the larger of t (t / s)^1.5 and t^2 / f. In 99 % of the steps over corners and peaks of forces, the
+        error is at most 20 times the estimate. In smooth motion, it is smaller than the estimate by decades, which
+        costs few steps, because the estimate is of order 12.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         n_sweeps, change, target, rho = (num.load(work, i) for i in (mem.SWEEPS, mem.CHANGE, mem.N_TARGET, mem.RHO))
@@ -518,7 +522,7 @@ class CollocationCode:
         num.store(builder.extract(factors, 1), work, mem.FACTOR_OF_ERROR)
 
     def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Return the largest defect between nodes, relative to its limit, or INVALID if accelerations are invalid.
+        """Return the largest defect between nodes, relative to ALLOWED_DEFECT, or INVALID if accelerations are invalid.
 
         Store FACTOR_OF_DEFECT, the largest ratio of the next step size to this one that the defect allows.
         """
@@ -554,7 +558,7 @@ class CollocationCode:
         return builder.select(all_valid, defect, constant(DOUBLE, INVALID))
 
     def store_prediction(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Store the polynomial of a rejected step, which predicts the shorter step taken instead."""
+        """Store the polynomial through the accelerations of a rejected step, to predict those of a shorter step."""
         num, old_polynomial = Emitter(emit.builder), self._polynomial_pointer(emit, work, other=False)
         with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
             a0 = num.load(num.pointer(state, i), 2 * self.n)
@@ -614,9 +618,10 @@ class CollocationCode:
                 num.store(builder.extract(a, last), target, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, work: Value, max_error: Value) -> None:
-        """Store NEXT_DEGREE, within 2 of DEGREE: the lowest degree with an error of at most 1.2 times the least error.
+        """Store NEXT_DEGREE: the lowest degree whose prediction error is at most 1.2 times the smallest error.
 
-        `max_error`: errors of the predictions of degree 1 to 8 at the end of the step.
+        It is at least 2, and within 2 of DEGREE; after the first step, it is FIRST_DEGREE. `max_error`: errors at the
+        end of the step of the predictions of degree 1 to 8, one in each lane.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         least = -emit.max_over_lanes(-max_error)
@@ -631,14 +636,14 @@ class CollocationCode:
         num.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, mem.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project positions at the ends of eight steps in place; store VALID (success) and MOVED (largest changes)."""
+        """Take a Newton step towards the constraints from the positions at the ends of eight steps; see `_project`."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:
             self._project_in_parts(emit, work, numbers, self.split_functions.project_position, ("moved", "q"))
 
     def project_states(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project the states at the ends of eight steps in place; store accelerations, multipliers, VALID and MOVED."""
+        """Project the states at the ends of eight steps; store accelerations and multipliers there; see `_project`."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.projection)
         else:
@@ -647,7 +652,7 @@ class CollocationCode:
     # methods that write parts of functions
 
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, program: Program) -> None:
-        """Project states at the ends of eight steps by a program that gives "moved", the change, and new values."""
+        """Write a projection of the ends of eight steps by a program; store MOVED, and VALID = 0 where it fails."""
         emit.numbers = emit.constants = numbers
         inputs = [load_lanes(emit, work, self.end_offset + LANES * k) for k in range(1 + 2 * self.n)]
         lowering, arrays = lower_program(emit, program, inputs, self.numbers)
@@ -661,7 +666,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Project states at the ends of eight steps by `write`, a method of SplitFunctions that fills `names`."""
+        """Do the same as `_project` by `write`, a method of SplitFunctions; `names`: the arrays that it fills."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
@@ -669,7 +674,7 @@ class CollocationCode:
         self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], is_valid)
 
     def _end_offsets(self) -> dict[str, int]:
-        """Return where `work` contains the quantities at the ends of steps, by name."""
+        """Return the offsets in `work` of "q", "v", "a" and "lam" at the ends of eight steps."""
         return {
             "q": self.end_offset + LANES,
             "v": self.end_offset + LANES * (1 + self.n),
@@ -686,7 +691,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
-        """Store positions and velocities at the nodes; return the largest change of a velocity since the last sweep."""
+        """Integrate accelerations to velocities and positions at the nodes; return the largest change of velocity."""
         num = Emitter(emit.builder)
         with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, num.pointer(work, k * LANES), self.v_offset)
@@ -701,7 +706,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Store velocities and positions of coordinate i, the k-th iterated one, at nodes; return the velocities."""
+        """Store v and q of coordinate i, the k-th iterated one, at the nodes; return v. `sums`: integrals of a."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
         index, begin = num.pointer(work, k * LANES), num.pointer(state, i)
@@ -721,18 +726,18 @@ class CollocationCode:
     def _weighted_accelerations(
         self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value | int
     ) -> Value:
-        """Return the sum of the rows of a table, each multiplied by the acceleration of coordinate i at its node."""
+        """Apply a map of `Tables` to the accelerations of coordinate i at the nodes, of which `first` is at node 0."""
         return self._weighted_sum(emit, table, self._node_accelerations(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
-        """Return the sum of the rows of a table, each multiplied by its term; two partial sums are faster than one."""
+        """Return the sum over k of terms[k] times row k of `table`; two partial sums are faster than one."""
         sums = [emit.broadcast(x) * constants(row) for x, row in zip(terms[:2], table[:2], strict=True)]
         for k, (x, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fma(emit.broadcast(x), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)
 
     def _polynomial_pointer(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
-        """Return a pointer to the polynomial of the last accepted step or, if `other`, of the attempted step."""
+        """Return a pointer to the stored polynomial of the last accepted step or, if `other`, of the attempted step."""
         builder, num = emit.builder, Emitter(emit.builder)
         second = builder.compare("fcmp one" if not other else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO)
         size = LANES * len(self.iterated_coordinates)
@@ -745,7 +750,7 @@ class Collocation(NamedTuple):
 
     functions: DeferredFunctions
     code: CollocationCode
-    numbers: Any  # coefficients that the functions read; if shared between systems, expressions for the coefficients
+    numbers: Any  # coefficients that the functions read: values, or expressions in the parameters for several systems
 
 
 def compiled_collocation(generated: GeneratedCode) -> Collocation:

@@ -8,9 +8,9 @@ fixed pivots. If one of these pivots is small, another function of the LLVM modu
 elimination that begins with M. In SIMD lanes, this function is called for all lanes if one lane needs it; the other
 lanes keep their results, so that the result of a run does not depend on the runs in other lanes.
 
-**Long equations** are split into functions that call one another, each compiled once: the time that LLVM takes grows
-faster than the length of a block. The values of long equations would be stored in memory anyway. Accelerations and both
-projections share the functions for the factors of the matrix at a position, and for the solution with these factors.
+**Long equations** are split into functions that call one another, each compiled once: the compile time of LLVM grows
+faster than the length of a block. Functions exchange values in memory, where most values of a long block are anyway.
+Accelerations and both projections call the same functions for the factors of the matrix and for the solution.
 """
 
 import ctypes
@@ -36,9 +36,10 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# generated code is used if accelerations at the start have at most this relative error; in runs it grew up to 200 times
+# code that adds rows to M, or refines solutions, is used only if its accelerations at the start have at most this
+# relative error; during runs, the error grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, DISTANCE = 4, 0.02  # largest number of positions where this error is measured, and their distance
+MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions to be tried for this test, and their spacing (m or rad)
 
 
 def write_accelerations(
@@ -46,7 +47,7 @@ def write_accelerations(
 ) -> tuple[list[Value], Value]:
     """Write code for the accelerations at `inputs`, [t, q, v]; return their values and a flag (whether they are valid).
 
-    On return, the builder's current block may be another one. `emit` must have the pointers to the coefficients.
+    The code that follows may belong to another LLVM block. `emit` must have the pointers to the coefficients.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -89,9 +90,10 @@ def _store_if_valid(emit: Emitter, is_valid: Value, pointers: Sequence[Value], a
 def call_accelerations(
     emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, out: Value
 ) -> Value:
-    """Write a call that stores the accelerations at `inputs`, [t, q, v], in `out`; return whether they are valid.
+    """Write a call that stores the accelerations at `inputs`, [t, q, v], in `out`; return the flag for valid results.
 
-    `index`: position of the program in `equations.accelerations`; 0: fewest operations, -1: elimination begins with M.
+    `index`: index of the called program in `equations.accelerations`. 0: program with the fewest operations; -1: the
+    elimination begins with M.
     """
     state = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
@@ -105,8 +107,8 @@ def _accelerations(
 ) -> tuple[list[Value], Value]:
     """Write code for the accelerations; return their values and a flag (whether they are valid).
 
-    If pivots are small, the code calls a function whose elimination begins with M. The function `state`, which may
-    write code, returns the arguments of this call: t and pointers to q and v.
+    If pivots are small, the code calls a function whose elimination begins with M. The arguments of this call are the
+    result of `state()`: t, and pointers to q and v.
     """
     program, *alternatives = equations.accelerations
     (a,) = program.run(lowering)
@@ -161,7 +163,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return the pointer to the coefficients; in SIMD lanes, two: to those that differ between lanes, and to others."""
+    """Return a list of the pointer to the coefficients; in lanes, of two: for varying and for constant coefficients."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -170,15 +172,17 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# equations with more operations than SPLIT_PROJECTIONS have their projections split into functions, which halves the
-# compile time; without a `reduced_program`, SPLIT_ALL applies: accelerations are split, too, and get 50 % slower
+# numbers of operations above which equations are split into functions. If there is a `reduced_program`, projections are
+# split above SPLIT_PROJECTIONS, which halves the compile time. If not, projections and accelerations are split above
+# SPLIT_ALL, which makes accelerations 50 % slower
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
     """Generator that splits long equations into parts: functions of the LLVM module that other functions call.
 
-    solution : solution of the linear equations; `stored_indices` lists the quantities that the parts share.
+    solution : programs for the factors of the linear equations M a + G^T lam = r, G a = c, and for the solution;
+        `stored_indices` lists the quantities that the parts exchange in memory.
     position_programs : programs by names of parts, with inputs t, q, v.
     solution_programs : programs by names of parts, with inputs r, c and the stored factors.
     """
@@ -225,7 +229,7 @@ class SplitFunctions:
     # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write `calls` (pairs: name of a part, arguments), and missing parts; return whether all results are valid."""
+        """Write calls of parts (pairs: name, arguments), and missing parts; return the flag that all are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -238,16 +242,16 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return the Lowering that writes a part; `args` begin with the inputs of `graph` and the coefficients."""
+        """Return the Lowering that writes a part; `args`: three inputs of `graph`, the coefficients, and others."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
-            emit.constants = emit.numbers  # type: ignore[attr-defined]
+            emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
         lowering = Lowering(emit, self.numbers, stored)
         lowering.define_inputs(graph, inputs)
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that stores factors and shared quantities in arguments[4]; return whether all are valid."""
+        """Write the part that stores factors and shared quantities in arguments[4]; return the flag for valid ones."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -258,7 +262,7 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part for a program whose quantities `stored` are in memory; return whether results are valid."""
+        """Write the part for a program; return the flag for valid results. `stored`: quantities loaded from memory."""
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
         results = program.run(lowering)
@@ -280,7 +284,7 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Write code that stores q after a Newton step in `out`, and its change in `moved`; return whether it works."""
+        """Write a Newton step towards C = 0: store q in `out`, its change in `moved`; return the flag for validity."""
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         _write_zeros(emit, self.n, r)
@@ -342,7 +346,7 @@ class SplitFunctions:
 
 
 def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
-    """Emit code that returns false if results are invalid, before any output is written; in lanes, emit nothing."""
+    """Write code that returns false from the function if results are invalid; in SIMD lanes, write nothing."""
     if is_valid.type == BIT:
         emit.builder.return_false_unless(is_valid)
 
@@ -366,7 +370,8 @@ def write_function(
 ) -> None:
     """Write a function that computes the arrays of a program from its inputs and its coefficients.
 
-    If the conditions hold and the first array is finite, the function returns true; else it leaves the arrays alone.
+    If the program's conditions hold and its first array is finite, the function stores the arrays and returns true;
+    else it stores nothing and returns false.
     """
 
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
@@ -400,13 +405,13 @@ class SharedCode:
         self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, optimise=False)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
-        """Return the GeneratedCode of one system, with coefficients for its parameters."""
+        """Return this code with the coefficients of one system; `evaluate` computes them from its parameters."""
         return GeneratedCode(
             self, evaluate(self.numbers.formulas), self.equations.traced.specialize(system, evaluate), evaluate
         )
 
     def _programs(self) -> dict[str, Program]:
-        """Return the programs of the functions that are not split, by name of function."""
+        """Return the programs of the functions that are not split into parts, by names of the functions."""
         equations = self.equations
         programs = {"own_redundant": equations.redundant_rows}
         if self.split_functions is None:
@@ -442,7 +447,7 @@ class GeneratedCode(NamedTuple):
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads
     traced: CallbackTraces
-    evaluate: Evaluator  # function that evaluates expressions of the shared trace cache for this system's parameters
+    evaluate: Evaluator  # function that evaluates expressions in the parameters for the parameters of this system
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -450,7 +455,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return whether a run from (t0, q0) may use this code: (t0, q0) must lead to the same choice of pivots."""
+        """Return True if a run may start at (t0, q0) with this code: the pivots chosen there are those of the code."""
         try:
             return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
@@ -484,10 +489,10 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 
 
 def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
-    """Return the largest relative error of accelerations by generated code, at rest, at positions at and near a start.
+    """Return the relative error of accelerations by generated code, at rest, at the start (t0, q0) or near it.
 
-    Accelerations are computed with and without a projection, by two functions whose pivots may differ. The error is
-    infinite if pivots are too small at all positions.
+    The first position where pivots are large enough is taken (see MAX_POSITIONS); if there is none, return infinity.
+    Two functions whose pivots may differ compute accelerations, with and without a projection: the larger error counts.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)
@@ -508,7 +513,7 @@ def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) 
         right, exact = np.concatenate([force, gamma[rows]]), np.zeros(n + len(rows))
         for _ in range(3):  # solve, and then refine the solution twice
             exact += np.linalg.solve(matrix, right - matrix @ exact)
-    except ValueError:  # gamma is computed by differences, or forces are not defined, or the matrix is singular
+    except ValueError:  # no exact solution: gamma by differences, or undefined forces, or a singular matrix
         return 0.0
     heavy = mass.diagonal() > 0.0
     size = max(np.abs(exact[:n]).max(), np.abs(force[heavy] / mass.diagonal()[heavy]).max(initial=0.0))

@@ -1,7 +1,7 @@
 """Derive C_q, C_t and Gamma exactly from traced callbacks.
 
-Programs replace the callbacks that a system does not have. The callbacks that a system has are compared with exact
-derivatives, which is better than a comparison with finite differences.
+If the user gives no callback for C_q or Gamma, a program derived from the other callbacks replaces it. The callbacks
+that the user gives are compared with exact derivatives, which are more reliable than finite differences.
 """
 
 import copy
@@ -20,12 +20,12 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# callbacks that are derived if a system does not have them; values: attribute of the system with the number of rows
+# callbacks that are derived if the user does not give them; values: attribute of the system with the number of rows
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
 class DerivedPrograms:
-    """Programs that replace missing callbacks, shared by the systems of a trace cache.
+    """Programs that replace missing callbacks, shared by all systems that have the same TraceCache (trace.py).
 
     programs : for each kind of callback, a program and the indices of its results in the callback's flattened array.
     traced : the traces that the programs were derived from.
@@ -35,7 +35,7 @@ class DerivedPrograms:
         self.programs, self.traced, self.kinds = programs, traced, traced.kinds
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
-        """Return a system with these programs in place of its missing callbacks."""
+        """Return a system with these programs for its missing callbacks; `evaluate` computes their coefficients."""
         functions: dict[str, Any] = {}
         for name, (program, indices) in self.programs.items():
             vectors = program.replace_coefficients(evaluate).as_arrays(indices)
@@ -58,7 +58,7 @@ class DerivedSystem(NamedTuple):
 
 
 def derive_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
-    """Return a system with programs in place of missing C_q and Gamma, and a tuple of the traces behind them.
+    """Return a system with programs in place of missing callbacks for C_q and Gamma, and the traces used for them.
 
     If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple; in the second
     case, finite differences replace missing callbacks. `check` raises Untraceable if the traces are wrong.
@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return, for each `missing` kind of callback, its expressions; keys: indices in the flattened array."""
+    """Return the expressions for "jacobian" and for "gamma" (both kinds of Gamma), by index in the flattened array."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -101,15 +101,16 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 
 Array = NDArray[np.float64]
 
-MAX_ENTRIES = 50_000  # callbacks are compared with exact derivatives if C_q and A have at most this many entries
-# displacements from the start at which derivatives are compared: of q, relative to its size; of t, to FIRST_TIME_SCALE
+MAX_ENTRIES = 50_000  # callbacks are compared with exact derivatives if [C_q; A] has at most this many entries
+# states at which derivatives are compared: displacements from the start, of q relative to its size, of t relative to
+# FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = accept_traces) -> CallbackTraces | None:
     """Return the exact derivatives C_q, C_t and Gamma as traces, to be compared with callbacks.
 
-    Return None if there are too many entries, callbacks cannot be traced, or `check` raises for the traces.
+    Return None if there are more than MAX_ENTRIES entries, callbacks cannot be traced, or `check` rejects the traces.
     """
     if system.n_q * (system.n_c + system.n_a) > MAX_ENTRIES:
         return None
@@ -130,9 +131,10 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
 
 
 def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Return whether callbacks for C_q, C_t and Gamma agree with the exact derivatives at states near a start.
+    """Return True if callbacks for C_q, C_t and Gamma agree with exact derivatives at states near a start (t, q, v).
 
-    Raise ValueError if C depends on time, perhaps only far from the start, but there is no callback for C_t.
+    If they differ, or callbacks cannot be traced, return False. Raise ValueError if C depends on time, perhaps only far
+    from the start, but there is no callback for C_t.
     """
     direction = generic_factors(len(q)) * sizes(q)
     states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * direction) for displacement in DISPLACEMENTS]
@@ -156,7 +158,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v of about the same size."""
+    """Return rows [t, q, v] with the t and q of `states`, and with random nonzero v in the range of their q and v."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

@@ -11,7 +11,8 @@ eliminated after its coordinates. So the pivots are pivots of the definite matri
 - If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows, and
   the generated code reports that its results are invalid.
 - The same factors are used to compute the nearest position and velocity on the constraints, in the metric of M.
-- If M is singular, rows g of G are added to M: M + g^T g. This changes neither accelerations nor projections.
+- If M is singular, the sum M + s g^T g over some rows g of G replaces it ("rows are added to M"; s: scale of a row).
+  This changes neither accelerations nor projections.
 - If rows of G are redundant, the equations contain independent rows only.
 """
 
@@ -44,16 +45,16 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # rows of G are added to M if M has a smaller ratio of the smallest to the largest eigenvalue
+SINGULAR_MASS = 1e-10  # rows of G are added to M if its smallest eigenvalue is below this fraction of the largest
 RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is below this fraction of the row
-# pivots of rows of G are measured relative to the pivot that the row has without the other rows. During a run, the code
-# accepts pivots down to about this fraction of the smallest pivot at the start
+# a pivot of a row of G is measured relative to the pivot that the row has without the other rows. During a run, the
+# generated code accepts pivots down to about this fraction of the smallest pivot at the start
 PIVOT_FRACTION = 0.01
 # possible values of `PivotChoice.min_pivot`, the smallest accepted pivot; below the last, rounding errors dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
-# MIN_PIVOTS[i] is chosen for the first i with START_LIMITS[i] <= smallest pivot at the start, else MIN_PIVOTS[-1]
+# min_pivot = MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest pivot at the start, else MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# all rows of G are added to M, on trial, if pivots are so small that the index of the chosen MIN_PIVOTS is at least
+# if pivots at the start are small, all rows of G are added to M on trial: if min_pivot = MIN_PIVOTS[i] with i at least
 # - MIN_INDEX_FEW, for at most N_FEW_COORDINATES coordinates
 # - MIN_INDEX_FEW_SINGULAR, if M is also singular: Euler parameters lose two digits even in sound models
 # - MIN_INDEX_MANY (plus one if M is singular), for more coordinates, because the code gets longer
@@ -61,9 +62,9 @@ N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # if s G^T G is added to M, approximate ratio of its largest entry to the largest entry of M
 MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows exceeds its pivot by this factor
-SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large number, so that most starts yield the same
-DISPLACEMENT = 0.2  # displacement of coordinates, m or rad, from positions at which entries happen to be zero
-MIN_GAIN = 2  # rows are added to M only if min_pivot becomes larger, by at least this number of steps in MIN_PIVOTS
+SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large number: then most starts have equal scales
+DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
+MIN_GAIN = 2  # rows added to M on trial are kept if the index of min_pivot in MIN_PIVOTS falls by at least this
 # dependent coordinates are eliminated only if G has at least this number of rows per coordinate: otherwise the linear
 # system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
@@ -80,8 +81,8 @@ class PivotChoice:
         M. This sum is definite. Scales are powers of two, with which the added terms are about as large as M.
     min_pivot : smallest pivot of a row of G with which results count as valid, relative to the pivot that the row has
         without the other rows; a power of ten.
-    blocks : pivot blocks in the order of elimination. A block has one or two indices in `rows`, and as many dependent
-        coordinates, for which these rows are solved. Empty if this would not pay, or if no pivots are suitable.
+    blocks : pivot blocks in the order of elimination. A block consists of one or two rows (indices in `rows`), and as
+        many dependent coordinates, for which these rows are solved. Empty: no dependent coordinates are eliminated.
     is_refined : whether solutions are improved by one step of refinement, because small pivots may cost digits.
     """
 
@@ -100,7 +101,8 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # refine solutions in these two cases only: in all others, random models had 8 correct digits without refinement
+        # refine solutions only if min_pivot is smallest or little inertia may lose digits: in all other cases, random
+        # models had 8 correct digits without refinement
         is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _hides_little_inertia(choice, mass, G)
         choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
@@ -208,12 +210,13 @@ class PivotChooser:
         return index if index >= 0 and chosen[2 : 2 + chosen[0]].tolist() == list(choice.rows) else -1
 
     def _try_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
-        """Return the choice for M + s G^T G if its smallest pivot is much larger than for M, else `choice`.
+        """Return a choice that adds all independent rows to M if its smallest pivot is much larger, else `choice`.
 
-        G: the independent rows. `index`: index in MIN_PIVOTS of the choice for M. A body may have little inertia about
-        its joints, such as a rod with a mass in its middle. Then rows are nearly dependent in the metric of M, and a
-        smallest pivot of 10^-k costs up to 2 k digits of accelerations. In the metric of M + s G^T G, rows are not
-        nearly dependent. If s G^T G is 10^k times as large as M, k digits are lost, and refinement restores them.
+        `factors`: factors on the scales s of all rows. `index`: index of `choice.min_pivot` in MIN_PIVOTS. A body may
+        have little inertia about its joints, such as a rod with a mass in its middle. Then rows are nearly dependent in
+        the metric of M, and a smallest pivot of 10^-k costs up to 2 k digits of accelerations. In the metric of
+        M + s G^T G, rows are not nearly dependent. If s G^T G is 10^k times as large as M, k digits are lost, and
+        refinement restores them.
         """
         rows = G[list(choice.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
@@ -225,7 +228,7 @@ class PivotChooser:
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _decode(self, index: int) -> PivotChoice:
-        """Return the choice that the compiled search has stored; raise Untraceable if its result `index` is a code."""
+        """Return the choice that the compiled search has stored; if `index`, its result, is < 0, raise Untraceable."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -251,11 +254,12 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 
 
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
-    """Return, for each row of G that is added to M, the factor on its scale.
+    """Return a factor for each row of G; the scale of a row that is added to M is multiplied by its factor.
 
-    `singular`: rows that are added because M is singular. The factor is 1 unless M is small in all columns of the row,
-    and these rows have entries in all of them; then it is a negative power of SCALE_STEP. Without it, a row on Euler
-    parameters alone, such as their norm, would hide the small inertia of a body beside heavy bodies.
+    `singular`: rows that are added because M is singular. The factor is a negative power of SCALE_STEP if M is small in
+    all columns of the row, and each of these columns has an entry in one of the rows `singular`. Otherwise it is 1.
+    Without the factor, a row on Euler parameters alone, such as their norm, would hide the small inertia of a body
+    beside heavy bodies.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0
@@ -269,7 +273,7 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
 
 
 def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return whether bodies of little inertia may lose digits: added rows have several scales, or pivots are small."""
+    """Return True if bodies of little inertia may lose digits: added rows have several scales, or a pivot is small."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)
@@ -292,15 +296,6 @@ class Elimination:
 
     Fields:
     graph : graph of the operations; its first inputs are t, q and v.
-    mass_first_program : program for the accelerations "a" (n_q,) at a state, by an elimination that begins with M.
-    reduced_program : shorter program for "a" that eliminates dependent coordinates; it is valid at fewer positions.
-    right_sides : program for the forces "r" (n_q,) and the right-hand sides "c" (n_c + n_a,) of the rows of G.
-    position_projection : program for the position "q" (n_q,) after one Newton step towards the constraints, and for its
-        change "moved" (n_q,), a vector x with A x = 0.
-    projection : program for "q" and "moved", for the projected velocity "v" (n_q,), and for the accelerations "a" and
-        multipliers "lam" (n_c + n_a,) at this velocity. M, G and Q are evaluated at the position before the step.
-    basic_projection : as `projection`, but "lam" is 0 for redundant rows (in `projection`, "lam" has the least norm).
-    position_errors, velocity_errors : programs for the right-hand sides "c" of corrections of positions, of velocities.
     redundant_rows : program without arrays; its conditions hold if the redundant constraints are satisfied.
     split_functions : generator that splits long equations into several functions; compile_equations.py sets it.
     n_operations : number of operations of callbacks and factorization, but not of the solution with the factors.
@@ -339,7 +334,7 @@ class Elimination:
         return elementwise(Affine.as_term, [self.equations.expressions(kind, v)])
 
     def _redundant_rows(self, rates: Any) -> Program:
-        """Return a program whose conditions hold if a state satisfies the redundant rows; `rates`: C_t and b."""
+        """Return a program whose conditions hold if a state satisfies the redundant rows; `rates`: C_t, then b."""
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
         violations = self._callback_terms("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
@@ -390,14 +385,14 @@ class Elimination:
 
     @cached_property
     def mass_first_program(self) -> Program:
-        """Return the program for the accelerations by an elimination that begins with M."""
+        """Return the program for the accelerations "a" (n_q,) by an elimination that begins with M."""
         solution, conditions = self._accelerations(self.v)
         self._check_length()
         return Program(self.graph, {"a": solution[: self.system.n_q]}, [*self.conditions, *conditions])
 
     @cached_property
     def reduced_program(self) -> Program | None:
-        """Return the program for accelerations that eliminates dependent coordinates; None if it saves too little."""
+        """Return a shorter program for "a" that eliminates dependent coordinates; None if it would save too little."""
         blocks = self.choice.blocks
         if not blocks:
             return None
@@ -441,13 +436,13 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for "c" = -C, the right side of position corrections; 0 in redundant rows and A."""
+        """Return the program for the right sides "c" of position corrections: -C; 0 for redundant rows, rows of A."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for "c" = -G v - (C_t, b), the right side of velocity corrections; 0 in redundant rows."""
+        """Return the program for the right sides "c" = -G v - (C_t, b) of velocity corrections; 0 in redundant rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -458,14 +453,17 @@ class Elimination:
 
     @cached_property
     def position_projection(self) -> Program:
-        """Return the program for the position "q" after one Newton step, and for its change "moved"."""
+        """Return the program for "q" (n_q,) after one Newton step towards C = 0, and for its change "moved" (n_q,)."""
         moved = self._correction(self.position_errors)
         position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
         return Program(self.graph, position, self.conditions)
 
     @cached_property
     def projection(self) -> Program:
-        """Return the program for the projected "q" and "v", and "a" and "lam" with this "v"; "lam" has least norm."""
+        """Return the program for a projected state "q", "v", the change "moved" of "q", and "a" and "lam" with this v.
+
+        M, G and Q are evaluated at the position before the projection. "lam" (n_c + n_a,) has the least norm.
+        """
         arrays = self.basic_projection.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
         lam = multipliers_of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
@@ -502,7 +500,7 @@ def multipliers_of_least_norm(
 
     `all_rows`: G. `rows`, `independent`: indices and multipliers of the independent rows. `solve`: solves with the
     factors of [M G^T; G 0]. A redundant row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of
-    G^T is spanned by e_i - sum_k Z_ik e_k. The component of lam in this null space is subtracted.
+    G^T is spanned by e_i - sum_k Z_ik e_k (e_i: unit vectors). The component of lam in this null space is subtracted.
     """
     zero = Affine(graph, 0.0, {})
     lam = [zero] * len(all_rows)
@@ -581,7 +579,6 @@ class FactorAndSolvePrograms:
         return solve(self._blocks, rhs)
 
     def _make_solution_program(self) -> Program:
-        """Return the program for "a" and "lam", the solution of the equations of motion."""
         lam = [self._zero] * len(self._c)
         solution, conditions = solve_refined(self._solve, self._choice, self._mass, self._rows, self._r, self._c)
         for k, value in zip(self._choice.rows, solution[self._n :], strict=True):

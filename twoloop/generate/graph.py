@@ -24,9 +24,9 @@ from twoloop.kernels.evaluation import operations as op
 
 # largest number of operations of a derived program or a series: tracing more would take longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
-# A product is recorded once for all its multiples: the constant factors of both arguments are taken out, unless this
-# might underflow or overflow, in two cases: the magnitude of their product is not between MIN_FACTOR and 1 /
-# MIN_FACTOR; or the product is one of the squares that make up a power with an exponent above HIGH_EXPONENT.
+# A product is recorded once for all its multiples: the constant factors of both arguments are taken out. They are not
+# taken out if this might underflow or overflow: if the magnitude of their product is not between MIN_FACTOR and
+# 1 / MIN_FACTOR, or if the product is one of the squares that make up a power with an exponent above HIGH_EXPONENT.
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 # reason in messages about a callback that compares an expression, or converts it to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
@@ -34,7 +34,7 @@ BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, 
 # functions of `math`, replaced by functions that also accept Parameters
 SIN, COS, EXP, LOG, ATAN, SQRT = map(math_function, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
-_equal = float.__eq__  # compares the current values of floats or Parameters; the operator == of Parameters raises
+_equal = float.__eq__  # compares values of floats or Parameters, for which the operator == raises an exception
 _magnitude = float.__abs__  # absolute value as a plain float, also for a Parameter
 
 CONVERSION_REASON = (
@@ -43,10 +43,10 @@ CONVERSION_REASON = (
 
 
 class Graph(SymbolicObject):
-    """Graph of quantities, numbered from 0.
+    """Graph of quantities, numbered from 0: inputs (time, coordinates, velocities) and results of operations.
 
-    operations : for each quantity, the kind of operation and two arguments, the second of which may be None; None for
-        an input. The second argument of a logarithm or an arctangent is the divisor of its derivative.
+    operations : for each quantity that is an input, None; for each other one, the kind of operation and its arguments
+        (the second may be None). The second argument of a logarithm or an arctangent is the divisor of its derivative.
     input_sizes : number of inputs that each call of `inputs` has added.
     traced : results of traced callbacks: arrays of expressions by kind of callback.
     """
@@ -58,9 +58,10 @@ class Graph(SymbolicObject):
         self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs that it depends on
         self.traced: dict[str, Any] = {}
         self._recorded_quantities: dict[tuple[int, int, int], int] = {}
-        # keys: identifiers of factors; values: ranks in the order of first use, which is the same for all parameters
+        # rank of each factor of a product in the order of first use, by its `identifier`; a product begins with the
+        # factor of lower rank, so that the order of its factors does not depend on the values of parameters
         self._factor_order: dict[int, int] = {}
-        self._identifiers: dict[Any, int] = {}  # integers that stand for keys of expressions: keys take long to compare
+        self._identifiers: dict[Any, int] = {}  # results of `identifier`, by keys of expressions
         self._quantities: dict[int, Affine] = {}
 
     def copy(self) -> "Graph":
@@ -105,7 +106,7 @@ class Graph(SymbolicObject):
         return expr
 
     def identifier(self, expr: "Affine") -> int:
-        """Return an integer that identifies an expression, up to rounding of its coefficients."""
+        """Return an integer that is equal for expressions with equal keys, and faster to compare than the keys."""
         if expr.cached_identifier is None:
             expr.cached_identifier = self._identifiers.setdefault(expr.key, len(self._identifiers))
         return expr.cached_identifier
@@ -125,7 +126,7 @@ class Graph(SymbolicObject):
         return self.quantity(quantity)
 
     def quantities_for(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of quantities that `exprs` need, arguments first, without inputs and `available` ones."""
+        """Return the indices of operations that `exprs` need, except `available` ones; arguments precede results."""
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms]
         while stack:
@@ -137,7 +138,7 @@ class Graph(SymbolicObject):
         return sorted(needed)
 
     def kind(self, i: int) -> int:
-        """Return the kind of the operation that computes quantity i, which must not be an input."""
+        """Return the kind of the operation that computes quantity i; it must not be an input."""
         operation = self.operations[i]
         assert operation is not None
         return operation[0]
@@ -147,14 +148,14 @@ class Graph(SymbolicObject):
         return [expr for expr in (self.operations[i] or ())[1:] if isinstance(expr, Affine)]
 
     def quantities_by_use(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the same indices as `quantities_for`, each right before the first use of its quantity."""
+        """Return the indices of `quantities_for` in another order: each one as late as its first use allows."""
         order: list[int] = []
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms][::-1]
         while stack:
             i = stack.pop()
             operation = None if i < 0 else self.operations[i]
-            if i < 0:  # the arguments of quantity ~i were above it on the stack, and are in `order` by now
+            if i < 0:  # ~i is the index of a quantity whose arguments were above it on the stack: they are in `order`
                 order.append(~i)
             elif i not in needed and operation is not None and i not in available:
                 needed.add(i)
@@ -163,7 +164,7 @@ class Graph(SymbolicObject):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return the product of a and b, as a multiple of the product of normalized factors, which is recorded once."""
+        """Return the product of a and b as a number times the product of normalized factors, which is recorded once."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
@@ -182,12 +183,12 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return the square; `is_high_power`: whether it is part of a power with an exponent above HIGH_EXPONENT."""
+        """Return the square of `expr`; if it is part of a power, `is_high_power`: exponent above HIGH_EXPONENT."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 
 def rounded(value: float) -> Any:
-    """Return a number rounded to 41 bits (12 digits); for a Parameter, return its rounded scale and its Powers."""
+    """Return a number rounded to 41 bits (12 digits); for a Parameter, return its rounded scale and its `powers`."""
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
@@ -249,7 +250,7 @@ class Affine:
         return factor, Affine(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
     def _convert_operand(self, other: Any) -> "Affine":
-        """Return an operand, a number or an expression, as an expression; refuse expressions of other graphs."""
+        """Convert an operand (a number or an expression) to an expression; refuse expressions of other graphs."""
         if type(other) is not Affine:
             return Affine(self.graph, as_number(other), {})
         if other.graph is not self.graph:
@@ -265,7 +266,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
-                terms.pop(i, None)  # if c has underflowed to zero, there may be no such term
+                terms.pop(i, None)  # None: there is no such term if `total` is only c, and c has underflowed to zero
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -414,8 +415,8 @@ class Affine:
 
     real = property(item)
 
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:  # isinstance reads this property
+    @property  # type: ignore[misc]  # the property `__class__`, which `isinstance` reads
+    def __class__(self) -> Any:
         if self.graph.is_tracing:
             self.graph.refuse("it asks for the type of what depends on t, q or v")
         return Affine
@@ -466,12 +467,12 @@ def is_zero(expr: Affine) -> bool:
 
 
 class Derivative:
-    """Derivatives of expressions along a direction; `direction`: nonzero components, by indices of inputs."""
+    """Directional derivatives of expressions; `direction`: its nonzero components, by indices of inputs."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
         self._derivatives = dict(direction)
-        self._input_mask = sum(1 << i for i in direction)  # bit mask of the inputs that change
+        self._input_mask = sum(1 << i for i in direction)  # bit mask of the inputs with components of the direction
 
     def differentiate(self, expr: Affine) -> Affine:
         """Return the derivative of an expression."""

@@ -49,19 +49,19 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of Taylor steps, as in kernels/steps/taylor_step.py
-# if a step is rejected because PREDICTION_ERROR > 1, the next step size is chosen so that it would have this value
+# if a step is rejected because PREDICTION_ERROR > 1, the next step size is chosen so that this error will be about
 TARGET_ERROR = 0.3
-MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of successive step sizes: its minimum, safety factor, maximum
-MAX_REJECTIONS = 10  # a run leaves its lane after more successive rejected steps than this
-FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
+MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # of the ratio of successive step sizes: minimum, safety factor, maximum
+MAX_REJECTIONS = 10  # if more successive steps than this are rejected, the run leaves its lane
+FIRST_UNIT = 0.01  # unit of time of the first series of a run, relative to the duration t1 - t0 of the run
 # a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
 CONTRACTION = 0.5  # a projection fails if the ratio of a correction to the previous correction is above this
-N_PARALLEL = 3  # number of coordinates whose series a loop evaluates: each of them needs 3 of the 16 vector registers
+N_PARALLEL = 3  # number of coordinates whose series one loop evaluates: each needs 3 of the 16 vector registers
 
 
 class LaneMemory(NamedTuple):
-    """Order of the series, pointer to `work`, and pointers to the arrays in `work`, see kernels/lanes/layout.py."""
+    """Order of the Taylor series, pointer to `work`, and pointers to arrays in `work`, see kernels/lanes/layout.py."""
 
     order: Value
     work: Value
@@ -84,7 +84,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Store and return UNIT, the unit of time (s) of the series; choose it in new runs and after accepted steps."""
+        """Store and return UNIT, the unit of time (s) of the series: a new one in new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -100,7 +100,7 @@ class LaneSteps:
         return unit
 
     def choose_sizes(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store the step sizes H and X, computed from the last two terms of the series; update RUNNING and ACTIVE."""
+        """Store the step size H (s), by the last two terms of the series, and X = H / UNIT; stop runs if H is tiny."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, norms = emit.constant(1.0), []
@@ -231,7 +231,7 @@ class LaneSteps:
         return None
 
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store ACCEPTED, and LONGEST, the largest next step size; clear RUNNING after MAX_REJECTIONS or a NaN."""
+        """Store ACCEPTED, and LONGEST, the largest next step size; clear RUNNING in lanes whose run has to stop."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, one / emit.to_double(order)
         off, *defects = (emit.load(work, field) for field in (lanes.PREDICTION_ERROR, lanes.WORST_DEFECT, lanes.DEFECT))
@@ -255,7 +255,7 @@ class LaneSteps:
         store_mask(emit, work, lanes.ACCEPTED, is_accepted)
         n_refused = emit.load(work, lanes.N_REJECTED)
         n_refused = select(is_running & is_refused, n_refused + one, n_refused)
-        # if a value is not finite, end the run: shorter steps might jump over a point where the equations are undefined
+        # if an error is not finite, end the run: shorter steps might jump over a point where equations are undefined
         n_refused = select(is_valid, n_refused, emit.constant(math.inf))
         emit.store(n_refused, work, lanes.N_REJECTED)
         h_longest = emit.load(work, lanes.H) * select(is_refused, factor, emit.constant(MAX_FACTOR))
@@ -278,7 +278,7 @@ class LaneSteps:
         return broadcast_entry(emit, control, lanes.RTOL), atol
 
     def memory(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> LaneMemory:
-        """Return the pointers to the arrays in `work`; store the pointers to coefficients in `emit`."""
+        """Return the LaneMemory for `work`; give `emit` the pointers to the coefficients."""
         *fixed, series = lanes.array_offsets(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
         emit.constants = emit.builder.advance(control, integer(lanes.ATOL + self.n))
@@ -319,10 +319,10 @@ SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by colum
 def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: SparseRows) -> Value:
     """Return a mask of the lanes where det G1 G0^T <= 0: steps in these lanes may have passed a singular position.
 
-    G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula,
-    the determinant is the inner product of the vectors of maximal minors of G0 and G1. It is positive if these vectors
-    are similar. A step through a position at which the rows become dependent may lead to another assembly: then all
-    minors pass through zero and change their signs. A lane with a zero pivot is in the mask, too.
+    G0 (`before`) and G1 (`after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet
+    formula, the determinant is the inner product of the vectors of maximal minors of G0 and G1. It is positive if these
+    vectors are similar. A step through a position at which the rows become dependent may lead to another assembly: then
+    all minors pass through zero and change their signs. A lane with a zero pivot is in the mask, too.
     """
     matrix: list[dict[int, Value]] = [{} for _ in before]
     for i, row in enumerate(after):
@@ -357,8 +357,7 @@ Array = NDArray[np.float64]
 
 WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero, because they are rounding errors of products like A A
 
-
-# A, b, c of an explicit Runge-Kutta method (its first stage is the state itself), and weights of two error estimates
+# Butcher tableau A, b, c of an explicit Runge-Kutta method (its first stage is the state), and weights of two estimates
 Tableau = tuple[Array, Array, Array, Array, Array]
 
 
@@ -378,7 +377,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Store NEW, the state at the time X after the beginning of the step, and ERROR, which is valid if X is H."""
+        """Store NEW, the state at the time X (s) after the step's beginning, and ERROR, which is valid if X = H."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -431,7 +430,7 @@ class _Coordinate:
             emit.store(self._loaded[count - 1], *self._acceleration_locations[count - 1])
 
     def sum(self, weights: Array) -> Value:
-        """Return the sum of the accelerations at the stages, multiplied by `weights`, one for each stage."""
+        """Return the sum over the stages of the acceleration times its weight."""
         total: Value | None = None
         for k, weight in enumerate(weights.tolist()):
             if abs(weight) > WEIGHT_ROUNDING:
@@ -459,15 +458,15 @@ class _Coordinate:
 
 
 GOLDEN_SECTION = 0.6180339887498949  # the multiples of this number, modulo 1, are spread evenly on [0, 1]
-MAX_PARTS = 1000.0  # largest number of parts of a step; the defect is evaluated between parts
-MAX_SERIES_OPERATIONS = 1500  # largest number of operations of a series; to compile 1500 takes some seconds
+MAX_PARTS = 1000.0  # largest number of equal parts of a step, between which the defect is evaluated
+MAX_SERIES_OPERATIONS = 1500  # no code is generated for series with more operations; to compile 1500 takes some seconds
 
 
 class LaneCode(LaneSteps):
     """Generator of the code of one mechanism for SIMD lanes, including the step-size control.
 
-    series : whether to generate code for the Taylor series, too.
-    tableau : tableau of an explicit method, to generate code for its stages.
+    series : True: generate code for Taylor steps, too.
+    tableau : Butcher tableau of an explicit Runge-Kutta method: generate code for its stages. None: no such code.
 
     Raise Untraceable if the equations, or their series, cannot be generated; the message says why.
     """
@@ -498,7 +497,7 @@ class LaneCode(LaneSteps):
         self._row_program = Program(equations.graph, {"G": [rows[k, j] for k, j in self._row_entries]})
         programs = [*equations.accelerations, equations.position_projection, equations.basic_projection]
         programs += [equations.redundant_rows, *([self.solution.factor_program] if series else [])]
-        # `_structure` gives indices to the coefficients of the program for G, also if the code is read from the disk
+        # `_structure` assigns array indices to coefficients, which are needed even if the code is read from the disk
         self.structure = self._structure(programs if series else [*programs, self._row_program])
         self.n_numbers = self.numbers.n_varying
         programs += [self.solution.solution_program] if series else []
@@ -513,7 +512,7 @@ class LaneCode(LaneSteps):
         return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit_tasks
 
     def series_size(self, order: int) -> int:
-        """Return the number of vectors in memory for the coefficients of a series up to `order`, and for scratch."""
+        """Return the number of vectors in `work` for the coefficients of a series up to `order`, and for scratch."""
         assert self.recurrences is not None
         return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
@@ -554,10 +553,10 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.ACTIVE, is_valid)
 
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store WORST_DEFECT, the largest defect at equidistant times within the step, at most GAP apart.
+        """Store WORST_DEFECT, the largest defect at equidistant times within the step, at most GAP (s) apart.
 
-        T_NEW becomes each of these times, and finally the end of the step. The times are shifted by SHIFT, a multiple
-        of the golden section modulo 1, as far as GAP allows, so that they differ from step to step.
+        T_NEW becomes each of these times, and finally the end of the step. The times differ from step to step: they are
+        shifted by SHIFT, a multiple of the golden section modulo 1, as far as GAP allows.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -585,7 +584,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct the positions NEW once in lanes with ACTIVE = 1; set ACTIVE and UNCONVERGED (1: success)."""
+        """Correct the positions NEW once in lanes with ACTIVE = 1; set ACTIVE and UNCONVERGED to 1 (success) or 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -594,7 +593,10 @@ class LaneCode(LaneSteps):
         emit.store(emit.constant(math.inf), work, lanes.LAST_CORRECTION)
 
     def correct_state(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Project NEW once in lanes with UNCONVERGED = 1; store a, lam, ACTIVE (converged) and UNCONVERGED."""
+        """Project NEW once in lanes with UNCONVERGED = 1; store accelerations and multipliers.
+
+        ACTIVE becomes 1 in lanes that have converged, and UNCONVERGED in lanes that need another pass; else 0.
+        """
         memory = self.memory(emit, order, control, work)
         was_active, is_unfinished = (is_set(emit, work, field) for field in (lanes.ACTIVE, lanes.UNCONVERGED))
         is_active, moved = self._project(emit, self.equations.basic_projection, lanes.UNCONVERGED, memory)
@@ -613,7 +615,7 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.ACTIVE, has_finished | converged)
 
     def _project(self, emit: LaneEmitter, outputs: Program, field: int, memory: LaneMemory) -> tuple[Value, Value]:
-        """Correct NEW by a projection program, in the lanes where `field` is 1.
+        """Correct NEW by the projection program `outputs`, in the lanes where `field` is 1.
 
         Return a mask of the lanes whose correction is valid, and the largest change of a position in each lane.
         """
@@ -652,7 +654,7 @@ class LaneCode(LaneSteps):
         return orientation_change_mask(emit, *(self._row_values(emit, memory, *end) for end in ends_of_step))
 
     def _row_values(self, emit: LaneEmitter, memory: LaneMemory, time: int, base: Value) -> list[dict[int, Value]]:
-        """Return the nonzero entries of each row of G, by column; `time`: field of t; `base`: pointer to the state."""
+        """Return the nonzero entries of each row of G, by column; `time`: field T or T_NEW; `base`: pointer to q, v."""
         inputs = [emit.load(memory.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
         _, (entries,) = lower_program(emit, self._row_program, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
@@ -681,8 +683,8 @@ class LaneConstraints(LaneSteps):
     system : a system without nonholonomic rows.
 
     Fields:
-    pattern : sparsity pattern of C_q: first, for each row, the index in `pattern` of its first column; then the length
-        of `pattern`; then the columns of the entries of all rows.
+    pattern : sparsity pattern of C_q in one array: for each row, the index in this array where its columns begin; then
+        the length of the array; then the columns of the entries, row by row.
 
     Raise Untraceable if the constraints cannot be generated; the message says why.
     """
@@ -704,7 +706,7 @@ class LaneConstraints(LaneSteps):
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._program.quantities())
 
     def compute_rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store in `LaneMemory.series` C, C_t and the entries of C_q at the state NEW and the time T_NEW."""
+        """Store C, C_t and the entries of C_q at the state NEW and the time T_NEW in the array `LaneMemory.series`."""
         memory = self.memory(emit, order, control, work)
         inputs = [emit.load(work, lanes.T_NEW), *(emit.load(memory.new, i) for i in range(2 * self.n))]
         lowering, arrays = lower_program(emit, self._program, inputs, self.numbers)
@@ -714,7 +716,7 @@ class LaneConstraints(LaneSteps):
         clear_active_unless(emit, work, lowering.is_valid(self._program, values))
 
 
-SECONDS_PER_QUANTITY = 3e-4  # estimated time (s) to compile the operation of one quantity
+SECONDS_PER_QUANTITY = 3e-4  # estimated time (s) to compile one operation
 ELIMINATION_MODULES = (elimination, null_space, compile_equations)  # modules that write the code of accelerations
 # modules that write the code: cached code is invalid after a change of one of them
 CODE_MODULES = (series, *ELIMINATION_MODULES, program, lane_series, llvm_code, llvm_text)
@@ -726,7 +728,7 @@ FILE_PREFIX = "lanes"  # first part of the names of cached files
 class GeneratedLanes(Generic[Code]):
     """Compiled code of a mechanism for SIMD lanes; its coefficients are computed from parameters.
 
-    tape : ParameterTape (parameter_expressions.py) of the traces of `code`.
+    tape : ParameterTape (parameter_expressions.py), which computes the coefficients of `code` from parameters.
     """
 
     def __init__(self, tape: ParameterTape, code: Code):
