@@ -260,7 +260,7 @@ class CheckedRegion:
         self.bounds = self._ranges
 
     def is_comparison_due(self) -> bool:
-        """Return whether calls and traces must be compared at all sampled states of the next run: in runs 1, 2, 4, 8, ..."""
+        """Return whether the next run compares calls and traces at all sampled states: runs 1, 2, 4, 8, ... do."""
         return (self._runs + 1) & self._runs == 0
 
     def count_run(self) -> None:
