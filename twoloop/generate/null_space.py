@@ -237,7 +237,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve the equations `rows` of G a = gamma for the accelerations `columns`; insert these in the others."""
+        """Solve equations `rows` of G a = gamma for accelerations `columns`; insert these in the other equations."""
         self.check_length()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)
@@ -318,7 +318,10 @@ class DependentCoordinates:
 def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations, and pairs of expressions; the reduced mass matrix is regular if first > second."""
+    """Return the accelerations (n_q,), and conditions under which the reduced mass matrix T^T M T is not singular.
+
+    A condition is a pair of expressions, the first of which must be larger. `mass`, `force`: M and Q.
+    """
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]

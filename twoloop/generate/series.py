@@ -226,7 +226,10 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return key, scale, first, second: factor * multiplier = scale * first * second; multiples share a key."""
+    """Return key, scale, first and second with factor * multiplier = scale * first * second.
+
+    Products that differ only by a constant factor have equal keys, so that one operation computes them.
+    """
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier
 
@@ -294,7 +297,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions in `exprs` as Sums, and their indices; `nodes`: quantities in the program."""
+    """Return the nonzero expressions as Sums, and their indices in `exprs`; `nodes`: program index of each quantity."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)

@@ -111,7 +111,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
 
 
 class DegreeAlgebra(Algebra[float]):
-    """Algebra of degrees: a value is the degree of a quantity as a polynomial in `inputs`; f(x) has that of x."""
+    """Algebra of degrees: a value is a quantity's degree as a polynomial in `inputs`; f(x) has the degree of x."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {

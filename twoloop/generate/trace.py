@@ -520,6 +520,7 @@ def derive_cached(
     """Return what `make` derives from traces (for example a series), with the parameters of one system inserted.
 
     `make` gets a TraceCache, and returns an object with a method `specialize`. Results are cached by `key`.
+
     The first TraceCache is shared with other systems. If callbacks cannot be traced with variable parameters, or if
     `check` raises Untraceable for the result (a callback may treat variable parameters differently from numbers), a
     cache for this system alone is used instead. If this fails in the same way, Untraceable is raised.
