@@ -1,10 +1,13 @@
-"""Solve M a + G^T lam = r, G a = c for accelerations a, in one of three forms (`f`: the kit, `w`: the workspace).
+"""Solve M a + G^T lam = r, G a = c for the accelerations a and the multipliers lam (`f`: kit, `w`: workspace).
 
-- NULL_SPACE, for few degrees of freedom: a = g + T x, where G g = c, the independent entries of g are 0, and the
-  columns of T = [I; D^T], D^T = -G_d^-1 G_i, are the velocities that the constraints allow. x is the solution of
-  (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
-- MULTIPLIERS: by the Schur complement G M^-1 G^T.
-- AUGMENTED: by sparse factors of the augmented matrix [M G^T; G 0], in which M is multiplied by w.mass_scale.
+M is the mass matrix, and G contains the independent rows of the constraint Jacobian. There are three forms:
+
+- NULL_SPACE, for few degrees of freedom. Let G_d and G_i be the columns of G for dependent and for independent
+  coordinates. The columns of T = [I; D^T], with D^T = -G_d^-1 G_i, are the velocities that the constraints allow. The
+  result is a = g + T x: g is the solution of G g = c whose independent entries are 0, and x solves
+  (T^T M T) x = T^T (r - M g). M need only be positive definite on the allowed velocities.
+- MULTIPLIERS: first solve (G M^-1 G^T) lam = G M^-1 r - c, with the Schur complement G M^-1 G^T.
+- AUGMENTED: use sparse factors of the augmented matrix [M G^T; G 0], in which M is multiplied by w.mass_scale.
 """
 
 import numpy as np
@@ -49,7 +52,7 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 @compiled
 def find_null_space(w):
-    """Store the null space of G in w.D, computed from rows and factors in w; keep the last row of w.D, see Work."""
+    """Store the matrix D in w.D: if G v = 0, dependent velocities are D^T times independent ones. Keep its last row."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -59,7 +62,7 @@ def find_null_space(w):
 
 @merged
 def _reduce_diagonal_mass(columns, independent, M, D, A, m):
-    """Store the upper triangle of T^T M T in A (n_dof, n_dof) for a diagonal M; m is scratch."""
+    """Store the upper triangle of T^T M T in A, for diagonal M and the allowed velocities T = [I; D^T]; m: scratch."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
     for i in range(independent.size):
@@ -73,7 +76,7 @@ def _reduce_diagonal_mass(columns, independent, M, D, A, m):
 
 @merged
 def _reduce_dense_mass(columns, independent, M, D, A, MT):
-    """Store the upper triangle of T^T M T in A (n_dof, n_dof) for any M; MT (n_q, n_dof) is scratch."""
+    """Store the upper triangle of T^T M T in A, for any M and the allowed velocities T = [I; D^T]; MT: scratch."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
         for j in range(n_dof):
@@ -95,7 +98,7 @@ def _reduce_dense_mass(columns, independent, M, D, A, MT):
 
 @merged
 def factor_reduced_mass(f, w):
-    """Store in w.A the LDL factors of T^T M T, computed from w.M and w.D; return a code."""
+    """Store in w.A the L D L^T factors of the mass matrix for independent velocities; return a code."""
     columns = columns_of(w.index_v)
     if f.diagonal_mass == 1:
         _reduce_diagonal_mass(columns, w.independent_v, w.M, w.D, w.A, w.x)
@@ -109,14 +112,14 @@ def factor_reduced_mass(f, w):
 
 @merged
 def solve_by_reduced_mass(f, w, r, c, a):
-    """Store in `a` the accelerations with M a + G^T lam = r and G a = c, using the factors of T^T M T."""
+    """Store in `a` the accelerations with M a + G^T lam = r and G a = c, by the factors from `factor_reduced_mass`."""
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
     n_dof, z, x, D, M = independent.size, w.z, w.x, w.D, w.M
     for k in range(rows.size):
         z[k] = c[rows[k]]
     solve_dependent(w.index_v, w.values_v, z)
     copy(r, a)
-    # `a` becomes r - M g; dependent entries of g are z, independent entries are 0
+    # `a` becomes r - M g, where G g = c: the dependent entries of g are z, and its independent entries are 0
     for k in range(columns.size):
         column = columns[k]
         if f.diagonal_mass == 1:
@@ -141,7 +144,7 @@ def solve_by_reduced_mass(f, w, r, c, a):
 
 @merged
 def multipliers_by_elimination(f, w, r, a, lam):
-    """Store the multipliers of the independent rows in lam, by solving the dependent columns of G^T lam = r - M a."""
+    """Store in lam the multipliers of the independent rows of G, from the dependent equations of G^T lam = r - M a."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         column = columns[k]
@@ -159,7 +162,7 @@ def multipliers_by_elimination(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Store in w.L the factors of w.M or, if M is constant and dense, its inverse, which is faster; return a code."""
+    """Store in w.L the factors of the mass matrix w.M, or M^-1 if M is constant and not banded; return a code."""
     if has_banded_mass(f):
         is_definite = factor_banded_mass(f, w) == DONE
     else:
@@ -172,13 +175,13 @@ def factor_mass(f, w):
 
 @merged
 def _apply_inverse_mass(f, w, x, y):
-    """Store M^-1 x in y, using w.L; unless M is constant, dense and not diagonal, x and y may be the same array."""
+    """Store M^-1 x in y, using w.L from `factor_mass`; x and y must be different arrays."""
     n = x.size
     if f.diagonal_mass == 1:
         for i in range(n):
             y[i] = x[i] * w.L[i, i]
     elif f.constant_mass == 1 and not has_banded_mass(f):
-        sum_rows(x, w.L, y)  # the inverse is symmetric; sums of rows are vectorised, sums of products would not be
+        sum_rows(x, w.L, y)  # the inverse is symmetric, and a sum of its rows, weighted by x, can be vectorised
     else:
         copy(x, y)
         if has_banded_mass(f):
@@ -198,7 +201,7 @@ def _is_equal(A, B):
 
 @merged
 def factor_schur_complement(f, w):
-    """Store in w.S the factors of S = G M^-1 G^T (G: independent rows), unless G and M are unchanged; return a code."""
+    """Store in w.S the factors of S = G M^-1 G^T (G: independent rows) if G or M has changed; return a code."""
     is_constant = f.constant_mass == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
@@ -224,7 +227,7 @@ def factor_schur_complement(f, w):
 
 @merged
 def solve_by_schur_complement(f, w, r, c, a):
-    """Store the accelerations in `a` and the multipliers of the independent rows in w.z, using the factors of S."""
+    """Store accelerations in `a`, multipliers of independent rows in w.z, by w.S, the factored Schur complement."""
     rows, M_inverse_G = w.rows_v, w.W
     _apply_inverse_mass(f, w, r, a)
     for i in range(rows.size):
@@ -238,13 +241,14 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-MIN_ROWS = 8  # smallest number of rows, and of degrees of freedom, where the augmented form is fastest (measured: 7)
-# smallest number of coordinates where the augmented form is always fastest, unless M is diagonal (measured: about 30)
+# the augmented form is used if there are at least MIN_ROWS constraints (it is fastest from 7 constraints), and at least
+# MIN_ROWS degrees of freedom or, unless M is diagonal, MIN_COORDINATES coordinates (it is fastest from about 30)
+MIN_ROWS = 8
 MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Return whether the augmented form is faster than the dense forms; `diagonal` is whether M is diagonal."""
+    """Return whether sparse factors (augmented form) are faster than dense ones; `diagonal`: whether M is diagonal."""
     return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
@@ -259,7 +263,7 @@ def _largest_entry(A):
 
 @compiled
 def _write_augmented_program(w):
-    """Store the program that factors the augmented matrix [M G^T; G 0] in w.index_a; return a code of choose_order."""
+    """Store the program that factors the augmented matrix [M G^T; G 0] in w.index_a; return a code (`choose_order`)."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     update_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
@@ -282,7 +286,7 @@ def _write_augmented_program(w):
 
 @compiled
 def _run_augmented_program(w):
-    """Store the factors of the augmented matrix in w.values_a; return False if the program does not suit the matrix."""
+    """Store the factors of the augmented matrix in w.values_a; return False if a pivot of the program is too small."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.mass_scale, w.entries.size
     source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
@@ -293,7 +297,7 @@ def _run_augmented_program(w):
 
 @compiled
 def factor_augmented(f, w):
-    """Factor the augmented matrix; if its factors are not sparse, set f.form to a dense form; return a code."""
+    """Factor the augmented matrix [M G^T; G 0]; set f.form to a dense form if factors are not sparse; return a code."""
     w.n_factorizations += 1
     has_new_entry = f.constant_mass == 0 and update_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or has_new_entry or not _run_augmented_program(w):
@@ -313,7 +317,7 @@ def factor_augmented(f, w):
 
 @compiled
 def solve_augmented(w, r, c, a):
-    """Store the accelerations in `a` and the multipliers of the independent rows in w.z, using the sparse factors."""
+    """Store accelerations in `a`, multipliers of independent rows in w.z, by the factors from `factor_augmented`."""
     n, size, scale = r.size, w.index_a[at.SIZE], w.mass_scale
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
@@ -334,7 +338,7 @@ def solve_augmented(w, r, c, a):
 
 @compiled
 def _factor_augmented_or_dense(f, w):
-    """Factor the augmented matrix; if a dense form replaces this form, store w.D or the factors of M; return a code."""
+    """Factor the augmented matrix; if this changes f.form, store what the dense form needs in w; return a code."""
     code = factor_augmented(f, w)
     if code == DONE and f.form == NULL_SPACE:
         find_null_space(w)
@@ -345,7 +349,7 @@ def _factor_augmented_or_dense(f, w):
 
 @merged
 def factor(f, w):
-    """Factor the equations of the accelerations, from w.M, w.D, the rows of G and their factors; return a code."""
+    """Factor the equations of the accelerations in the form f.form, unless w.factored is 1; return a code."""
     if w.factored == 1.0:
         return DONE
     code = _factor_augmented_or_dense(f, w) if f.form == AUGMENTED else DONE
@@ -375,7 +379,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Store in lam the multipliers of the independent rows for the last solution `a`; leave other entries unchanged."""
+    """Store in lam the multipliers of independent rows that belong to `a`, the last solution; keep other entries."""
     if f.form == NULL_SPACE:
         multipliers_by_elimination(f, w, r, a, lam)
     else:
@@ -394,8 +398,9 @@ def solve_with_multipliers(f, w, r, c, a, lam):
 def least_norm(w, lam):
     """Replace lam by the multipliers of least norm that give the same reactions G^T lam.
 
-    Redundant row i is the sum over k of Z[i, k] times independent row k. The null space of G^T is spanned by the
-    columns n_i = e_i - sum_k Z[i, k] e_k of a matrix N, and lam -= N (N^T N)^-1 N^T lam.
+    Redundant row i of G is the sum, over independent rows k, of Z[i, k] times row k. So the vectors e_i - sum_k Z[i, k]
+    e_k (e: unit vectors) are in the null space of G^T. They are the columns of a matrix N; the part N (N^T N)^-1 N^T
+    lam of lam in the null space is subtracted.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     r, n_red = rows.size, lam.size - rows.size

@@ -1,15 +1,17 @@
 """Factor and solve the matrix [M G^T; G 0] of a large system by a program, see symbolic_factorization.py.
 
-An independent row of G has a negative pivot: minus the squared norm of the part of the row that is orthogonal to
-previous rows, in the metric of M^-1. The squared norm of the row itself is the sum of contributions of the bodies. The
-ratio of the two squared norms is the squared sine of the angle between the row and the previous rows. For a redundant
-row, 0 replaces 1 / pivot, which removes the row from the solution without another program. If the smallest squared sine
-is 10^-k, solutions lose k digits, which refinement with M and G recovers.
+M is the mass matrix, and G the constraint Jacobian. An independent row of G has a negative pivot: minus the squared
+norm of the part of the row that is orthogonal to previous rows, in the metric of M^-1. The squared norm of the row
+itself is the sum of contributions of the bodies. The ratio of the two squared norms is the squared sine of the angle
+between the row and the previous rows. For a redundant row, 0 replaces 1 / pivot, which removes the row from the
+solution without another program. If the smallest squared sine is 10^-k, solutions lose k digits, which refinement with
+M and G recovers.
 
-If a body's M is singular, as it is with four Euler parameters, rows g of this body alone stiffen M: M + s g g^T
-replaces M. This does not change accelerations, because g a is prescribed; the multiplier of g decreases by s g a. So M
-need only be positive definite on the velocities that these rows allow. A redundant row, as it occurs in loops through a
-hub, may stiffen M, too; then s g^T (g a) is added to the right-hand side.
+The matrix M of a body may be singular, as it is with four Euler parameters. Then M + s g g^T replaces M for each row g
+of G that involves this body only; s is a positive number. Accelerations stay the same, because the constraint
+prescribes g a, but the multiplier of g decreases by s g a. So M need only be positive definite on the velocities that
+these rows allow. A row g that is redundant, as in closed loops, may be added, too. Its constraint is not part of the
+solution; so s g^T (g a), with the prescribed value of g a, is added to the right-hand side.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -24,12 +26,12 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     update_runs_of,
 )
 
-NOT_DEFINITE = -1.0  # `factor` returns this in place of the smallest squared sine if a pivot of M is not positive
+NOT_DEFINITE = -1.0  # result of `factor` if a pivot of M is not positive; otherwise, the result is at least 0
 
 
 @compiled
 def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Store s = m / |g|^2 in `stiffness` for rows g to be added to M as s g g^T; m: largest M_jj of g's columns j."""
+    """Store s = m / |g|^2 for rows g of G that are added to M as s g g^T; m: largest M_jj of the columns j of g."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -55,7 +57,10 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store G, and M with added terms s g g^T, in `values`; store s in `stiffness`; `scratch`: one number per pivot."""
+    """Store [M G^T; G 0] in `values`, after adding terms s g g^T to a singular M for some rows g of G.
+
+    The numbers s are stored in `stiffness`, see `_fill_stiffness`. `scratch`: one number for each pivot.
+    """
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_entries_of(program)
@@ -75,9 +80,10 @@ def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
 def factor(program, is_independent, values, sizes, min_sine_square):
     """Replace the matrix in `values` by its factors, with 1/pivot on the diagonal; return the smallest squared sine.
 
-    The squared sine of a row is -pivot / (squared norm of the row), with norms from `sizes`. `is_independent` is
-    0 for redundant rows, and becomes 0 for rows with a squared sine up to `min_sine_square`; these rows do not affect
-    the result. Return NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
+    The sine is that of the angle between a row of G and the previous rows. Its square is -pivot / (squared norm of the
+    row); the squared norms are stored in `sizes`. On entry, `is_independent` is 0 for rows that count as redundant. It
+    becomes 0 for rows whose squared sine is at most `min_sine_square`. Rows with 0 do not affect the result. If M is
+    not positive definite on the velocities that the rows allow, return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)
@@ -114,7 +120,7 @@ def factor(program, is_independent, values, sizes, min_sine_square):
             slot = s + 1
             while slot < last:
                 size = runs[u]
-                if multiplier != 0.0:  # two thirds of the multipliers are 0 if a planar mechanism is modelled in space
+                if multiplier != 0.0:  # two thirds of the entries of L are 0 if a planar mechanism is modelled in space
                     target_run, source_run = values[runs[u + 1] : runs[u + 1] + size], values[slot : slot + size]
                     for i in range(size):
                         target_run[i] -= multiplier * source_run[i]
@@ -126,10 +132,13 @@ def factor(program, is_independent, values, sizes, min_sine_square):
 
 @compiled
 def solve(program, values, stiffness, x, y):
-    """Replace the right-hand side x = [r, c] by the solution [a, lam], using the factors `values`; y is scratch."""
+    """Replace x = [r, c] by the solution [a, lam] of M a + G^T lam = r, G a = c, using the factors `values`.
+
+    `stiffness`: the number s for each row g of G that was added to M as s g g^T. y is scratch.
+    """
     n, order, n_q = program[N_PIVOTS], pivot_order_of(program), program[N_COORDINATES]
-    # with M + s g g^T in place of M, r should become r + s g c. If r stays the same, so do accelerations, because
-    # g a = c, but the multiplier of g is smaller by s c; the last loop adds s c
+    # `values` are factors for M + s g g^T; so r + s c g^T should replace r. Without this, accelerations stay the same,
+    # because g a = c, but the multiplier of g is too small by s c. The last loop adds s c
     begin, row_of = factor_columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -149,7 +158,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, rhs, right):
-    """For each redundant row g, if s g g^T was added to M, add s g^T c_g to `right`; c_g: the entry of g in `rhs`."""
+    """For each redundant row g of G that was added to M as s g g^T, add s c g^T to `right`; c: its entry in `rhs`."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)
     product_rows, first, second, _ = stiffening_products_of(program)
@@ -161,7 +170,7 @@ def add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, rh
 
 @compiled
 def subtract_product(program, mass, jacobian, is_independent, x, b):
-    """Subtract [M x_q + G^T x_c, G x_q], where x = [x_q, x_c], from b in place; set b to zero in redundant rows."""
+    """Subtract [M G^T; G 0] x from b in place; then set the entries of redundant rows of G in b to zero."""
     n_q = program[N_COORDINATES]
     rows, columns, _ = mass_entries_of(program)
     for k in range(rows.size):
@@ -178,7 +187,7 @@ def subtract_product(program, mass, jacobian, is_independent, x, b):
 
 @compiled
 def solve_refined(program, mass, jacobian, is_independent, values, stiffness, x, n_corrections, right, residual, y):
-    """Replace the right-hand side x = [r, c] by the solution [a, lam], corrected `n_corrections` times by refinement.
+    """Replace x = [r, c] by the solution [a, lam] of M a + G^T lam = r, G a = c; correct it `n_corrections` times.
 
     Return the last correction of a, relative to max|a|; 0: no corrections. The last three arguments are scratch.
     """

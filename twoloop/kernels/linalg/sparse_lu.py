@@ -1,12 +1,14 @@
-"""Factor the unsymmetric Newton matrix of a large system in a fixed order of pivots, and group the columns of K and D.
+"""Factor the unsymmetric matrix of Newton's method for a large system, in a fixed order of pivots.
 
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
 
-symbolic_factorization.py chooses the order of elimination, by the pattern alone; its argument `couplings` contains the
-entries of K and D. Pivots are single entries. The program lists the entries of M, then of K and D, and ends with groups
-of columns of K and D: no two columns of a group have an entry in the same row, so that one displacement yields all
-columns of the group by differences (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
+M is the mass matrix, and G the constraint Jacobian. K and D are the derivatives of the forces by positions and by
+velocities; z is proportional to the step size. symbolic_factorization.py chooses the order of elimination, by the
+pattern alone; its argument `couplings` contains the entries of K and D. Pivots are single entries. The program lists
+the entries of M, then of K and D. It ends with groups of columns of K and D: no two columns of a group have an entry in
+the same row. So differences after one displacement, of all coordinates of a group, yield all columns of the group
+(Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,7 +34,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     update_runs_of,
 )
 
-MIN_PIVOT = 1e-11  # pivots below this fraction of the sum of their |terms| may be rounding errors of zero
+MIN_PIVOT = 1e-11  # smallest pivot, relative to the sum of its absolute terms; smaller ones may be rounding errors
 
 
 def newton_program(
@@ -44,9 +46,9 @@ def newton_program(
     body_groups: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors Newton's matrix, as `factorization_program` does for M and G.
+    """Return the program that factors Newton's matrix; None if it would have too many updates.
 
-    `tangents`: entries of K and D, both triangles, in the order of `grouped_entries`.
+    `tangents`: entries of K and D (derivatives of forces), both triangles, in the order of `grouped_entries`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
     group_begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
@@ -57,13 +59,13 @@ def newton_program(
 
 
 def grouped_entries(tangents: Entries, n_q: int) -> Entries:
-    """Return the entries of K and D, sorted by the groups of their columns."""
+    """Return `tangents`, the entries of K and D (derivatives of the forces), sorted by groups of columns."""
     sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
     return tangents[0][sequence], tangents[1][sequence]
 
 
 def column_groups(entries: Entries, n_q: int) -> Integers:
-    """Return the index of the group of each column (n_q); no two columns of a group have an entry in the same row."""
+    """Return the number of the group of each column (n_q); no two columns of a group have an entry in the same row."""
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
     for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
@@ -80,9 +82,10 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangent_entries_of(program):
-    """Return the rows and the columns of the entries of K and D, and the index of the first entry of each column group.
+    """Return the rows and columns of the entries of K and D, and the index of the first entry of each group of columns.
 
-    One displacement yields all columns of a group. The last index is the number of entries.
+    K and D are derivatives of the forces; one displacement yields all columns of a group. Behind the index of the last
+    group's first entry, the number of entries follows.
     """
     group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
@@ -92,7 +95,10 @@ def tangent_entries_of(program):
 
 @compiled
 def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
-    """Store Newton's matrix for real or complex z in `values`; `stiffness`: factors s of rows g added as s g g^T."""
+    """Store Newton's matrix [M - z^2 K - z D, G^T; G, 0] in `values`, for real or complex z.
+
+    `stiffness`: the number s for each row g of G that is added to a singular M as s g g^T.
+    """
     for s in range(values.size):
         values[s] = 0.0
     n_off = program[N_OFF_DIAGONAL]
@@ -115,7 +121,7 @@ def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
 
 @compiled
 def factor(program, is_independent, values, sizes):
-    """Replace the matrix in `values` by its factors, 1/pivot on the diagonal; return False if a pivot is too small.
+    """Replace the matrix in `values` by its factors L U, 1/pivot on the diagonal; return False if a pivot is too small.
 
     Factors of redundant rows (0 in `is_independent`) become 0, so that solutions do not use them. `sizes` is scratch.
     """
@@ -169,7 +175,7 @@ def factor(program, is_independent, values, sizes):
 
 @compiled
 def solve(program, values, x, y):
-    """Replace the right-hand side x = [r, c] by the solution, using the factors `values`; y is scratch."""
+    """Replace x, a right-hand side of Newton's equations, by the solution, using the factors `values`; y is scratch."""
     n, n_off, order = program[N_PIVOTS], program[N_OFF_DIAGONAL], pivot_order_of(program)
     begin, row_of = factor_columns_of(program)
     for k in range(n):

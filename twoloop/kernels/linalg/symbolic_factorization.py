@@ -3,18 +3,19 @@
     [M  G^T]
     [G   0 ]  = L D L^T
 
-The matrix is factored in an order of elimination that is chosen once, by the pattern of entries alone. Pivots are
-single entries: see sparse_ldl.py and sparse_lu.py. A "slot" is the index of a number in the array of the factors, which
-contains the pivots in their order, then the columns of L, each downwards.
+M is the mass matrix, and G the constraint Jacobian. The order of elimination is chosen once, by the pattern of entries
+alone. Pivots are single entries: see sparse_ldl.py and sparse_lu.py. A "slot" is the index of a number in the array of
+the factors, which contains the pivots in their order, then the columns of L, each downwards.
 
 Terms: coordinates that M couples, or that the system declares as a group, form a body. The rows of G that involve the
 same bodies form a joint. A body with more than MAX_JOINTS joints is a hub. A part is a set of bodies that eliminated
-joints connect. A support of a part is the ground, or a hub, to which an eliminated joint connects it.
+joints connect. A support of a part is the ground, or a hub, to which an eliminated joint connects the part.
 
 Bodies other than hubs are eliminated first. G M^-1 G^T remains, which is positive definite, so that any order of its
-joints is stable. To eliminate a hub, too, would couple all its joints; so hubs are ordered among the joints, by minimum
-degree with one condition. A joint that involves a hub, directly or through eliminated joints, may be eliminated before
-this hub only if its rows are independent without the motion of the hub: one of its parts must have no support yet.
+joints is stable. If hubs were also eliminated first, all joints of a hub would be coupled. So hubs are ordered among
+the joints by minimum degree, with one condition. A joint may be eliminated before a hub that it involves, directly or
+through eliminated joints, only if its rows are independent even while the hub is at rest: one of the parts that the
+joint connects must have no support yet.
 """
 
 import heapq
@@ -52,20 +53,20 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Supports of the parts (see the module's docstring) while joints and hubs are eliminated one after another."""
+    """Record the supports of each part (see the module's docstring) during the elimination of joints and hubs."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        # hubs with a single coordinate: a joint with such a hub may fix a part, and counts as a joint with the ground
+        # hubs with a single coordinate. A joint with such a hub may fix a part; so it counts as a joint with the ground
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
-        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support each part
+        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs supporting the part of a body
         # for each hub: one body of each part that the hub supports or has supported
         self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def can_eliminate(self, joint: int) -> bool:
-        """Return whether a joint may be eliminated next, see the module's docstring."""
+        """Return True if one of the parts that the joint connects has no support, or if the joint involves no hub."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone_bodies and any(not self.is_grounded[p] and not self.hubs_by_part[p] for p in parts):
@@ -87,7 +88,7 @@ class _PartSupports:
         self._merge_parts([hub, *supported_bodies], False, frozenset())
 
     def _merge_parts(self, bodies: Iterable[int], is_grounded: bool, hubs: AbstractSet[int]) -> None:
-        """Merge the parts that contain `bodies`; add `hubs`, and the ground if `is_grounded`, to their supports."""
+        """Merge the parts of `bodies`; add `hubs` and, if `is_grounded`, the ground to the supports of the result."""
         first, *others = bodies
         part = self.parts.find(first)
         for body in others:
@@ -117,15 +118,15 @@ def elimination_order(
     ----------
     n_q, n_rows : int
     mass_entries, jacobian_entries : (rows, columns)
-        Entries of M and of G.
+        Indices of the nonzero entries of M (mass matrix) and of G (constraint Jacobian).
     body_groups : iterable of sequence of int
         Groups of coordinates that form one body each, even if M does not couple them.
     early_rows : sequence of int
-        Rows of single bodies. Unless the body is a hub, its rows are eliminated before all joints, so that a dependence
-        on other rows cannot make their pivots small.
+        Rows of G that involve a single body each. Unless the body is a hub (it has many joints), these rows are
+        eliminated before all joints, so that a dependence on other rows cannot make their pivots small.
     couplings : (rows, columns), optional
-        Entries of K and D (derivatives of forces), which couple bodies as springs do. All bodies are then hubs, and
-        each is eliminated together with its `early_rows`.
+        Entries of K and D (derivatives of the forces), which couple bodies as springs do. If given, all bodies are
+        treated as hubs, and each body is eliminated together with its `early_rows`.
     """
     body_of = bodies_of(n_q, mass_entries, body_groups)
     bodies_in_row: list[set[int]] = [set() for _ in range(n_rows)]
@@ -168,7 +169,10 @@ def elimination_order(
 
 
 def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], groups: Iterable[Sequence[int]]) -> list[int]:
-    """Return for each coordinate the first coordinate of the same body, which identifies the body."""
+    """Return, for each coordinate, the first coordinate of its body, which identifies the body.
+
+    Coordinates belong to the same body if an entry of M couples them, or if they are in one of the `groups`.
+    """
     pairs = np.array([(first, other) for first, *others in groups for other in others], dtype=np.int64).reshape(-1, 2)
     rows, columns = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
     representatives, previous = np.arange(n_q), np.full(n_q, -1)
@@ -192,8 +196,9 @@ def _minimum_degree_order(
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    Among the joints and hubs that may be eliminated, the next is the one whose neighbours have the fewest rows and
-    coordinates (`sizes`). `pairs`: hubs that are coupled otherwise than by a joint. `lone_bodies`: see `_PartSupports`.
+    Hubs are bodies with many joints. The next joint or hub is the one, of those allowed, whose neighbours have the
+    fewest rows and coordinates (`sizes`). `pairs`: hubs coupled otherwise than by a joint. `lone_bodies`: see
+    `_PartSupports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -224,7 +229,7 @@ def _minimum_degree_order(
         if is_eliminated[node] or degree_on_heap != degree(node):
             continue  # this entry of the heap is outdated: a newer one replaces it
         if node < n_joints and not supports.can_eliminate(node):
-            continue  # after a hub is eliminated, this joint, which is its neighbour, is put on the heap again
+            continue  # the joint must wait for the elimination of a hub beside it, which puts it on the heap again
         is_eliminated[node] = True
         order.append(node)
         affected_nodes = neighbours[node]
@@ -242,20 +247,20 @@ def _minimum_degree_order(
 
 Entries = tuple[Integers, Integers]  # row indices and column indices of the nonzero entries of a matrix
 
-# indices of the sizes at the beginning of a program; functions at the end of this module return its other sections
+# indices of the sizes at the beginning of a program; functions at the end of this module return its later sections
 (
     N_COORDINATES,  # n_q
     N_PIVOTS,  # number of coordinates and rows
     N_OFF_DIAGONAL,  # number of entries of L below the diagonal
-    N_UPDATES,  # number of updates, each a multiplication and a subtraction
+    N_UPDATES,  # number of updates in the elimination, each a multiplication and a subtraction
     N_RUNS,  # length of the section that `update_runs_of` returns
     N_OF_MASS,  # number of entries of M
     N_OF_JACOBIAN,  # number of entries of G
-    N_STIFFENED,  # number of products of two entries of G that are added to a singular M
+    N_STIFFENED,  # number of products of two entries in a row of G, which are added to a singular M
     N_HEAD,
 ) = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program with at most this number of updates is always written
-# a longer program of n pivots is written if it has at most MAX_UPDATE_RATIO n^3 updates: else dense factors are faster
+# a longer program for n pivots is written if it has at most MAX_UPDATE_RATIO * n^3 updates; else dense factors are used
 MAX_UPDATE_RATIO = 1e-3
 MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer program takes too much memory
 
@@ -268,9 +273,9 @@ def factorization_program(
     body_groups: Iterable[Sequence[int]] = (),
     stiff_rows: Sequence[int] = (),
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors M and G; None if the program would have too many updates.
+    """Return the program that factors [M G^T; G 0]; None if the program would have too many updates.
 
-    mass, jacobian : entries of M, both triangles, and of G. If an entry is listed repeatedly, its numbers are added.
+    mass, jacobian : entries of M, both triangles, and of G. If an entry is listed repeatedly, its values are added.
     body_groups : groups of coordinates that form one body each, even if M does not couple them.
     stiff_rows : rows g of G that are added to M as s g g^T, because M is singular; M must have the entries of g g^T.
     """
@@ -283,7 +288,7 @@ def program_in_order(
 ) -> NDArray[np.int32] | None:
     """Return the program for an order of elimination; None if the program would have too many updates.
 
-    `unsymmetric`: factors also contain U; entry (i, j) of U has the slot of (j, i) of L, plus program[N_OFF_DIAGONAL].
+    If `unsymmetric`, factors are L U: entry (i, j) of U is program[N_OFF_DIAGONAL] numbers behind entry (j, i) of L.
     """
     n = len(order)
     position = np.empty(n, dtype=np.int64)
@@ -313,7 +318,7 @@ def program_in_order(
     runs = _update_runs(slots_of(first_of, second_of), first_of == second_of)
     entry_slots = slots_of(low, high)
     n_mass = len(mass[0])
-    # entries of M above the diagonal get slots of U, or, with symmetric factors, a slot that is never read
+    # entries of M above the diagonal are stored in U or, if factors are symmetric, at an index that is never read
     is_above = rows[:n_mass] < columns[:n_mass]
     n_off_diagonal = len(entry_keys)
     entry_slots[:n_mass][is_above] = (
@@ -328,10 +333,11 @@ def program_in_order(
 
 
 def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Divide the off-diagonal updates into "runs" with consecutive target slots; return [length, first target] of each.
+    """Divide the updates of off-diagonal entries into runs; return the length and the first target of each run.
 
-    The rows of a joint are adjacent in all columns, so that runs are long: the numbers of a run are read and written as
-    vectors, and the program is a tenth as long as a list of all targets.
+    Targets are slots of changed entries, and are consecutive in a run. The rows of a joint are adjacent in all columns,
+    so that runs are long: their numbers are read and written as vectors, and a list of all targets would be ten times
+    as long.
     """
     off_diagonal = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off_diagonal - 1] | (targets[off_diagonal] != targets[off_diagonal - 1] + 1))
@@ -340,7 +346,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """List all products of two entries in the same row, for the rows in `chosen`: row, and indices of both entries."""
+    """List all products of two entries of a row, for each row in `chosen`: the row, and the indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
@@ -365,7 +371,8 @@ def _index_pairs(m: int) -> Entries:
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
     """Return, for each column of L, the rows that have an entry below the diagonal, including fill-in.
 
-    If i is the first of these rows, the elimination of the column adds all of them to column i.
+    The entries of the matrix are in columns `low` and rows `high`. If i is the first of the rows in a column of L, the
+    elimination of this column adds the other rows to column i.
     """
     rows_below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
@@ -396,7 +403,7 @@ def pivot_order_of(program):
 
 @inlined
 def factor_columns_of(program):
-    """Return the index of the first entry of each column of L (and, last, of the end), and the row of each entry.
+    """Return the index of the first entry of each column of L, then the number of entries; and the row of each entry.
 
     Rows are numbered in the order of elimination.
     """
@@ -407,7 +414,7 @@ def factor_columns_of(program):
 
 @inlined
 def update_runs_of(program):
-    """Return [length, first slot] of the runs of off-diagonal updates, in the order of their use by `factor`."""
+    """Return length and first target of each run of updates (see `_update_runs`), in the order of elimination."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
     return program[begin : begin + program[N_RUNS]]
 

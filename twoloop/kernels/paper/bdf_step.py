@@ -1,8 +1,9 @@
-"""Attempt steps by backward differentiation formulas of orders 1 to 5 for (q_i, v_i), with a fixed-point outer loop.
+"""Attempt steps by backward differentiation formulas of orders 1 to 5, with a fixed-point outer loop.
 
-The history consists of modified divided differences (Krogh), scaled to the step size as in DASSL and IDA (fixed leading
-coefficient), so that the step size can change in every step. With equal steps, they are backward differences. They are
-stored for all coordinates (q, v), so that a new partition needs no conversion. `f` is the kit, `w` the workspace.
+The formulas apply to the independent positions and velocities (q_i, v_i). The history consists of modified divided
+differences (Krogh), scaled to the step size as in DASSL and IDA (fixed leading coefficient), so that the step size can
+change in every step. With equal steps, they are backward differences. Differences of all coordinates and velocities are
+stored, so that a new partition needs no conversion. `f` is the kit, `w` the workspace.
 """
 
 from typing import Any
@@ -22,28 +23,28 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-SAFETY = 0.9  # factor on the step size after a rejected step, and smallest ratio of step sizes after an accepted step
-MIN_STEP_FACTOR = 0.2  # smallest step-size ratio after a rejected step, or after a step far from its prediction
+SAFETY = 0.9  # safety factor on the size of a repeated step; also smallest ratio of step sizes after an accepted step
+MIN_STEP_FACTOR = 0.2  # smallest ratio of step sizes after a rejection, or after a large error of predicted positions
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
 STEP_SIZE_FACTOR = 6.0  # further factor on the error in the choice of the next step size, to avoid rejections (VODE)
-ORDER_FACTOR = 1.4  # factor on the error estimates of other orders, so that the order rarely changes to and fro
+ORDER_FACTOR = 1.4  # factor on the error estimates of the next lower and higher order, so that the order changes rarely
 MIN_INCREASE = 1.2  # the step size is kept if it could grow by less than this factor
 MAX_INCREASE = 2.0  # largest ratio of successive step sizes
 
-# indices in `options` of the scalars, which precede the options of the Gauss steps
+# indices in `options`: largest order, tolerances of the inner and of the outer loop. The options of Gauss steps follow
 HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
-# indices in `memory` of the scalars, which precede the arrays of _coefficient_row and _history_views
+# indices of the scalars in `memory`; the arrays of _coefficient_row and _history_views follow
 (
     HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
-    ORDER,
+    ORDER,  # order of the next attempt
     DEPTH,  # highest order of a difference in the history
     AGE,  # number of accepted steps since the last change of order or the last rejected step
-    NEXT_ORDER,
-    NEXT_DEPTH,
+    NEXT_ORDER,  # value of ORDER after the attempted step
+    NEXT_DEPTH,  # value of DEPTH after the attempted step, if it is accepted
     N_MEMORY_SCALARS,
 ) = range(7)
-# indices of rows of coefficients. SPANS: times (s) from earlier points of the history to its last point. NEW_SPANS:
-# times (s) from all points of the history to the end of the step. ERROR_CONSTANTS: one for each of the orders 0, 1, ...
+# indices of the rows of coefficients in `memory`. SPANS: times (s) from earlier states of the history to the last one.
+# NEW_SPANS: times (s) from all states of the history to the end of the step. ERROR_CONSTANTS: one for each order from 0
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -60,16 +61,17 @@ def memory_size(n_q: int) -> int:
 
 @inlined
 def _coefficient_row(memory, row):
-    """Return a view (N_DIFFERENCES) of row `row`, such as SPANS, of the coefficients in `memory`."""
+    """Return a view (N_DIFFERENCES) of a row of coefficients in `memory`; `row` is its index, such as SPANS."""
     start = N_MEMORY_SCALARS + row * N_DIFFERENCES
     return memory[start : start + N_DIFFERENCES]
 
 
 @inlined
 def _history_views(memory, n):
-    """Return views of `memory`: differences, trial differences (of the attempted step), prediction, rate, and scratch.
+    """Return views of `memory`: history, trial differences (of the attempted step), prediction, rate, and scratch.
 
-    Arrays of differences have the shape (N_DIFFERENCES, 2 n). The prediction of (q, v) and its rate have 2 n entries.
+    The first two are tables of differences (N_DIFFERENCES, 2 n). `prediction` is the predicted (q, v) at the end of the
+    step, and `rate` its time derivative (2 n each).
     """
     begin = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
@@ -82,7 +84,7 @@ def _history_views(memory, n):
 
 @kernel(COMMIT)
 def commit_bdf(f, w, options, memory, tolerances, accepted):
-    """Set ORDER to NEXT_ORDER; if the attempted step was accepted, the trial differences become the history."""
+    """Set ORDER to NEXT_ORDER; if the step was accepted, also store its trial differences as the new history."""
     differences, trial, _, _, _ = _history_views(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -114,10 +116,10 @@ def _begin_history(memory, differences, state, h, order):
 
 @compiled
 def _predict_state(memory, differences, trial, h, prediction, rate):
-    """Store in `trial` the differences, scaled to a step of size h; also store `prediction` and its `rate`.
+    """Scale the differences to a step of size h (s), and store them in `trial`; predict the end of the step.
 
-    `prediction` is the value, and `rate` the derivative, of the polynomial of degree ORDER at the end of the step.
-    NEW_SPANS and ERROR_CONSTANTS are stored in `memory`.
+    `prediction` becomes the value at the end of the step, and `rate` the time derivative there, of the polynomial of
+    degree ORDER through the history. Also store NEW_SPANS and ERROR_CONSTANTS in `memory`.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, new_spans = _coefficient_row(memory, SPANS), _coefficient_row(memory, NEW_SPANS)
@@ -155,13 +157,14 @@ def _corrector_coefficient(h, k):
 
 @compiled
 def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
-    """Solve y = prediction + c (y' - rate) at time t for y = (q_i, v_i); return a code.
+    """Solve y = prediction + c (y' - rate) at time t, where y = (q_i, v_i) are independent entries; return a code.
 
-    The iteration is on the independent accelerations. Then all of `new_state` satisfies the equations. a_new: scratch.
+    The outer loop iterates on the independent accelerations. On return, `new_state` is [q, v, a, lam], and satisfies
+    the equations of motion and the constraints. `c`: see `_corrector_coefficient`; a_new: scratch.
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    copy(prediction, new_state[: 2 * n])  # for dependent coordinates, these are start values of Newton's method
+    copy(prediction, new_state[: 2 * n])  # for dependent coordinates, this is a first guess
     copy(rate[n:], a1)
     last_change = np.inf
     for iteration in range(MAX_ITERATIONS):
@@ -192,7 +195,7 @@ def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
 
 @compiled
 def _difference_norm(tolerances, y, y1, d, sign, difference):
-    """Return the largest component of |d + sign * difference| / (atol + rtol max(|y|, |y1|))."""
+    """Return the largest |d + sign * difference| / (atol + rtol max(|y|, |y1|)) of positions and velocities."""
     n_q = d.size // 2
     largest = 0.0
     for m in range(d.size):
@@ -203,11 +206,14 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error (in tolerances) and the next step-size ratio; d: y1 minus its prediction."""
+    """Store NEXT_ORDER; return the error, in tolerances, and the ratio of the next step size to this one.
+
+    y and y1 are (q, v) at the beginning and at the end of the step; d is y1 minus its prediction.
+    """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
-    # with unequal steps, interpolation of the history also causes an error; as in DASSL, the larger error counts
+    # with unequal steps, interpolation of the history causes a second error; as in DASSL, the larger one of both counts
     interpolation_error = spans[0] / spans[k]
     for j in range(k):
         interpolation_error += spans[0] / spans[j] - 1.0 / (j + 1.0)
@@ -242,7 +248,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _update_differences(memory, trial, y1, d):
-    """Replace scaled differences in `trial` by the differences at the end of the step, where y1 = prediction + d."""
+    """Replace scaled differences in `trial` by those at the end of the step, where (q, v) is y1 = prediction + d."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:
@@ -279,7 +285,8 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
-    Steps of fixed size have the order HIGHEST; before them, HIGHEST Gauss steps fill the history.
+    If the step size is fixed, the order is HIGHEST; before, the first HIGHEST steps are Gauss steps, which fill the
+    history.
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _history_views(memory, n)

@@ -1,4 +1,4 @@
-"""Attempt implicit Runge-Kutta steps by one of two fixed-point outer loops (`f`: the kit, `w`: the workspace)."""
+"""Attempt implicit Runge-Kutta steps, by the fixed-point outer loops of iterations.py (`f`: kit, `w`: workspace)."""
 
 import numpy as np
 
@@ -47,12 +47,12 @@ def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by fixed-point iteration; estimate its error by a step of size h and two steps of size h/2.
+    """Attempt a step by fixed-point iteration; estimate its error from a step of size h and two steps of size h/2.
 
-    The new state is the end of the second half step. With EXTRAPOLATION = 1 / (2^order - 1), this state is extrapolated
-    with the end of the whole step, and projected onto the constraints. The polynomial through the stage accelerations
-    of the last accepted step predicts the stages of the whole step; the polynomial of the whole step predicts the
-    stages of the half steps. If the step size is fixed, the new state is the end of the whole step.
+    The new state is the end of the second half step. If EXTRAPOLATION is not 0, the difference from the end of the
+    whole step serves to extrapolate this state, which is then projected onto the constraints. The polynomial through
+    the stage accelerations of the last accepted step predicts the stages of the whole step; the polynomial of the whole
+    step predicts the stages of the half steps. If the step size is fixed, only the whole step is computed.
     """
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
@@ -92,9 +92,8 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        prediction_error = max(
-            prediction_error, prediction_error_mid
-        )  # the next step begins at the end of the second half step
+        # the end of the whole step is discarded, and with it the error of its predicted positions
+        prediction_error = max(prediction_error, prediction_error_mid)
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
         )
@@ -111,12 +110,12 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # a step is rejected if END_ERROR_WEIGHT * estimate_end_error is larger; not in the paper
+SUDDEN_ERROR = 10.0  # a step with a larger error by jumps of a force, in tolerances, is rejected; not in the paper
 
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step as in Sects. 3.1-3.3 of the paper; a step of size h and two steps of h/2 yield the error."""
+    """Attempt a step as in Sects. 3.1-3.3 of the paper; estimate its error from a step of h and two of h/2."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

@@ -1,8 +1,8 @@
 """Solve for the stages of implicit Runge-Kutta steps by one of two fixed-point iterations, the outer loops.
 
-`iterate_accelerations` iterates on the stage accelerations (the tableau is applied twice to q'' = a).
-`iterate_first_order` is the loop of the paper on y_i = [v_i, q_i]. Both are compiled as parts of the steps in
-fixed_point_step.py. Equation numbers refer to the paper; `f` is the kit, `w` the workspace.
+`iterate_accelerations` iterates on the stage accelerations, from which the tableau, applied once and twice, yields
+velocities and positions. `iterate_first_order` is the loop of the paper on y_i = [v_i, q_i], the independent velocities
+and positions. Equation numbers refer to the paper; `f` is the kit, `w` the workspace.
 
 Richardson's error estimate is the difference between a step and two half steps; it also allows extrapolation.
 """
@@ -16,17 +16,17 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints,
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
-# number of vectors with rounding errors of compensated sums, for steps of fixed size: for q and v, after the last
-# accepted step and after this attempt. Without compensation, the energy of symmetric methods drifts
+# number of vectors of rounding errors: of q and v after the last accepted step, and of q and v after this attempt. Sums
+# in steps of fixed size are compensated for these errors, because otherwise the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# scalars in `memory`: whether a step was attempted (1), and its size (s); the same of the last accepted step
+# indices of the scalars in `memory`: 1 if a step was attempted, and its size (s); the same for the last accepted step
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
-# indices of the blocks (s, n_q) in `memory`, with a row for each stage: accelerations of the last accepted step, of the
-# attempted step, and of half a step; positions and velocities of the stages
+# indices of the blocks (s, n_q) in `memory`, with a row for each stage: accelerations in the last accepted step, in the
+# attempted step, and in a half step; positions and velocities
 A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-# indices of the vectors (n_q) in `memory`. _FULL: at the end of the whole step. _MID: at the end of the first half
-# step. _OLD: before an iteration. ROUNDING: first of N_ROUNDING vectors of rounding errors
+# indices of vectors (n_q) in `memory`: positions Q, velocities V, accelerations A. _FULL: at the end of the whole step.
+# _MID: after the first half step. _OLD: before an iteration. ROUNDING: first of N_ROUNDING vectors of rounding errors
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
 
 
@@ -66,17 +66,17 @@ def step_views(memory, s, n):
 
 @inlined
 def rounding_errors_of(memory, s, n, tolerances):
-    """Return a view of the rounding errors in `memory`, (N_ROUNDING, n), or (0, n) with step-size control."""
+    """Return a view (N_ROUNDING, n) of the rounding errors in `memory`; with step-size control, it is empty (0, n)."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + ROUNDING) * n, N_ROUNDING if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
 MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_order` has failed; the paper has no limit
-# an iteration diverges if a change exceeds the first change by more than this factor; changes may grow at first,
-# because the iteration matrix is not normal
+# an iteration has diverged if a change of the stages exceeds this multiple of the first change. Changes may grow at
+# first, because the iteration matrix is not normal
 MAX_GROWTH = 1e3
-MIN_ITERATIONS = 8  # after this number of iterations, a change that exceeds the previous change means divergence
+MIN_ITERATIONS = 8  # after this number of iterations, a change that is not below the previous one means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
@@ -108,7 +108,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set the rounding errors of this attempt to zero for dependent `coordinates`, which no sum updates."""
+    """Set the rounding errors of this attempt to zero for dependent `coordinates`, which the inner loop computes."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0
@@ -116,12 +116,12 @@ def _clear_rounding_errors(coordinates, rounding):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
-    """Compute a step of size h from (q, v) by iteration on the stage accelerations; return a code and an error.
+    """Compute a step of size h from (q, v) by iteration on stage accelerations; return a code and a `prediction_error`.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
-    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
-    then satisfy (17). For undamped systems, one iteration reduces errors as much as two iterations of first order. Sums
-    are compensated if `rounding` has rows. The error is the result of `prediction_error` (step_size.py).
+    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k,
+    with the tableau A, c, then satisfy eq. (17) of the paper. For undamped systems, one iteration reduces errors as
+    much as two iterations by `iterate_first_order`. Sums are compensated if `rounding` has rows.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -137,7 +137,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     convergence = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.n_outer += 1
-        # compute all stages before evaluating one of them: in Gauss-Seidel order, convergence would require a smaller h
+        # compute all stages before evaluating any: updating one stage after another (Gauss-Seidel) needs a smaller h
         for j in range(s):
             for m in w.independent:
                 sum_q = 0.0
@@ -183,7 +183,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
 @merged
 def _largest_change(coordinates, q, v, q_old, v_old):
-    """Return the largest change of `coordinates` and their velocities, relative to max(1, |value|)."""
+    """Return the largest change, relative to max(1, |value|), of `coordinates` and their velocities in an iteration."""
     change = 0.0
     for m in coordinates:
         change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
@@ -193,11 +193,11 @@ def _largest_change(coordinates, q, v, q_old, v_old):
 
 @compiled
 def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
-    """Compute a step of size h by the paper's outer loop on y_i = [v_i, q_i]; return a code.
+    """Compute a step of size h by the paper's outer loop on y_i = [v_i, q_i] (independent entries); return a code.
 
-    The loop starts from an Euler step, and ends by the tests (32) and (33). `a`: accelerations at (t, q, v). Row j of
-    A_stage and row j of V_stage form K_j = [a_j; v_j]. An iteration updates one stage after another, each with the
-    latest K (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints.
+    The loop starts from an Euler step, and ends by the tests (32) and (33) of the paper. `a`: accelerations at (t, q,
+    v). Row j of A_stage and row j of V_stage form K_j = [a_j; v_j]. An iteration updates one stage after another, each
+    with the latest K (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size
@@ -243,13 +243,13 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
         change = _largest_change(w.independent, q1, v1, q_old, v_old)
         if options[OUTER_TEST] == 1.0:
             change = max(change, _largest_change(w.dependent, q1, v1, q_old, v_old))
-        if change <= options[OUTER_TOL]:  # test (32) of the paper
+        if change <= options[OUTER_TOL]:  # the iteration has converged: test (32) of the paper
             return DONE
         norm = 0.0
         for m in range(n):
             norm += (q1[m] - q_old[m]) ** 2 + (v1[m] - v_old[m]) ** 2
         norm = np.sqrt(norm)
-        if not norm <= norm_before:  # test (33) of the paper
+        if not norm <= norm_before:  # the iteration diverges: test (33) of the paper
             return OUTER_DIVERGED
         norm_before = norm
     return OUTER_DIVERGED
@@ -259,7 +259,8 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
     """Return the norm of the difference between a step and two half steps, in units of the tolerances (eq. 26).
 
-    The norm is the largest |component| of positions and velocities if `largest`, else the root mean square (eq. 27).
+    (q, v): beginning of the step; (q_full, v_full), (q1, v1): ends of the step, of the half steps. The norm is the
+    largest |component| of positions and velocities if `largest`, else the root mean square (eq. 27).
     """
     rtol = tolerances[RTOL]
     total = 0.0

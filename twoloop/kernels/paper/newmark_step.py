@@ -9,14 +9,15 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# if the largest |coordinate| grows by more than this factor, _motion_rate assumes a start from rest at the origin
+# if a step increases the largest |coordinate| by more than this factor, _motion_rate assumes a start at the origin
 GROWTH_AFTER_REST = 2.0
-TINY = 1e-300  # added to the tolerance of a step, which is zero for a mechanism at rest at the origin
+TINY = 1e-300  # added to the allowed error of a step, which may be 0 for a mechanism at rest at the origin
 
 # indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. The new accelerations (n_q) follow
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
-# indices in `options` of newmark_step
+# indices in `options`: parameters of Newmark's method, tolerances of inner and outer loop. ERROR_TOL: tolerance of the
+# error as measured in the paper; 0: measure it otherwise, see _estimated_error
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
@@ -31,8 +32,8 @@ def _largest_abs(x, lower_bound):
 def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
     """Return the rate (1/s) of the motion: the reciprocal of the time in which the largest |coordinate| can double.
 
-    The time follows from the largest |coordinate|, |velocity| and |acceleration| so far, because all coordinates may be
-    near zero at a single time, depending on the origin. If the largest |coordinate| arises mainly in this step, as it
+    The time follows from the largest |coordinate|, |velocity| and |acceleration| so far: at a single time, all
+    coordinates may be near zero, depending on the origin. If the largest |coordinate| arises mainly in this step, as it
     does after rest at the origin, the time is at least `gap` (s).
     """
     memory[SIZE] = _largest_abs(q, memory[SIZE])
@@ -47,11 +48,11 @@ def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
 
 @compiled
 def _estimated_error(options, tolerances, rate, h, q, v, a, a1):
-    """Return the estimated error of a step, in units of the tolerances.
+    """Return the estimated error of a step, in units of the tolerances; `rate` (1/s) is the result of `_motion_rate`.
 
-    The leading local error of q for gamma = 1/2 is e = |beta - 1/6| h^2 |a1 - a|. The result is the largest component
-    of (e / h) / (rate atol + rtol |v|). This error per unit time is of order h^2, like the error of the run. If
-    ERROR_TOL > 0, the result is the 2-norm of e divided by ERROR_TOL (err_out in the paper).
+    The leading local error of q for the parameter gamma = 1/2 is e = |beta - 1/6| h^2 |a1 - a|. The result is the
+    largest component of (e / h) / (rate atol + rtol |v|). This error per unit time is of order h^2, like the error of
+    the run. If ERROR_TOL > 0, the result is the 2-norm of e divided by ERROR_TOL (err_out in the paper).
     """
     factor = abs(options[BETA] - 1.0 / 6.0) * h
     total = 0.0
@@ -73,7 +74,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     a_new = memory[N_MEMORY_SCALARS : N_MEMORY_SCALARS + n]
     for m in range(n):
         a1[m] = a[m]
-        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # start values of Newton's method for dependent coordinates
+        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # for dependent coordinates, this is a first guess
     last_change = np.inf
     for _ in range(MAX_ITERATIONS):
         w.n_outer += 1
@@ -94,7 +95,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
                 error = _estimated_error(options, tolerances, rate, h, q, v, a, a1)
-                if options[ERROR_TOL] == 0.0:  # (ERROR_TOL > 0: as in the paper, without `prediction_error`)
+                if options[ERROR_TOL] == 0.0:  # else the error is measured as in the paper, without `prediction_error`
                     for k in range(w.dependent.size):
                         m = w.dependent[k]
                         w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])

@@ -21,21 +21,21 @@ from twoloop.kernels.data.indices import ATOL, DONE, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 
 HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES is exact up to order 13
-N_TERMS = HIGHEST + 2  # number of stored differences phi_i, of coefficients g_i and of coefficients G_i
+N_TERMS = HIGHEST + 2  # number of stored differences of accelerations, and of their coefficients for v and for q
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
 SAFETY = 0.8  # safety factor: ratio of the next step size to the size for which the error would equal the tolerance
 GROWTH, SHRINKAGE = 1.2, 0.5  # largest and smallest ratio of successive step sizes
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
-LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes after an error of predicted positions
+LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes after a large error of predicted dependent positions
 RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
 
-# eight Gauss nodes on [0, 1] and their weights: exact for c_i and (1 - s) c_i up to i = 15
+# eight Gauss nodes on [0, 1] and their weights: exact for polynomials up to degree 15, such as (1 - s) c_15(s)
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
-POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values c_i at NODES in the integral of (1 - s) c_i
+POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values c_i(s) at NODES in the integral of (1 - s) c_i(s)
 
 
 def _error_constants():
-    """Return |g_k - g_{k+1}| at equal steps for each order k from 0 to HIGHEST.
+    """Return |g_k - g_{k+1}| at equal steps for each order k from 0 to HIGHEST (g: coefficients for velocities).
 
     The estimate of the velocity error is h |g_k - g_{k+1}| d, where d is the error of the predicted accelerations.
     """
@@ -45,8 +45,8 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants for equal steps. Smaller constants are not used: after a decrease of h, the constants for the actual
-# steps are smaller, and would underestimate the error if the force jumps
+# error constants for equal steps, used as lower bounds: after a decrease of h, the constants for the actual steps are
+# smaller, and would underestimate the error if the force jumps
 ERROR_CONSTANTS = _error_constants()
 
 # indices in `options`. THETA: a projection has converged if its last correction is at most THETA, see `project`
@@ -54,7 +54,7 @@ THETA, N_OPTIONS = range(2)
 # indices of the scalars in `memory`. After the scalars, `memory` contains N_ROWS rows of coefficients, two tables of
 # differences, and two scratch rows, see _coefficient_row, _difference_table and _scratch_rows
 (
-    CURRENT,  # index, 0 or 1, of the table of differences at the last accepted step
+    CURRENT,  # index, 0 or 1, of the table of differences at the last accepted step; the other one is the attempt's
     ORDER,  # order of the next attempt
     DEPTH,  # number of accelerations in the history, at most N_TERMS
     AGE,  # number of accepted steps since the last change of the order or the last rejected step
@@ -63,7 +63,7 @@ THETA, N_OPTIONS = range(2)
     NEXT_ORDER,  # order chosen at the end of an attempt for the next one
     N_SCALARS,
 ) = range(8)
-# indices of the rows of coefficients: psi(n), psi(n+1), beta, g, G, and the values of c_i at NODES
+# indices of rows of coefficients, see the module's docstring: psi(n), psi(n+1), beta, g, G, and values of c_i at NODES
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
@@ -78,7 +78,7 @@ def _padded_size(n_q: int) -> int:
 
 @inlined
 def _row(memory, index):
-    """Return a view (N_TERMS + 2) of row `index`, such as PSI, of the coefficients in `memory`."""
+    """Return a view (N_TERMS + 2) of a row of coefficients in `memory`; `index` is the row's index, such as PSI."""
     start = N_SCALARS + index * (N_TERMS + 2)
     return memory[start : start + N_TERMS + 2]
 
@@ -87,7 +87,7 @@ def _row(memory, index):
 def _difference_table(memory, n, index):
     """Return a view of table `index` (0 or 1) of differences: N_TERMS + 1 rows of n entries, padded.
 
-    The difference phi_i is row i - 1 plus the last row.
+    The difference phi_i of the accelerations is row i - 1 plus the last row.
     """
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(index) * (N_TERMS + 1) * width
@@ -96,7 +96,7 @@ def _difference_table(memory, n, index):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return two scratch rows (n, padded), for v and for q: first mean accelerations, later reciprocal tolerances."""
+    """Return two scratch rows (n, padded), for v and for q: mean accelerations, or later reciprocals of tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -139,7 +139,7 @@ def _begin_history(memory, n, state):
 
 @merged
 def _compute_coefficients(memory, h, k):
-    """Store in `memory` psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of size h."""
+    """Store the coefficients psi(n+1), beta, g and G (see the module's docstring) for a step of size h at order k."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
     g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
     new_psi[0] = h
@@ -173,7 +173,7 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # row k + 1 of the table is phi_{k+2} - d, and phi_{k+2} = d - beta_{k+1} phi_{k+1}
+        # row k + 1 becomes phi_{k+2} - d, where d, the last row, is the error of the prediction: -beta_{k+1} phi_{k+1}
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
@@ -224,7 +224,7 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
 
 @merged
 def _estimate_error(g, G, h, order, largest_v, largest_q):
-    """Return the estimated error of a step at `order`, in units of the tolerances.
+    """Return the estimated error of a step at `order`, in units of the tolerances; g, G: coefficients for v and for q.
 
     `largest_v`, `largest_q`: largest component of phi_{order+1} over the tolerances of velocities, and of positions.
     """
@@ -235,8 +235,9 @@ def _estimate_error(g, G, h, order, largest_v, largest_q):
 def _choose_order(memory, h, k, table, d, n):
     """Store NEXT_ORDER; return the error, in units of the tolerances, and the ratio of the next step size to h.
 
-    The rules are taken from STEP (Shampine and Gordon). The order decreases if the error at lower orders is not larger.
-    It increases if k + 1 steps had the order k and the error at order k + 1 is smaller; while STARTING is 1, always.
+    The rules are taken from STEP (Shampine and Gordon). The order k decreases if the error at lower orders is not
+    larger. It increases if k + 1 steps had the order k and the error at order k + 1 is smaller. While STARTING is 1, it
+    increases in every step. `table`: predicted differences; `d`: error of the predicted accelerations.
     """
     g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     weight_v, weight_q = _scratch_rows(memory, n)
@@ -292,7 +293,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     old, new = _difference_table(memory, n, memory[CURRENT]), _difference_table(memory, n, 1.0 - memory[CURRENT])
     _compute_coefficients(memory, h, k)
     _predict_state(memory, h, k, old, new, state, q1, v1, n)
-    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # order of the next attempt if an evaluation fails in this attempt
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # order of the next attempt if an evaluation fails in this one
     code = evaluate_without_projection(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

@@ -1,19 +1,19 @@
 """Diagonally implicit Runge-Kutta steps with an explicit first stage (ESDIRK), for stiff problems and few digits.
 
-The stages are solved one after another. For stage j, Newton's method finds the accelerations a of the independent
-coordinates, with z = gamma h and sums over the stages k < j:
+The stages are solved one after another. For stage j of the tableau a_jk, with the diagonal entry gamma, Newton's method
+finds the accelerations a of the independent coordinates. F are the accelerations that the inner loop returns,
+z = gamma h, and sums are over the stages k < j:
 
     F(t_j, Q, V) - a = 0,  V = v_j + z a,  Q = q_j + z V,
     v_j = v + h sum_k a_jk a_k,  q_j = q + h sum_k a_jk V_k.
 
 The corrections d solve (I - z^2 J_q - z J_v) d = F - a, where J_q and J_v are the derivatives of F. If the system
-provides tangents, the derivatives are computed in every iteration: stiff directions turn with the bodies, and if they
-turn much in a step, the iteration with older derivatives does not converge. Methods that solve all stages together, as
-in newton_step.py, use one set of derivatives for all stages.
+provides the tangents K and D (derivatives of the forces by q and v), derivatives are computed in every iteration: stiff
+directions turn with the bodies, and if they turn much in a step, the iteration with older derivatives does not
+converge. Then the dense matrix T^T (M - z^2 K - z D) T is factored, where the columns of T are the allowed velocities.
 
-If the system provides tangents K and D, the dense matrix T^T (M - z^2 K - z D) T of an iteration is factored directly.
-(newton_systems.py first multiplies the derivatives by the inverse of T^T M T, to use them in several systems. Direct
-factorization takes half the work if each matrix is used in one iteration only.)
+newton_step.py, which solves all stages together, uses one set of derivatives for all stages. So newton_systems.py first
+multiplies derivatives by the inverse of T^T M T. For a matrix that is used in one iteration, this is twice the work.
 
 Under step-size control, a step of TR-BDF2 ends at the result of the embedded formula of order 3; the difference of the
 two formulas is filtered three times, which keeps the method L-stable. Then the errors of many short steps add up to the
@@ -65,7 +65,10 @@ def _is_symmetric(A):
 
 @compiled
 def _fill_newton_matrix(w, memory, n, m, z, H):
-    """Store T^T (M - z^2 K - z D) T in H (m^2 numbers, row by row); m is the number of independent coordinates."""
+    """Store Newton's matrix T^T (M - z^2 K - z D) T in H (m^2 numbers, row by row); m: number of degrees of freedom.
+
+    M: mass matrix; K and D: derivatives of the forces by q and v; columns of T: velocities that the constraints allow.
+    """
     N, Kr, Dr = (
         matrix_storage(w, n, at.SYSTEMS),
         matrix_storage(w, n, at.DERIVATIVE_Q),
@@ -82,7 +85,7 @@ def _fill_newton_matrix(w, memory, n, m, z, H):
 
 @compiled
 def factor_newton_matrix(w, memory, z):
-    """Factor T^T (M - z^2 K - z D) T, z = gamma h, for the tangents K and D that were computed last; return a code."""
+    """Factor Newton's matrix T^T (M - z^2 K - z D) T by the tangents K and D that were computed last; return a code."""
     n, m = w.Q.size, w.independent.size
     storage = matrix_storage(w, n, at.FILTER)
     H = as_matrix(storage, m)
@@ -100,7 +103,7 @@ def factor_newton_matrix(w, memory, z):
 
 @compiled
 def compute_and_factor_matrix(f, w, memory, t, q, v, z):
-    """Compute the tangents K and D at (t, q, v) and factor T^T (M - z^2 K - z D) T; return a code.
+    """Compute K and D (derivatives of forces) at (t, q, v); factor Newton's T^T (M - z^2 K - z D) T; return a code.
 
     The last evaluation must have been at (t, q, v), and w.lam must be the multipliers there.
     """
@@ -128,7 +131,7 @@ def compute_and_factor_matrix(f, w, memory, t, q, v, z):
 
 @compiled
 def _solve_newton_system(w, memory, x):
-    """Replace the right-hand side x (n_dof) by the solution, using the factors from `factor_newton_matrix`."""
+    """Replace x (n_dof), a right-hand side of Newton's equations, by the solution; see `factor_newton_matrix`."""
     m = x.size
     H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
     if memory[at.IS_SYMMETRIC] == 1.0:
@@ -159,7 +162,7 @@ def correct_stage(w, memory, residual, a):
 
 @compiled
 def filter_dense_error(w, memory, z, e_q, e_v):
-    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), by the factors of `factor_newton_matrix`."""
+    """Filter the velocity error e_v (n_dof), see `filter_error` in newton_systems.py, by `factor_newton_matrix`."""
     n = w.Q.size
     m = e_q.size
     N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
@@ -175,15 +178,15 @@ def filter_dense_error(w, memory, z, e_q, e_v):
 
 MAX_ITERATIONS = 8  # largest number of Newton iterations of a stage: if they do not converge, the step fails
 DIVERGENCE_RATIO = 2.0  # Newton's method has diverged if a correction exceeds this multiple of the previous one
-LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences, because convergence is then linear
-# derivatives by differences are renewed if a correction exceeds this fraction of the previous one
+LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences: convergence is then only linear
+# derivatives computed by differences are renewed if a Newton correction exceeds this fraction of the previous one
 MAX_CONTRACTION = 0.1
-VELOCITY_WEIGHT = 0.1  # weight, in the convergence test, of the position error that a correction of velocities causes
+VELOCITY_WEIGHT = 0.1  # weight, in Newton's convergence test, of the position error that an error of velocities causes
 
 
 @inlined
 def stage_views(memory, s, n):
-    """Return views of `memory`: stage velocities (s, n), stage accelerations (s, n), accelerations at the start (n)."""
+    """Return views of `memory`: stage velocities and accelerations (s, n each), accelerations at the beginning (n)."""
     last = memory.size - n
     return (
         memory[last - 2 * s * n : last - s * n].reshape((s, n)),
@@ -194,26 +197,26 @@ def stage_views(memory, s, n):
 
 @merged
 def gamma_of(options):
-    """Return gamma: all diagonal entries of A (s, s) except the first are equal to gamma."""
+    """Return gamma, the value of all diagonal entries of the tableau A (s, s) except the first, which is 0."""
     s = int(options[at.DIAGONAL_OFFSET])
     return options[at.DIAGONAL_OFFSET + s * s]
 
 
 @merged
 def has_dense_tangents(f, w):
-    """Return whether each iteration of Newton's method factors a new dense matrix T^T (M - z^2 K - z D) T."""
+    """Return True if Newton iterations compute tangents K, D and factor the dense matrix T^T (M - z^2 K - z D) T."""
     return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != FIXED_ORDER
 
 
 @merged
 def stages_at_once(options):
-    """Return 1, the number of stages solved at once; for a literal 1, numba would compile newton_systems.py again."""
+    """Return 1, the number of stages solved at once; a literal 1 would make numba compile newton_systems.py again."""
     return int(options[at.STAGES])
 
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
-    """Renew derivatives (at Q, V, where accelerations are F) and factors unless they are still valid; return a code."""
+    """Compute the derivatives of accelerations F at (t, Q, V), and factors, unless they are valid; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -231,7 +234,7 @@ def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
 
 @compiled
 def solve_stage(f, w, options, memory, t, h, A_stage):
-    """Solve for the accelerations A_stage (1, n_q) of a stage at t by Newton's method; return a code.
+    """Solve for the accelerations A_stage (1, n_q) of a stage at the time t by Newton's method; return a code.
 
     On entry, A_stage contains predicted accelerations. Q_MID and V_MID in `memory` become the state of the stage.
     """
@@ -297,18 +300,18 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# the difference of the two formulas is filtered this number of times before it is subtracted from the result; with
-# fewer filters, the method is unstable for vibrations, see tests/kernels/test_diagonal.py
+# the difference between a step's formula and its embedded formula is filtered this number of times, then subtracted
+# from the end of the step. With fewer filters, the method is unstable for vibrations (tests/kernels/test_diagonal.py)
 N_FILTERS = 3
 
-# a single jump can cause at most this ratio of |sum_k jump_weights[k] a_k| to the range of the stage accelerations a_k;
-# if the ratio is smaller, `_error_at_jumps` reduces its estimate in proportion
+# if the accelerations a_k of the stages jump once, |sum_k jump_weights[k] a_k| is at most this fraction of their range.
+# If the fraction is smaller, `_error_at_jumps` reduces its estimate in proportion
 MAX_RATIO_BY_ONE_JUMP = 0.174
 
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, using the factors that were computed last.
+    """Remove stiff components: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, using the last factors.
 
     J is the Jacobian of (v, F) by (q_i, v_i). Only the first n_dof numbers of e_q and e_v (n_q) are read and changed.
     """
@@ -334,7 +337,7 @@ def _factor_filter(f, w, options, memory, h):
 def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
     """Store h * factor * sum_k weights[k] * V_stage[k] in e_q, and the same sum of A_stage[k] in e_v.
 
-    Only the entries of independent coordinates are computed; they become the first n_dof numbers of e_q and e_v (n_q).
+    Only sums for independent coordinates are computed; they become the first n_dof numbers of e_q and e_v (n_q).
     """
     for i in range(w.independent.size):
         j = w.independent[i]
@@ -348,7 +351,7 @@ def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
 
 @compiled
 def _renew_derivatives(f, w, options, memory, t, h, new_state):
-    """Compute the derivatives at t and `new_state`, and factor the matrices for steps of size h; return a code."""
+    """Compute derivatives of accelerations at t and `new_state`; factor matrices for steps of size h; return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -372,7 +375,8 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
     """Return the largest component of the error estimate of `_store_weighted_sums`, in units of the tolerances.
 
     The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If outdated derivatives
-    make the filter wrong, they are computed anew. On return, E_Q and E_V in `memory` have the estimate, filtered twice.
+    make the filter wrong, they are computed anew. On return, E_Q and E_V in `memory` contain the twice filtered
+    estimate.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
@@ -414,7 +418,7 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
 def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
     """Replace (q1, v1), the state at the end of the step, by the result of the embedded formula.
 
-    On entry, the vectors E_Q and E_V of `memory` must contain the difference of the two formulas, filtered twice.
+    On entry, E_Q and E_V in `memory` must contain the difference of (q1, v1) from this result, filtered twice.
     """
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, N_FILTERS):
@@ -426,7 +430,7 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the effect, in units of the tolerances, of the velocity error E_V in slow directions, see newton_step.py.
+    """Return the effect, in tolerances, of the slowly changing part of the velocity error E_V, see newton_step.py.
 
     If the whole of E_V has an effect of at most 1, return 0. E_Q, E_V and the factors are overwritten.
     """
@@ -443,7 +447,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
     h_longer = STEPS_TO_DECAY * h / gamma_of(options)
     if _factor_filter(f, w, options, memory, h_longer) == DONE:
         _filter_errors(f, w, options, memory, h_longer, e_q, e_v)
-        # in unstable motion, the filter may be nearly singular, and the filtered error too large
+        # in unstable motion, the filter's matrix may be nearly singular; then the filtered error is too large
         error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     memory[at.H_FACTORED] = 0.0
     return error
@@ -530,9 +534,8 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)
-    for (
-        m
-    ) in w.dependent:  # positions by the formula: `prediction_error` compares them with positions on the constraints
+    # `prediction_error` compares these positions, by the formula, with positions on the constraints
+    for m in w.dependent:
         q1[m] = q_bar[m] + h * A[s - 1, s - 1] * V[m]
     for m in w.independent:
         q1[m] = Q[m]

@@ -1,9 +1,10 @@
-"""Step of an explicit Runge-Kutta method for (q_i, v_i): each stage is one evaluation, and there is no outer loop.
+"""Step of an explicit Runge-Kutta method: each stage is one evaluation, and there is no outer loop.
 
-The first stage is the state at the beginning of the step, and two embedded formulas estimate the error. By default, the
-inner loop computes the dependent coordinates of every stage, so that all stages satisfy the constraints. With FREE = 1,
-unlike in the paper, the method integrates dependent coordinates, too: stages violate the constraints by the error of
-the formula, and only the end of the step is projected. `f` is the kit, and `w` the workspace.
+The method integrates the independent positions and velocities (q_i, v_i). The first stage is the state at the beginning
+of the step, and two embedded formulas estimate the error. By default, the inner loop computes the dependent coordinates
+of every stage, so that all stages satisfy the constraints. With FREE = 1, unlike in the paper, the method integrates
+dependent coordinates, too: stages violate the constraints by the error of the formula, and only the end of the step is
+projected. `f` is the kit, and `w` the workspace.
 """
 
 import numpy as np
@@ -15,10 +16,10 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
 from twoloop.kernels.linalg.dense import copy, sum_rows
 
-# indices of the scalars in `options`, which are arguments of options_array. After the scalars, `options` contains
-# A (s, s), b (s), c (s) and the weights of the two error estimates (s each). FREE: 1 if stages are not projected
+# indices of the scalars in `options`, see the arguments of options_array. FREE: 1 if stages are not projected. The
+# tableau A (s, s), b (s), c (s) and the weights of the two error estimates (s each) follow
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
-# indices of the vectors in `memory`; the slopes [v, a] of the s stages follow. All have 2 n_q numbers, padded
+# indices of vectors in `memory`; derivatives [v, a] of the s stages follow. All have 2 n_q numbers, and are padded
 STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
 BLOCK_SIZE = 8  # vectors are padded to a multiple of this size, so that loops over them have no remainder
 # STRICT: factor on the error estimate once a run has come near a singular position, because phase errors grow at each
@@ -38,7 +39,8 @@ def options_array(
 ) -> NDArray[np.float64]:
     """Return the array `options` of `explicit_step` for the tableau A (s, s), b (s), c (s).
 
-    `fine`, `coarse`: weights (s) of the two error estimates; `free`: stages are not projected; `theta`: see `project`.
+    `fine`, `coarse`: weights (s) of the two error estimates; `free`: stages are not projected; `theta`: a projection
+    has converged if its last correction is at most this.
     """
     A, b, c, fine, coarse = (np.asarray(x, dtype=float) for x in (A, b, c, fine, coarse))
     s = b.size
@@ -78,7 +80,7 @@ def _vector_view(memory, n, index):
 
 @compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
-    """Set y1 to y + h * sum_k weights[k] * slopes[k], adding y last to avoid rounding errors; `total` is scratch."""
+    """Set y1 to y + h * sum_k weights[k] * slopes[k]; y is added last to reduce rounding errors; `total` is scratch."""
     sum_rows(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -89,9 +91,10 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
     """Return the error e^2 / sqrt(e^2 + d^2) of a step from y to y1 (2 n each), in units of the tolerances.
 
     e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
-    velocities), relative to atol + rtol |y|. The formula is not applied to single components: where d of a component
-    passes through zero, it would yield e, of low order, at the cost of up to 30 % more evaluations. If `strict`, the
-    error is e^(3/2) / (e^2 + d^2)^(1/4), because terms of high order are not small near a singular position.
+    velocities), relative to atol + rtol |y|. The formula is not applied to each component separately: where d of a
+    component passes through zero, the result would be e, which is of low order, and steps would need up to 30 % more
+    evaluations. If `strict`, the error is e^(3/2) / (e^2 + d^2)^(1/4), because terms of high order are not small near a
+    singular position.
     """
     n = fine_error.size // 2
     rtol = tolerances[RTOL]
@@ -134,8 +137,8 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     )
     begin, width = N_VECTORS * _padded_width(n), _padded_width(n)
     slopes = memory[begin : begin + s * width].reshape((s, width))  # velocities and accelerations of each stage
-    # near a singular position, all stages are projected, because it matters on which side of the position a stage lies,
-    # and how accurate its velocities are
+    # near a singular position, stages are projected even if FREE is 1: on which side of the position a stage lies, and
+    # how accurate its velocities are, matters there
     is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
     is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)
@@ -144,7 +147,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.n_outer += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # start values, for dependent coordinates
+        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # for dependent coordinates, first guesses
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if is_free:

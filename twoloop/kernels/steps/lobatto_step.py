@@ -46,36 +46,37 @@ from twoloop.kernels.linalg.dense import copy
 # indices in `options`
 (
     THETA,  # a projection has converged if its last correction is at most this, see `project`
-    N_ITERATED,  # number of coordinates whose accelerations are iterated
+    N_ITERATED,  # number of coordinates on which accelerations depend; only these coordinates are iterated
     N_ROWS,  # number of constraints
     FREE,  # in steps longer than FREE * tolerances[DEFECT_GAP], the defect is also evaluated between the nodes
-    MAY_REPEAT,  # 1: a sweep may evaluate accelerations twice; 0: their code is split, and the second time no cheaper
+    MAY_REPEAT,  # 1: a sweep may evaluate accelerations twice; 0: once, because a second time would not be cheaper
     N_OPTIONS,
 ) = range(6)
 
-START_CONTRACTION = 0.12  # contraction rho for which the first step size is chosen after its first guess is rejected
+START_CONTRACTION = 0.12  # contraction rho by a sweep that the first step should have; guesses of its size aim at it
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
-MAX_LIMITED = 24.0  # the motion counts as stiff, and another method takes over, if LIMITED reaches this value
-MIN_CURVATURE = 0.1  # accelerations hardly vary within a step if CURVATURE is below this value
-N_PIVOT_PARTS = 4  # number of equal parts of a step, between which the smallest pivot of C_q is computed
-MIN_PIVOT_RATIO = 0.4  # a singular position is near if a pivot falls below this fraction of its value at the beginning
-# with a smaller tolerance, another method takes over after a singular position: else five more runs of A02 end wrong
+MAX_LIMITED = 24.0  # another method takes over at this value of LIMITED, which counts steps limited by convergence
+MIN_CURVATURE = 0.1  # below this value of CURVATURE (in tolerances), accelerations hardly vary within a step
+N_PIVOT_PARTS = 4  # number of equal parts of a step; the smallest pivot of C_q is computed where two parts meet
+MIN_PIVOT_RATIO = 0.4  # a singular position is near if a step reduces the smallest pivot of C_q below this fraction
+# with a smaller tolerance, another method takes over once a singular position was near: without this rule, five more
+# runs of the benchmark A02 (N-four-bar mechanism) end with wrong results
 TIGHT_TOLERANCE = 1e-8
 MAX_FAILURES = 12.0  # another method takes over at this value of FAILURES, to which a step without convergence adds 2
-CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
+CHECKED_GAP = 0.0908  # longest time between evaluations at and between the nodes, relative to the step size
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
 LEAST_TREND = 0.4  # lower bound of the trend, the ratio of step sizes that the error allows in successive steps
-# ratio of the step sizes that the convergence allows with and without repeated evaluation at new velocities
+# ratio of the step sizes that the convergence allows if sweeps evaluate accelerations twice, and once
 GAIN_BY_REPEATS = 1.5
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
 # the error allows: the second evaluation then saves no time
 MAX_REACH = 2.5
-MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
+MAX_EXTRAPOLATION = 3.0  # the step size that the error allows counts at most as this multiple of the actual size
 _array_offsets = merged(array_offsets)
 
 
@@ -103,7 +104,8 @@ def _reuse_rejected_polynomial(f, data, state):
 def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     """Solve for the stages of a step of size h; return a code, the error, and the ratio of the next step size to h.
 
-    The stages are stored in `data`. The code is CONVERGED, REJECTED, GUESSED or NOT_COMPUTED. Error: in tolerances.
+    The stages are stored in `data`; the error is in tolerances. Codes: CONVERGED, REJECTED (too large an error, or no
+    convergence), GUESSED (the first step size must be guessed again), NOT_COMPUTED (accelerations were not computed).
     """
     is_first, is_estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[DEFECT_GAP] / CHECKED_GAP
@@ -147,10 +149,10 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, but a step takes the target number of sweeps, or one less
+    # the motion may be stiff if accelerations hardly vary, but a step takes at least N_TARGET - 1 sweeps
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
-    # extrapolate the step size that the error allows by its trend, which mostly changes little from step to step
+    # extrapolate the step size that the error allows by its last change, because such changes vary little between steps
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVATURE] >= MIN_CURVATURE:
         trend = 1.0 if is_first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
@@ -161,7 +163,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     factor = max(data[field.FACTOR], MIN_FACTOR)
     if data[field.REPEATS] == 1.0:
         if is_limited or h * factor > MAX_REACH * h_allowed:
-            # a sweep with one evaluation reduces the error by about the square root of the contraction with two
+            # the contraction with one evaluation in a sweep is about the square root of that with two evaluations
             data[field.REPEATS], data[field.RHO] = 0.0, math.sqrt(data[field.RHO])
     elif options[MAY_REPEAT] == 1.0 and factor < max_factor and not is_limited:
         data[field.REPEATS] = 1.0
@@ -182,7 +184,7 @@ def _accept_polynomial(data):
 
 @merged
 def _must_change_method(w, data, tolerances):
-    """Return whether another method has to take over, because stiffness limits steps or a singular position is near."""
+    """Return True if another method has to take over: stiffness limits the steps, or a singular position is near."""
     is_stiff = data[field.LIMITED] >= MAX_LIMITED or data[field.FAILURES] >= MAX_FAILURES
     is_near = w.near_now == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
     return is_stiff or (w.nearly_singular == 1.0 and is_near)
@@ -190,10 +192,10 @@ def _must_change_method(w, data, tolerances):
 
 @compiled
 def _passes_singular_position(f, w, t, h, state, new_state):
-    """Return whether the smallest pivot of C_q within a step is below MIN_PIVOT_RATIO times the pivot at its beginning.
+    """Return True if the smallest pivot of C_q within a step is below MIN_PIVOT_RATIO times the pivot at its beginning.
 
     Another method then has to cross the singular position, near which stages that violate the constraints have wrong
-    accelerations. Positions within the step are on the cubic through the states at both ends.
+    accelerations. Positions within the step are interpolated by the cubic through the states at both ends.
     """
     n, pivot = w.Q.size, w.pivot
     for k in range(1, N_PIVOT_PARTS):
@@ -276,9 +278,9 @@ def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
 def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, state):
     """Copy the projected state in lane k of `data` to `row` and `state`; return False if the state is invalid.
 
-    The state is invalid if its projection has failed or has changed positions in `row` by more than the tolerances, or
-    if it violates redundant rows. If constraints depend on time (`driven`), velocities must not change by more than the
-    tolerances, either: this would show a discontinuity of the drive between the nodes, see discontinuities.py.
+    The state is invalid if its projection has failed or has moved positions, from those in `row`, by more than the
+    tolerances, or if it violates redundant rows. If constraints depend on time (`driven`), the same limit holds for
+    velocities: a larger change would show a discontinuity of the drive between the nodes, see discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if data[field.VALID + k] == 0.0:
@@ -305,7 +307,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return whether a step of size h may follow before the integrator has checked the step that was taken last."""
+    """Return whether a step of size h may follow now, although the integrator has not checked the last step yet."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
@@ -349,8 +351,8 @@ def lobatto_steps(
 ):
     """Take at most LANES steps in a row, and project their ends together; return the number of accepted steps.
 
-    A group of steps ends when the run's number of accepted steps is a multiple of LANES, so that the results do not
-    depend on the times at which the integrator pauses.
+    A group of steps ends when the run's number of accepted steps is a multiple of LANES. So the times at which the
+    integrator pauses do not influence the results.
     """
     data, n = _aligned_view(memory), w.Q.size
     if out_t.size < LANES or w.nearly_singular == 1.0:

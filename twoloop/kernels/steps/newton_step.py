@@ -1,14 +1,16 @@
 """Implicit Runge-Kutta steps whose outer loop is Newton's method, for stiff problems.
 
-The unknowns are the stage accelerations a_j of the independent coordinates (`f`: kit, `w`: workspace):
+The unknowns are the stage accelerations a_j of the independent coordinates, the residuals r_j (`f`: kit, `w`:
+workspace):
 
     r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
-where F are the accelerations that the inner loop returns. J_q and J_v are the derivatives of F by q_i and v_i at a
-single state (simplified Newton's method). The corrections d solve (I - h^2 A A x J_q - h A x J_v) d = r, where x is the
-Kronecker product. In the eigenvectors of A, this splits into systems (n_dof, n_dof) I - (h l)^2 J_q - h l J_v: a real
-system for each real eigenvalue l of A, and a complex one for each pair. They have half the size of the systems of a
-first-order form (Hairer & Wanner, Solving ODEs II, IV.8, for Radau IIA). Fixed-point iteration would need tiny steps.
+where F are the accelerations that the inner loop returns, and A, c is the tableau. J_q and J_v are the derivatives of F
+by the independent positions and velocities at a single state (simplified Newton's method). The corrections d solve
+(I - h^2 A A x J_q - h A x J_v) d = r, where x is the Kronecker product. In the basis of eigenvectors of A, this splits
+into systems I - (h l)^2 J_q - h l J_v of size n_dof: a real system for each real eigenvalue l of A, and a complex one
+for each pair. These systems have half the size of systems of a first-order form (Hairer & Wanner, Solving ODEs II,
+IV.8, for Radau IIA). Fixed-point iteration would need tiny steps.
 """
 
 import numpy as np
@@ -43,7 +45,7 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
-# the next step computes new derivatives if the ratio of the last two Newton corrections is above this
+# the next step computes new derivatives if the last Newton correction exceeds this fraction of the previous one
 SLOW_CONTRACTION = 0.05
 # largest Newton correction, relative to max(1, |value|), that counts as a rounding error in steps of fixed size
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
@@ -53,7 +55,7 @@ MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     """Solve for the stage accelerations A_stage (s, n) by Newton's method; return a code.
 
-    On entry, A_stage contains predictions. Store the ratio of the last two corrections in memory[CONTRACTION].
+    On entry, A_stage contains predictions. memory[CONTRACTION] becomes the ratio of the last two Newton corrections.
     """
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
@@ -125,9 +127,9 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma0 and the Jacobian J of (v, F) by (q_i, v_i).
+    """Remove stiff components from errors: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma0.
 
-    Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
+    J is the Jacobian of (v, F) by (q_i, v_i), with accelerations F. Only the first n_dof numbers of e_q and e_v change.
     """
     s = int(options[STAGES])
     m = w.independent.size
@@ -184,9 +186,9 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
     """Return the effect, in tolerances, of the slowly changing part of the velocity error E_V, see `velocity_error`.
 
-    In `filtered_velocity_error`, errors last as long as their fastest component. Here, a filter keeps the component
-    that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. If the whole of E_V has an
-    effect of at most 1, return 0. E_Q, E_V and the factors of the filter are overwritten.
+    `filtered_velocity_error` assumes that all of the error lasts as long as its fastest component. Here, a filter keeps
+    the component that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. If the whole of
+    E_V has an effect of at most 1, return 0. E_Q, E_V and the factors of the filter are overwritten.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]
@@ -199,7 +201,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
         e_q[i] = 0.0
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
-        # in unstable motion, the filter may be nearly singular, and the filtered error too large
+        # in unstable motion, the filter's matrix may be nearly singular; then the filtered error is too large
         error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
@@ -238,8 +240,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage, where stiff directions differ least from directions at other
-            # stages. Between the stages, a force might act that acts at no stage
+            # compute derivatives at the middle stage, where stiff directions differ least from those at other stages.
+            # (At a time that is not a stage, a force might act that acts at no stage.)
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])
@@ -270,8 +272,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the extrapolated state of the middle stage may be wrong, and so may derivatives there, as of friction: repeat
-        # the step with derivatives at its beginning
+        # repeat the step with new derivatives. If they are new already, the extrapolated state of the middle stage may
+        # be wrong, and with it derivatives there, as of friction: compute derivatives at the beginning of the step
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

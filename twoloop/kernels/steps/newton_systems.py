@@ -1,17 +1,18 @@
-"""Linear algebra of Newton's method in implicit steps: one system, I - z^2 J_q - z J_v with z = h l, per eigenvalue l.
+"""Solve linear systems of Newton's method in implicit steps: I - z^2 J_q - z J_v, z = h l, for each eigenvalue l of A.
 
-J_q and J_v are the derivatives of the accelerations by the independent positions and velocities. The corrections x of
-the independent accelerations solve (I - z^2 J_q - z J_v) x = r. The velocities that the constraints allow are
-v = T v_i, T = [I; -Cqd^-1 Cqi]. Multiplied by T^T M T, the system becomes (`f`: kit, `w`: workspace)
+A is the tableau. J_q and J_v are the derivatives of the accelerations by the independent positions and velocities. The
+corrections x of the independent accelerations solve (I - z^2 J_q - z J_v) x = r. The velocities that the constraints
+allow are v = T v_i, T = [I; -Cqd^-1 Cqi], where Cqd and Cqi are the dependent and independent columns of C_q.
+Multiplied by T^T M T, the system becomes (`f`: kit, `w`: workspace)
 
     T^T (M - z^2 K - z D) T x = T^T M T r.
 
-K and D are the derivatives of Q - Cq^T lam by q and v, at constant lam. This omits the dependence of T and M on q, and
-of Q_d on v. The omitted terms are not stiff, and are zero for linear constraints, so that a simplified Newton's method
-does not need them. Under step-size control, steps are as long without them. Fixed steps in which a body turns by some
-0.4 rad may fail without them, but converge with differences of the accelerations.
+K and D, the tangents, are the derivatives of Q - Cq^T lam by q and v, at constant lam. This omits the dependence of T
+and M on q, and of gamma on v. The omitted terms are not stiff, and are zero for linear constraints, so that a
+simplified Newton's method does not need them. Under step-size control, steps are as long without them. Fixed steps in
+which a body turns by some 0.4 rad may fail without them, but converge with differences of the accelerations.
 
-X = T x also solves a system with a bordered matrix,
+X = T x also solves a system with a bordered matrix, with Cq^T and Cq as the border,
 
     [[M - z^2 K - z D, Cq^T], [Cq, 0]] [X; mu] = [M T r; 0].
 
@@ -81,7 +82,7 @@ RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, re
 # 1 + DISPLACEMENT_INCREMENT * (i % N_INCREMENTS), because the effects of equal displacements might cancel each other
 DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
 
-# --- tangents K and D, of which only the band |i - j| <= b is computed and read
+# --- tangents K and D (derivatives of the forces by q and v): only the band |i - j| <= b is computed and read
 
 
 @inlined
@@ -181,7 +182,7 @@ def fill_tangent_by_v(f, t, q, v, b, D):
 
 @compiled
 def reduce_to_independents(w, A, AT, B):
-    """Store A T in AT (n_q, n_dof) and T^T A T in B (n_dof, n_dof), with T = [I; w.D^T]."""
+    """Store A T in AT (n_q, n_dof), T^T A T in B (n_dof, n_dof); columns of T = [I; w.D^T]: the allowed velocities."""
     n, m = AT.shape
     columns = columns_of(w.index)
     for i in range(n):
@@ -204,7 +205,7 @@ def reduce_to_independents(w, A, AT, B):
 
 @compiled
 def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
-    """Store in w.matrices J_q and J_v at (t, q, v), the last evaluated state, computed from K and D; return a code."""
+    """Store J_q and J_v, derivatives of accelerations at the last state (t, q, v), from K and D; return a code."""
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
@@ -234,7 +235,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store in J the matrix J_q (J_v if `by_v`) at (t, q, v), where accelerations are a; return a code."""
+    """Store in J the derivatives of accelerations `a` at (t, q, v) by q_i, or by v_i if `by_v`; return a code."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     for column in range(w.independent.size):
         j = w.independent[column]
@@ -253,7 +254,7 @@ def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_ne
 
 @compiled
 def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
-    """Store in w.matrices J_q and J_v at (t, q, v), the last evaluated state; a: accelerations there; return a code."""
+    """Store J_q and J_v, the derivatives of accelerations `a` at the last evaluated state; return a code."""
     if f.force_by_q_given == 1 and w.Rate.size == w.C.size:
         return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
@@ -265,7 +266,7 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
     code = _fill_by_differences(f, w, options, t, q, v, a, False, q_moved, v_moved, a_new, Jq)
     if code != DONE:
         return code
-    # displace all velocities at once: if this changes no acceleration, J_v is zero
+    # displace all velocities at once: if this changes no acceleration, J_v, the derivative by velocities, is zero
     copy(q, q_moved)
     for column in range(m):
         j = w.independent[column]
@@ -284,7 +285,7 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense_matrix(w, memory, s, index, z, matrix):
-    """Store in `matrix` the LU factors of I - z^2 J_q - z J_v, and in `memory` the pivots `index`; return a code."""
+    """Store LU factors of Newton's matrix I - z^2 J_q - z J_v in `matrix`, pivots in `memory`; return a code."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
     damped = memory[at.HAS_DAMPING] == 1.0
@@ -299,7 +300,7 @@ def _factor_dense_matrix(w, memory, s, index, z, matrix):
 
 @compiled
 def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
-    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
+    """Filter e_v (n_dof) as `filter_error` does, by the dense factors of I - z^2 J_q - z J_v with z = h gamma0."""
     n = w.Q.size
     m = e_q.size
     gamma0 = options[newton_options_index(s) + at.GAMMA0]
@@ -317,15 +318,15 @@ def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
 
 @inlined
 def _band_view(numbers, n, b):
-    """Return a view (n, 2 b + 1) of `numbers`, which store K or D; its element [i, b + j - i] is K[i, j] or D[i, j]."""
+    """Return a view (n, 2 b + 1) of `numbers`, the band of a matrix such as K; its element [i, b + j - i] is K_ij."""
     return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
 
 
 @inlined
 def _border_views(w, n, r, b):
-    """Return views of three arrays stored after K: independent rows of C_q (r, n), w.D (n - r + 1, r), indices (r).
+    """Return views of three arrays stored behind K: independent rows of C_q (r, n), w.D (n - r + 1, r), indices (r).
 
-    The first two are copies from the state where K was computed. The indices are the dependent coordinates.
+    The first two are copies from the state where K was computed. The indices are those of the dependent coordinates.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -338,7 +339,7 @@ def _border_views(w, n, r, b):
 
 @compiled
 def _update_banded_residual(f, w, t, q, v):
-    """Store Q - C_q^T w.lam at (t, q, v) in w.Q, and C_q in w.Gx."""
+    """Store the residual Q - C_q^T w.lam at (t, q, v) in w.Q, and C_q in w.Gx."""
     w.n_evaluations += 1
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
@@ -351,7 +352,7 @@ def _update_banded_residual(f, w, t, q, v):
 
 @compiled
 def _fill_band(f, w, t, q, v, by_v, base, moved, b, band):
-    """Store K (D if `by_v`), computed by differences, in `band` (n_q, 2 b + 1); return DONE or NOT_FINITE.
+    """Store K (D if `by_v`), the derivative of the residual by q (by v), by differences, in `band`; return a code.
 
     Columns j, j + 2 b + 1, ... are computed at once. `base` (n_q) is the residual at (q, v); `moved` (n_q) is scratch.
     """
@@ -385,7 +386,7 @@ def _copy_band(A, b, band):
 
 @compiled
 def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
-    """Store in w.matrices the bands of the tangents K and D at (t, q, v), the last evaluated state; return a code."""
+    """Store the bands of K and D, derivatives of forces at the last evaluated state, by callbacks; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, at.FILTER).reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
     code = fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
@@ -401,7 +402,7 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_tangents(f, w, memory, s, t, q, v):
-    """Store in w.matrices bands of K and D at (t, q, v), the last evaluated state, and the border; return a code."""
+    """Store the bands of K and D (derivatives of forces) at the last evaluated state, C_q and w.D; return a code."""
     n = q.size
     b = f.bandwidth
     w.n_jacobians += 1
@@ -421,7 +422,7 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
     code = _fill_band(f, w, t, q, v, False, base, moved, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b))
     if code != DONE:
         return code
-    # displace all velocities at once: if this does not change the residual, D is zero
+    # displace all velocities at once: if this does not change the residual, D, its derivative by velocities, is zero
     for j in range(n):
         moved[j] = displace_unequally(v[j], j)
     _update_banded_residual(f, w, t, q, moved)
@@ -436,7 +437,7 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
-    """Store in `numbers` the factors of M - z^2 K - z D bordered by C_q, and pivots in `memory`; return a code.
+    """Store the factors of M - z^2 K - z D (Newton's matrix), bordered by C_q, in `numbers`, and pivots; return a code.
 
     `index`: index of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
     """
@@ -457,7 +458,7 @@ def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
 
 @compiled
 def _multiply_by_T(w, b, x, X):
-    """Store T x[:n_dof] in X (n_q)."""
+    """Store T x[:n_dof] in X (n_q): the columns of T are the velocities that the constraints allow."""
     n_dof = w.independent.size
     _, D, columns = _border_views(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -470,7 +471,7 @@ def _multiply_by_T(w, b, x, X):
 
 @compiled
 def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system for x (n_q); store independent entries in x[:n_dof]; the other entries are scratch."""
+    """Solve the bordered system for x (n_q); move independent entries to x[:n_dof]; other entries become scratch."""
     Cq, _, _ = _border_views(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # in ascending order, no entry is overwritten before it is read
@@ -479,7 +480,7 @@ def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
 
 @compiled
 def _solve_banded_system(f, w, b, numbers, pivots, substitute, X, x):
-    """Replace x[:n_dof] by (I - z^2 J_q - z J_v)^-1 x[:n_dof], using the factors of the bordered matrix.
+    """Replace the right-hand side x[:n_dof] by the solution of Newton's system, by factors of the bordered matrix.
 
     The other entries of x (n_q), and X (n_q), are scratch.
     """
@@ -491,7 +492,7 @@ def _solve_banded_system(f, w, b, numbers, pivots, substitute, X, x):
 
 @compiled
 def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
-    """Replace e_v[:n_dof] as `filter_error` does; the other entries of e_v (n_q) are scratch."""
+    """Filter e_v[:n_dof] as `filter_error` does, by banded factors; the other entries of e_v (n_q) are scratch."""
     n = w.Q.size
     b = f.bandwidth
     z = h * options[newton_options_index(s) + at.GAMMA0]
@@ -509,8 +510,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# the sparsity pattern is complete if the change of the residual differs from its prediction by at most this fraction of
-# the sum of the absolute terms of the prediction
+# the pattern of K and D is complete if K or D times a displacement differs from the change of the residual by at most
+# this fraction of the sum of the absolute terms of the product
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
@@ -526,7 +527,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, of G, of K and of D, a copy of w.is_independent, stiffness of rows."""
+    """Return views of w.matrices: entries of M, G, K and D, a copy of w.is_independent, numbers s (sparse_ldl.py)."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass
@@ -561,7 +562,7 @@ def _sparse_scratch(f, w):
 
 @inlined
 def _sparse_factor_view(f, w, k):
-    """Return a real view of the factors in w.matrices: of the filter matrix (k = 0), or for eigenvalue k - 1 of A."""
+    """Return a real view of factors in w.matrices: of the filter's matrix (k = 0), or for eigenvalue k - 1 (k > 0)."""
     n = f.newton_program[N_PIVOTS]
     n_factors = n + 2 * f.newton_program[N_OFF_DIAGONAL]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -573,9 +574,9 @@ def _sparse_factor_view(f, w, k):
 
 @compiled
 def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
-    """Store Q - G^T w.lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
+    """Store the residual Q - G^T w.lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
 
-    The entries of G are in w.jacobian_values; if `renews_G`, first evaluate them at (t, q).
+    The entries of G are in w.jacobian_values; if `renews_G`, evaluate them at (t, q) first.
     """
     w.n_evaluations += 1
     out[:] = 0.0
@@ -595,7 +596,7 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 @compiled
 def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
-    """Store in `entries` the entries of K (of D if `by_v`), computed by differences; return DONE or NOT_FINITE.
+    """Store in `entries` the entries of K (of D if `by_v`), the derivative of the residual by q (by v); return a code.
 
     All columns of a group are computed at once. `base`: residual at (q, v); `residual` and `moved` (n_q): scratch.
     """
@@ -619,7 +620,7 @@ def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, mo
 
 @compiled
 def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
-    """Return whether the `entries` of K or D explain the difference between the residuals `base` and `residual` (n_q).
+    """Return True if the `entries` of K or D explain the difference between the residuals `base` and `residual` (n_q).
 
     `base`, `residual`: residuals at `base_point` (q or v), and at `moved`. `largest`: largest term of a residual.
     `residual` and `predicted` (n_q) are overwritten.
@@ -639,7 +640,7 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
 
 @compiled
 def _fill_sparse_tangents(f, w, memory, t, q, v):
-    """Store in w.matrices the entries of K and D at (t, q, v), the last evaluated state; return a code.
+    """Store the entries of K and D (derivatives of the residual) at the last evaluated state (t, q, v); return a code.
 
     The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
     """
@@ -683,7 +684,7 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
 
 @compiled
 def _factor_sparse_matrix(f, w, z, factors):
-    """Store in `factors` the factors of the bordered matrix for z, real or complex as z is; return a code."""
+    """Store in `factors` the factors of [M - z^2 K - z D, G^T; G, 0], real or complex as z is; return a code."""
     mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
     w.n_factorizations += 1
@@ -693,7 +694,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store the right-hand side of the bordered system, [M r; G r] (with rows added to M), in `right`."""
+    """Store the right-hand side [M r; G r] of the bordered system in `right`, adjusted for rows added to M."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -707,7 +708,7 @@ def _fill_sparse_right_side(f, w, r, right):
 
 @compiled
 def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
-    """Replace e_v (n_q) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
+    """Filter e_v (n_q) as `filter_error` does, by sparse factors."""
     _, _, K, _, _, _ = _sparse_derivative_views(f, w)
     _, _, _, _, right, y = _sparse_scratch(f, w)
     z, n = h * options[newton_options_index(s) + at.GAMMA0], y.size
@@ -725,7 +726,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store in w.matrices J_q and J_v (dense storage) or K and D (else) at the last evaluated state; return a code."""
+    """Store J_q and J_v (dense storage) or K and D (else) at the last evaluated state; return a code."""
     if f.form == FIXED_ORDER:
         return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.bandwidth >= 0:
@@ -735,7 +736,7 @@ def fill_derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
-    """Store in `numbers` the factors of I - z^2 J_q - z J_v, real or complex as z is; see `_factor_banded`."""
+    """Store the factors of Newton's matrix, real or complex as z is, in `numbers`; see `_factor_banded`."""
     w.n_factorizations += 1
     if f.bandwidth >= 0:
         return _factor_banded(w, memory, s, f.bandwidth, index, z, numbers, factorize, substitute)
@@ -744,7 +745,7 @@ def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
 
 @compiled
 def factor_filter(f, w, options, memory, s, h):
-    """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, with z = h gamma0; return a code."""
+    """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, z = h gamma0 (see GAMMA0); return a code."""
     z = h * options[newton_options_index(s) + at.GAMMA0]
     if f.form == FIXED_ORDER:
         return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 0))
@@ -753,7 +754,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor I - z^2 J_q - z J_v for z = h gamma0, and for z = h l with each eigenvalue l of A; return a code."""
+    """Factor Newton's matrix I - z^2 J_q - z J_v for z = h gamma0 and z = h l, l: eigenvalues of A; return a code."""
     offset = newton_options_index(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + at.N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -773,7 +774,7 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
-    """Replace x[:n_dof] by the solution, using the factors in `numbers` from `_factor_system`; X (n_q) is scratch."""
+    """Replace x[:n_dof] by the solution of Newton's system, by factors from `_factor_system`; X (n_q) is scratch."""
     m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, index)
     if f.bandwidth >= 0:
         _solve_banded_system(f, w, f.bandwidth, numbers, pivots, substitute, X, x)
@@ -783,7 +784,7 @@ def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
 
 @compiled
 def _solve_sparse_system(f, w, numbers, right, y, x):
-    """Replace x (n_q), real or complex, by the solution, using the factors `numbers`; `right` and `y` are scratch."""
+    """Replace x (n_q) by the solution of Newton's system, using the factors `numbers`; `right` and `y` are scratch."""
     _fill_sparse_right_side(f, w, x, right)
     solve_lu(f.newton_program, numbers, right, y)
     copy(right[: x.size], x)
@@ -791,7 +792,7 @@ def _solve_sparse_system(f, w, numbers, right, y, x):
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
-    """Replace x[:n_dof], a complex right-hand side, by the solution of the system for eigenvalue k of A.
+    """Replace x[:n_dof], a complex right-hand side, by the solution of Newton's system for eigenvalue k of the tableau.
 
     If this eigenvalue is real, only the real part of x is used, and the solution is real.
     """
@@ -818,9 +819,10 @@ def solve_system(f, w, options, memory, s, k, x):
 
 @compiled
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
-    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
+    """Remove stiff components from e_v: replace it by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
 
-    Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
+    e_q and e_v are errors of q and v; J_q and J_v are derivatives of accelerations. Only the first n_dof entries of e_q
+    and e_v (n_q) are read and changed.
     """
     m = w.independent.size
     if f.form == FIXED_ORDER:
@@ -833,7 +835,7 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
 
 @compiled
 def correct_stages(f, w, options, memory, s, residual, A_stage):
-    """Replace the residuals (s, n_q) by Newton corrections of the stage accelerations; add these to A_stage (s, n_q).
+    """Replace residuals (s, n_q) by Newton corrections of the stage accelerations; add these to A_stage (s, n_q).
 
     Only the entries of independent coordinates in `residual` and A_stage are read and changed.
     """
@@ -844,7 +846,7 @@ def correct_stages(f, w, options, memory, s, residual, A_stage):
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)
     offset += at.N_EIGEN_SCALARS + s
-    corrections = block(memory, s, n, at.Q_STAGE)  # scratch, because stage positions are computed anew before their use
+    corrections = block(memory, s, n, at.Q_STAGE)  # scratch: stage positions are computed anew before their use
     corrections[:, :] = 0.0
     for k in range(n_systems):
         begin_row = offset + 2
