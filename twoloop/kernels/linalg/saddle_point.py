@@ -52,7 +52,7 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 @compiled
 def find_null_space(w):
-    """Store the matrix D in w.D: if G v = 0, dependent velocities are D^T times independent ones. Keep its last row."""
+    """Store D in w.D, except in its last row: dependent velocities are D^T times independent ones if G v = 0."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -62,7 +62,7 @@ def find_null_space(w):
 
 @merged
 def _reduce_diagonal_mass(columns, independent, M, D, A, m):
-    """Store the upper triangle of T^T M T in A, for diagonal M and the allowed velocities T = [I; D^T]; m: scratch."""
+    """Store the upper triangle of T^T M T in A, for a diagonal M and allowed velocities T = [I; D^T]; m: scratch."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
     for i in range(independent.size):
@@ -76,7 +76,7 @@ def _reduce_diagonal_mass(columns, independent, M, D, A, m):
 
 @merged
 def _reduce_dense_mass(columns, independent, M, D, A, MT):
-    """Store the upper triangle of T^T M T in A, for any M and the allowed velocities T = [I; D^T]; MT: scratch."""
+    """Store the upper triangle of T^T M T in A, for any mass M and allowed velocities T = [I; D^T]; MT: scratch."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
         for j in range(n_dof):
@@ -398,9 +398,9 @@ def solve_with_multipliers(f, w, r, c, a, lam):
 def least_norm(w, lam):
     """Replace lam by the multipliers of least norm that give the same reactions G^T lam.
 
-    Redundant row i of G is the sum, over independent rows k, of Z[i, k] times row k. So the vectors e_i - sum_k Z[i, k]
-    e_k (e: unit vectors) are in the null space of G^T. They are the columns of a matrix N; the part N (N^T N)^-1 N^T
-    lam of lam in the null space is subtracted.
+    Redundant row i of G is the sum, over independent rows k, of Z[i, k] times row k. So G^T maps the vectors e_i -
+    sum_k Z[i, k] e_k (e: unit vectors) to zero. These are the columns of a matrix N; the part N (N^T N)^-1 N^T lam of
+    lam, which causes no reactions, is subtracted.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     r, n_red = rows.size, lam.size - rows.size

@@ -137,8 +137,8 @@ def solve(program, values, stiffness, x, y):
     `stiffness`: the number s for each row g of G that was added to M as s g g^T. y is scratch.
     """
     n, order, n_q = program[N_PIVOTS], pivot_order_of(program), program[N_COORDINATES]
-    # `values` are factors for M + s g g^T; so r + s c g^T should replace r. Without this, accelerations stay the same,
-    # because g a = c, but the multiplier of g is too small by s c. The last loop adds s c
+    # `values` are factors for M + s g g^T; so r + s c g^T should replace r. With r, accelerations are the same, because
+    # g a = c, but the multiplier of row g is too small by s c. The last loop adds s c
     begin, row_of = factor_columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]

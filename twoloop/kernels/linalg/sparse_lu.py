@@ -34,7 +34,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     update_runs_of,
 )
 
-MIN_PIVOT = 1e-11  # smallest pivot, relative to the sum of its absolute terms; smaller ones may be rounding errors
+MIN_PIVOT = 1e-11  # smallest allowed pivot, relative to the sum of its |terms|; smaller ones may be rounding errors
 
 
 def newton_program(
@@ -46,7 +46,7 @@ def newton_program(
     body_groups: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors Newton's matrix; None if it would have too many updates.
+    """Return the program that factors Newton's matrix; None if the program would be too long.
 
     `tangents`: entries of K and D (derivatives of forces), both triangles, in the order of `grouped_entries`.
     """

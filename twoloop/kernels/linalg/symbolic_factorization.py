@@ -61,7 +61,7 @@ class _PartSupports:
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
-        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs supporting the part of a body
+        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # index: smallest body of a part
         # for each hub: one body of each part that the hub supports or has supported
         self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}
 
@@ -259,7 +259,7 @@ Entries = tuple[Integers, Integers]  # row indices and column indices of the non
     N_STIFFENED,  # number of products of two entries in a row of G, which are added to a singular M
     N_HEAD,
 ) = range(9)
-ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program with at most this number of updates is always written
+ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program is always written if it has at most this number of updates
 # a longer program for n pivots is written if it has at most MAX_UPDATE_RATIO * n^3 updates; else dense factors are used
 MAX_UPDATE_RATIO = 1e-3
 MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer program takes too much memory
@@ -335,9 +335,9 @@ def program_in_order(
 def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
     """Divide the updates of off-diagonal entries into runs; return the length and the first target of each run.
 
-    Targets are slots of changed entries, and are consecutive in a run. The rows of a joint are adjacent in all columns,
-    so that runs are long: their numbers are read and written as vectors, and a list of all targets would be ten times
-    as long.
+    A target is the slot of the entry that an update changes; targets are consecutive in a run. The rows of a joint are
+    adjacent in all columns, so that runs are long. So numbers are read and written as vectors, and the program is a
+    tenth as long as a list of all targets.
     """
     off_diagonal = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off_diagonal - 1] | (targets[off_diagonal] != targets[off_diagonal - 1] + 1))
@@ -403,7 +403,7 @@ def pivot_order_of(program):
 
 @inlined
 def factor_columns_of(program):
-    """Return the index of the first entry of each column of L, then the number of entries; and the row of each entry.
+    """Return two arrays: index of the first entry of each column of L, then the number of entries; row of each entry.
 
     Rows are numbered in the order of elimination.
     """
@@ -437,7 +437,10 @@ def jacobian_entries_of(program):
 
 @inlined
 def stiffening_products_of(program):
-    """Return, for each product of two entries of G that is added to M: row, indices of both entries, and slot."""
+    """Return, for each product of two entries of G that is added to M: row, indices of both entries, slot.
+
+    A slot is the index of a number in the array of the factors.
+    """
     n = program[N_STIFFENED]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     begin += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])

@@ -110,7 +110,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # a step with a larger error by jumps of a force, in tolerances, is rejected; not in the paper
+SUDDEN_ERROR = 10.0  # a step with a larger estimated error by a jump of a force is rejected; not in the paper
 
 
 @kernel(ATTEMPT)

@@ -259,8 +259,8 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
     """Return the norm of the difference between a step and two half steps, in units of the tolerances (eq. 26).
 
-    (q, v): beginning of the step; (q_full, v_full), (q1, v1): ends of the step, of the half steps. The norm is the
-    largest |component| of positions and velocities if `largest`, else the root mean square (eq. 27).
+    (q, v) is the beginning, (q_full, v_full) the end of the step, and (q1, v1) the end of the half steps. If `largest`,
+    the norm is the largest |component| of positions and velocities, else the root mean square (eq. 27).
     """
     rtol = tolerances[RTOL]
     total = 0.0

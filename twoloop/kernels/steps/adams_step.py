@@ -29,7 +29,7 @@ START_GROWTH = 2.0  # largest ratio of successive step sizes while the order sti
 LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes after a large error of predicted dependent positions
 RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
 
-# eight Gauss nodes on [0, 1] and their weights: exact for polynomials up to degree 15, such as (1 - s) c_15(s)
+# eight Gauss nodes on [0, 1] and their weights: this quadrature is exact for polynomials up to degree 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
 POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values c_i(s) at NODES in the integral of (1 - s) c_i(s)
 
@@ -52,7 +52,7 @@ ERROR_CONSTANTS = _error_constants()
 # indices in `options`. THETA: a projection has converged if its last correction is at most THETA, see `project`
 THETA, N_OPTIONS = range(2)
 # indices of the scalars in `memory`. After the scalars, `memory` contains N_ROWS rows of coefficients, two tables of
-# differences, and two scratch rows, see _coefficient_row, _difference_table and _scratch_rows
+# differences, and two scratch rows, see _row, _difference_table and _scratch_rows
 (
     CURRENT,  # index, 0 or 1, of the table of differences at the last accepted step; the other one is the attempt's
     ORDER,  # order of the next attempt
@@ -173,7 +173,7 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # row k + 1 becomes phi_{k+2} - d, where d, the last row, is the error of the prediction: -beta_{k+1} phi_{k+1}
+        # row k + 1 becomes -beta_{k+1} phi_{k+1} = phi_{k+2} - d; the error d of the prediction will be the last row
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)

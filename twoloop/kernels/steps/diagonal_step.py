@@ -1,4 +1,4 @@
-"""Diagonally implicit Runge-Kutta steps with an explicit first stage (ESDIRK), for stiff problems and few digits.
+"""Diagonally implicit Runge-Kutta steps with an explicit first stage (ESDIRK), for stiff problems and low accuracy.
 
 The stages are solved one after another. For stage j of the tableau a_jk, with the diagonal entry gamma, Newton's method
 finds the accelerations a of the independent coordinates. F are the accelerations that the inner loop returns,
@@ -85,7 +85,7 @@ def _fill_newton_matrix(w, memory, n, m, z, H):
 
 @compiled
 def factor_newton_matrix(w, memory, z):
-    """Factor Newton's matrix T^T (M - z^2 K - z D) T by the tangents K and D that were computed last; return a code."""
+    """Factor T^T (M - z^2 K - z D) T with K and D, the derivatives of forces that were computed last; return a code."""
     n, m = w.Q.size, w.independent.size
     storage = matrix_storage(w, n, at.FILTER)
     H = as_matrix(storage, m)
@@ -103,7 +103,7 @@ def factor_newton_matrix(w, memory, z):
 
 @compiled
 def compute_and_factor_matrix(f, w, memory, t, q, v, z):
-    """Compute K and D (derivatives of forces) at (t, q, v); factor Newton's T^T (M - z^2 K - z D) T; return a code.
+    """Compute K and D, the derivatives of forces, at (t, q, v), and factor T^T (M - z^2 K - z D) T; return a code.
 
     The last evaluation must have been at (t, q, v), and w.lam must be the multipliers there.
     """
@@ -162,7 +162,7 @@ def correct_stage(w, memory, residual, a):
 
 @compiled
 def filter_dense_error(w, memory, z, e_q, e_v):
-    """Filter the velocity error e_v (n_dof), see `filter_error` in newton_systems.py, by `factor_newton_matrix`."""
+    """Filter e_v (n_dof) as `filter_error` of newton_systems.py does, by the factors of `factor_newton_matrix`."""
     n = w.Q.size
     m = e_q.size
     N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
@@ -186,7 +186,7 @@ VELOCITY_WEIGHT = 0.1  # weight, in Newton's convergence test, of the position e
 
 @inlined
 def stage_views(memory, s, n):
-    """Return views of `memory`: stage velocities and accelerations (s, n each), accelerations at the beginning (n)."""
+    """Return views of `memory`: velocities (s, n) and accelerations (s, n) of the stages, initial accelerations (n)."""
     last = memory.size - n
     return (
         memory[last - 2 * s * n : last - s * n].reshape((s, n)),
@@ -216,7 +216,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
-    """Compute the derivatives of accelerations F at (t, Q, V), and factors, unless they are valid; return a code."""
+    """Compute derivatives of accelerations F at (t, Q, V) and Newton's factors if they are outdated; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -313,7 +313,7 @@ MAX_RATIO_BY_ONE_JUMP = 0.174
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
     """Remove stiff components: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, using the last factors.
 
-    J is the Jacobian of (v, F) by (q_i, v_i). Only the first n_dof numbers of e_q and e_v (n_q) are read and changed.
+    J is the Jacobian of velocities and accelerations by (q_i, v_i). Only the first n_dof entries of e_q and e_v change.
     """
     z = h * gamma_of(options)
     n_dof = w.independent.size
@@ -375,8 +375,7 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
     """Return the largest component of the error estimate of `_store_weighted_sums`, in units of the tolerances.
 
     The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If outdated derivatives
-    make the filter wrong, they are computed anew. On return, E_Q and E_V in `memory` contain the twice filtered
-    estimate.
+    make the filter wrong, they are computed anew. E_Q and E_V in `memory` become the twice filtered estimate.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
@@ -488,7 +487,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[at.DIAGONAL_OFFSET])
         _, A_stage, a_end = stage_views(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # not F at the new state, which would amplify Newton's last error by the stiffness
+        copy(A_stage[s - 1], a_end)  # not those at the new state, in which stiffness amplifies Newton's last error
         memory[at.IS_FRESH] = 0.0
 
 

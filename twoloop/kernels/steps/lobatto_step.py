@@ -53,7 +53,7 @@ from twoloop.kernels.linalg.dense import copy
     N_OPTIONS,
 ) = range(6)
 
-START_CONTRACTION = 0.12  # contraction rho by a sweep that the first step should have; guesses of its size aim at it
+START_CONTRACTION = 0.12  # contraction (ratio of errors by a sweep) that guesses of the first step size aim at
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
@@ -71,7 +71,7 @@ N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
 LEAST_TREND = 0.4  # lower bound of the trend, the ratio of step sizes that the error allows in successive steps
-# ratio of the step sizes that the convergence allows if sweeps evaluate accelerations twice, and once
+# step size that the convergence allows if sweeps evaluate accelerations twice, relative to that if they do so once
 GAIN_BY_REPEATS = 1.5
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
 # the error allows: the second evaluation then saves no time

@@ -1,7 +1,6 @@
 """Implicit Runge-Kutta steps whose outer loop is Newton's method, for stiff problems.
 
-The unknowns are the stage accelerations a_j of the independent coordinates, the residuals r_j (`f`: kit, `w`:
-workspace):
+The stage accelerations a_j of the independent coordinates must make the residuals r_j zero (`f`: kit, `w`: workspace):
 
     r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
@@ -129,7 +128,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
     """Remove stiff components from errors: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma0.
 
-    J is the Jacobian of (v, F) by (q_i, v_i), with accelerations F. Only the first n_dof numbers of e_q and e_v change.
+    J is the Jacobian of velocities and accelerations by (q_i, v_i). Only the first n_dof entries of e_q and e_v change.
     """
     s = int(options[STAGES])
     m = w.independent.size

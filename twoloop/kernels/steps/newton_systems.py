@@ -205,7 +205,7 @@ def reduce_to_independents(w, A, AT, B):
 
 @compiled
 def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
-    """Store J_q and J_v, derivatives of accelerations at the last state (t, q, v), from K and D; return a code."""
+    """Store J_q and J_v, derivatives of accelerations at the last evaluated state, by tangents K, D; return a code."""
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
@@ -352,9 +352,9 @@ def _update_banded_residual(f, w, t, q, v):
 
 @compiled
 def _fill_band(f, w, t, q, v, by_v, base, moved, b, band):
-    """Store K (D if `by_v`), the derivative of the residual by q (by v), by differences, in `band`; return a code.
+    """Store K (D if `by_v`), differences of Q - C_q^T lam by q (by v) at (t, q, v), in `band`; return a code.
 
-    Columns j, j + 2 b + 1, ... are computed at once. `base` (n_q) is the residual at (q, v); `moved` (n_q) is scratch.
+    Columns j, j + 2 b + 1, ... are computed at once. `base`: Q - C_q^T lam at (q, v); `moved` (n_q): scratch.
     """
     n = q.size
     base_point = v if by_v else q
@@ -527,7 +527,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, G, K and D, a copy of w.is_independent, numbers s (sparse_ldl.py)."""
+    """Return views of w.matrices: entries of M, G, K, D, a copy of w.is_independent, numbers s of sparse_ldl.py."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass
@@ -684,7 +684,7 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
 
 @compiled
 def _factor_sparse_matrix(f, w, z, factors):
-    """Store in `factors` the factors of [M - z^2 K - z D, G^T; G, 0], real or complex as z is; return a code."""
+    """Store in `factors` the factors of Newton's matrix [M - z^2 K - z D, G^T; G, 0], for real or complex z."""
     mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
     w.n_factorizations += 1
@@ -754,7 +754,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor Newton's matrix I - z^2 J_q - z J_v for z = h gamma0 and z = h l, l: eigenvalues of A; return a code."""
+    """Factor Newton's matrix I - z^2 J_q - z J_v for z = h gamma0 and for z = h times eigenvalues of the tableau."""
     offset = newton_options_index(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + at.N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -821,8 +821,7 @@ def solve_system(f, w, options, memory, s, k, x):
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """Remove stiff components from e_v: replace it by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
 
-    e_q and e_v are errors of q and v; J_q and J_v are derivatives of accelerations. Only the first n_dof entries of e_q
-    and e_v (n_q) are read and changed.
+    J_q, J_v: derivatives of accelerations; e_q, e_v (n_q): errors of q and v, in their first n_dof entries.
     """
     m = w.independent.size
     if f.form == FIXED_ORDER:
