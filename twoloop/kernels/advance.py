@@ -79,14 +79,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.gamma_given == 0:  # again, with the scale of Gamma that is known only now
+    if code == DONE and f.gamma_given == 0:  # repeat: errors of Gamma depend on its size, now known
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return JUMP, RAMP or SMOOTH for C_t and b (of A v + b = 0) within a step, and the times (s) at the ends of it."""
+    """Return JUMP, RAMP or SMOOTH for C_t and b (of A v + b = 0) in a step; the jump's or ramp's begin and end (s)."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -100,7 +100,7 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return a code, the error in tolerances, and the ratio of the next size to `size` (0: not known).
+    """Attempt a step; return DONE or another code, the error in tolerances, and next size / `size` (0: not known).
 
     If `crosses_jump`, the step only crosses a jump of C_t or b: `new_state` already contains the state after the jump.
     """
@@ -270,7 +270,7 @@ def advance(
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        n_grid_steps = 1.0  # for a fixed step size: number (0 or 1) of intervals of the time grid that it completes
+        n_grid_steps = 1.0  # fixed step size: number (0 or 1) of intervals of the time grid that this step completes
         if fixed_size:
             size, n_grid_steps, reaches_goal = size_on_grid(clock, t, h, target, goal)
         else:
@@ -329,7 +329,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the method does not know `error_factor`
+        elif error_factor > 1.0 and error > 0.0:  # the method computed `factor` without `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:

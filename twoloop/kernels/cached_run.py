@@ -140,7 +140,7 @@ def split_steps(steps, counts, h, changes, used_newton):
     - changes: numbers of rejections by the error test, failures, and new partitions in each step
     - used_newton: True for a step by Newton's method
 
-    `counts`: these three numbers since the start of the run; the values before the first step are updated in place.
+    `counts`: these three numbers since the start of the run; on entry before the first step, on return after the last.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -329,7 +329,7 @@ def _restore_start(b):
 # indices in `last_start`. N_EQUAL: number of successive runs from the last start, at most 2. START: index of the first
 # number of the last start, [t, t1, q, v]
 N_EQUAL, START = 0, 1
-NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run could start at the last start; `saved` contains its data
+NEVER, IS_SAVED = 0.0, 2.0  # N_EQUAL if no run could begin at the last start; if `saved` has data of this start
 
 
 @exact
@@ -401,7 +401,7 @@ def start_and_advance(f, checked_kit, w, b, t, t1, q, v, records, region, checks
     If successive runs begin at the same start, the second one checks it again, and saves all data computed there. Later
     runs restore these data without a check. For the arguments see _start_run and _write_report.
     """
-    f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form
+    f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form of the linear equations
     is_repeated, n_equal = _equals_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
     if is_repeated and n_equal == IS_SAVED:
         _restore_start(b)

@@ -34,7 +34,7 @@ from twoloop.run.singular_start import branch_at
 Array = NDArray[np.float64]
 
 MAX_ATTEMPTS = 1024  # number of attempted integration steps after which `IntegrationLoop` takes over from `advance`
-FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # only these callbacks may depend on parameters that change
+FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # parameters that change may enter these callbacks only
 CHANGED_PARAMETERS = "the parameters changed at samples"  # text in the field `changes` of all results of SampledRun
 
 
@@ -121,7 +121,7 @@ class SampledRun:
                 f"have lost rank there ({dependent_rows(self._derived_system, t, q)}), but not beside it. Start a "
                 "little before that position, or beyond; run and solve_dae may start there"
             )
-        run.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels keep the known ranks
+        run.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels keep known ranks
         run.set_step_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
@@ -173,7 +173,7 @@ class SampledRun:
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # earlier calls of `step` may have missed changes of forces, but are not repeated
+            if len(self.times) > 1:  # warn: earlier calls of `step` may have missed changes, and are not repeated
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -256,7 +256,7 @@ class SampledRun:
         self._parameters_changed = False
 
     def _finish_by_loop(self, end: float) -> None:
-        """Let IntegrationLoop integrate to `end`: `advance` stopped earlier; raise RuntimeError if this fails."""
+        """Let IntegrationLoop go on to `end`, before which `advance` has stopped; raise RuntimeError if this fails."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
         interrupts = Interrupts().install_handlers()

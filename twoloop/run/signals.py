@@ -25,7 +25,7 @@ class SignalHandlers:
 
     Python may call a handler anywhere. An exception that a handler raises while numba compiles breaks numba for the
     rest of the process. So, while a compiler runs, handlers are not called but recorded for later calls. Elsewhere a
-    handler is called at once. If machine code has called the Python function that runs then, the exception becomes a
+    handler is called at once; but if it interrupts Python code that machine code has called, its exception becomes a
     `SystemError`. So `call_delayed`, called between chunks of steps, and `restore` raise the original exception again.
     `ctrl_c`: True replaces Python's own handler of Ctrl-C, too, as `Interrupts` does during integrations.
     """
@@ -84,7 +84,7 @@ def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
 
 
 def is_in_user_function(frame: FrameType | None) -> bool:
-    """Return True if a frame of the call stack is within a user's callback or event function."""
+    """Return True if a stack frame is within a user's callback or event function, called by twoloop."""
     while frame is not None:
         if frame.f_code in CALLERS_OF_USER_CODE:
             return True
@@ -93,7 +93,7 @@ def is_in_user_function(frame: FrameType | None) -> bool:
 
 
 def is_in_compiler(frame: FrameType | None) -> bool:
-    """Return True if a frame of the call stack is within numba or llvmlite, but not within a user's function there."""
+    """Return True if a stack frame is within numba or llvmlite, and not in a user's function that these call."""
     while frame is not None and frame.f_code not in CALLERS_OF_USER_CODE:
         if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
             return True

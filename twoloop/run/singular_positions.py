@@ -22,14 +22,14 @@ TimedState = tuple[float, Array]  # time and state [q, v, ...]
 Crossings = list[list[TimedState]]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
-# messages say that constraints lose rank if their Jacobian has a smaller ratio of smallest to largest singular value
+# messages say that constraints lose rank if smallest / largest singular value of their Jacobian is below this
 LOST_RANK_RATIO = 1e-2
 N_POSITIONS = 33  # number of positions between two states at which singular values of the Jacobian are computed
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of q in finite differences of constraint equations and their Jacobian, relative to the largest coordinate
 DISPLACEMENT = 1e-6
 # rows of the Jacobian are divided by their norms; a row that is small at this position only is divided by MIN_ROW_NORM
-# times its typical norm, which follows from its derivative
+# times its norm at positions nearby, which its derivative yields
 MIN_ROW_NORM = 0.1
 # velocities count as discontinuous if they change in a step by more than JUMP_RATIO times the step size times the
 # acceleration, and by more than MIN_JUMP times the tolerances
@@ -40,7 +40,7 @@ def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_stat
     """Return sentences about the singular positions that steps crossed, for the message of a result.
 
     `crossings`: for each position the states before and after it. If the run ended before the crossing was complete,
-    the state after it is missing; then the last state of the run, `end_state`, replaces it. `rank`: rank of [C_q; A].
+    the state after it is missing; then the last state of the run, `end_state`, replaces it. `rank`: of the Jacobian.
     """
     ratios = {
         ends[0][0]: _least_ratio_between(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]
@@ -63,7 +63,7 @@ def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_stat
 
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the `rank`-th largest singular value of the Jacobian [C_q; A] over the largest one; 1: no constraints."""
+    """Return `rank`-th largest / largest singular value of the constraint Jacobian; 1 if there are no constraints."""
     return _singular_value_ratio(system.rows(t, q), rank)
 
 
@@ -166,7 +166,7 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the scaled M, the scaled constraint Jacobian [C_q; A], divisors of its rows, and units of coordinates.
+    """Return the scaled M, the scaled constraint Jacobian, divisors of its rows, and units of coordinates.
 
     The units of coordinates make the diagonal entries of M 1, and the divisors give rows the norm 1. If a row is small
     at this position only, its divisor is larger, see MIN_ROW_NORM.
@@ -196,7 +196,7 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-# rounding errors of velocities are estimated only if a singular value is at most this fraction of the largest one
+# rounding errors of velocities are estimated only if a singular value of the Jacobian, over the largest, is below this
 WEAK_RATIO = 1e-2
 # rounding errors of velocities are estimated, whatever the tolerances, if the smallest pivot of the Jacobian over the
 # largest is below SMALL_PIVOT. This ratio of pivots is typically PIVOT_FACTOR times the ratio of singular values
@@ -237,7 +237,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
-    """Return a warning if the start q is, within the tolerances, a singular position, else ""; `rank`: of [C_q; A]."""
+    """Return a warning if the start q may, within tolerances, be a singular position, else ""; `rank`: of C_q and A."""
     if rank == 0 or certainly_exceed(WEAK_RATIO, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)

@@ -117,23 +117,23 @@ MASSLESS_RATIO = 1e-10
 # if M is singular, g g^T may be added to M for a row g of C_q whose component along massless directions is longer than
 # this fraction of g
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # n_q / LARGE above which the matrix of Newton's method may be factorized as a sparse matrix
-MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they take at most this fraction of the dense operations
+MIN_SIZE_NEWTON = 1.6  # n_q / LARGE (callbacks.py) above which Newton's matrix may be factorized as a sparse matrix
+MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they take at most this fraction of dense operations
 
 
 class FixedOrderForm(NamedTuple):
     """Program that factorizes a large sparse system in an order of elimination chosen once; data for workspaces."""
 
     program: NDArray[np.int32]
-    sizes: FixedOrderSizes  # sizes of the arrays in its workspaces
+    sizes: FixedOrderSizes  # sizes of the arrays in a workspace for this form
     mass: Entries  # row and column indices of the nonzero entries of M
     # (n_c, n_q), 1 where C_q may be nonzero, else 0; shape (0, n_q) if callback `jacobian_values` gives nonzero entries
     pattern: Array
     # (n_q, n_q), 1 where M may be nonzero, else 0; shape (0, 0) if M is constant or `mass_values` gives its entries
     mass_pattern: Array
     newton_arguments: tuple[Any, ...]  # arguments `mass`, `jacobian`, `bodies`, `stiff` of `newton_form`
-    newton_program: NDArray[np.int32] | None = None  # for the matrix of Newton's method; None: not yet needed
-    n_groups: int = 0  # number of column groups of this matrix, see `newton_form`: finite differences of forces for it
+    newton_program: NDArray[np.int32] | None = None  # factorizes Newton's matrix; None until a plan needs it
+    n_groups: int = 0  # number of column groups of Newton's matrix; each takes one finite difference of forces
 
     def matrix_cost(self) -> float:
         """Return the estimated cost of Newton's matrix with its factors; unit: one evaluation of accelerations."""
@@ -346,7 +346,7 @@ def _dense_flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
-    """Return True if sparse factors would be faster than dense ones. They need an M definite on allowed velocities."""
+    """Return True if sparse factors would be faster than dense ones; they need M definite on allowed velocities."""
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 

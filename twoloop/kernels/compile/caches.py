@@ -244,7 +244,7 @@ def compile_cached(
 
     digests : two digests of everything on which the machine code depends, see `digests_of`. If the first digest differs
         from that of a file, the file is out of date. The second one, of closure variables, is part of the name of the
-        file: functions with the same source may have different values. None: no machine code is stored on disk.
+        file: functions with the same source may differ in these. None: no machine code is stored on disk.
     announcement : text printed on stderr before the first compilation of this process.
     **options : options of numba.njit.
     """
@@ -330,7 +330,7 @@ class _CodeCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if cache_dir:  # numba would create a folder that others may write
+        if cache_dir:  # create the folder here: numba might let others write to it
             with suppress(OSError):
                 make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
@@ -385,7 +385,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         digests = digests_of(function)
         dispatcher = njit(**options)(give_unique_name(function, digests))
         if digests is not None:
-            # `_use_twoloop_cache`, called if a callback calls this function, does not recompile code with these digests
+            # if a callback calls this function, `_use_twoloop_cache` compares digests, and need not recompile it
             _COMPILED_DIGESTS[dispatcher] = digests
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _CodeCache(dispatcher.py_func, *digests, "")

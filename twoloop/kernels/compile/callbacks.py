@@ -303,8 +303,8 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
     """Compile a callback of a mechanism with the signature of its kind.
 
     The arguments are the time, the coordinates `q` (n_q,), in some kinds the velocities `v` (n_q,) or the multipliers
-    `lam` (n_c,), the parameters `p`, and the array to fill. Add to this array, which contains zeros at first (for a
-    tangent of a system with a bandwidth, only in the band). The function must not write to the other arrays::
+    `lam` (n_c,), the parameters `p`, and the array to fill, which contains zeros at first. Add to this array (to a
+    derivative of forces, if the system has a `bandwidth`, only within the band), and write to no other array::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):
@@ -459,7 +459,7 @@ def _name_and_location(function: Callable[..., Any]) -> str:
 
 # pattern of source excerpts in numba's messages; such an excerpt ends with a line that contains only ^
 _SOURCE_EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
-# lines of numba's messages that begin like this give no reason of an error
+# lines of numba's messages that begin like this do not state the reason for an error
 _UNINFORMATIVE_LINE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"

@@ -1,6 +1,6 @@
 """Find the values on which the machine code of a function depends, to hash, compare or replace them.
 
-When numba compiles a function, it makes values part of the machine code, which we call frozen: globals, closure
+When numba compiles a function, it freezes values, that is, makes them part of the machine code: globals, closure
 variables, defaults, attributes of modules, items of tuples, and compiled functions that it calls (helpers). `Digest`
 hashes these values, `frozen_values` lists where they are stored, and `FunctionCopier` copies a function with other
 helpers.
@@ -64,7 +64,7 @@ class Digest:
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
-        self.names: set[str] = set()  # attributes of modules to hash: names that the function being hashed may use
+        self.names: set[str] = set()  # if a value is a module, only its attributes with these names are hashed
         self.positions: dict[tuple[int, str], int] = {}  # serial number of each value added so far, by its id and name
         self.helpers: list[Any] = []  # compiled helpers added so far; a helper comes after the helpers that it calls
 
@@ -373,7 +373,7 @@ class FunctionCopier:
         return self.copies[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
-        """Return the copy of a Python function, as `wrap` returns it."""
+        """Return the replacement of a Python function: what `wrap` returns for a copy of it."""
         self._add_copy(function)
         return self.copies[id(function)]
 

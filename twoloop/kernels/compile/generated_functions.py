@@ -1,4 +1,4 @@
-"""Compile functions that twoloop generates for one mechanism as LLVM code; cache them on disk; do not use numba.
+"""Compile the LLVM code that twoloop generates for one mechanism, without numba; cache machine code on disk.
 
 Numba would add about a thousand lines of code to each function, and take ten milliseconds for each line of its source.
 Generated code consists only of arithmetic on numbers in memory, already in a good order, so that LLVM can emit machine
@@ -119,8 +119,8 @@ def _shared_target_machine() -> Any:
 def _two_pass_manager() -> tuple[Any, Any]:
     """Return a pass manager of LLVM with two optimisation passes, and its pass builder.
 
-    They make the code of small mechanisms a tenth faster; all other passes together gain no further speed. The result
-    is cached, because LLVM leaks 300 kB for each pass that is created.
+    These passes make the code of small mechanisms a tenth faster; all other passes together gain no further speed. The
+    result is cached, because LLVM leaks 300 kB for each pass that is created.
     """
     manager = binding.create_new_module_pass_manager()
     manager.add_reassociate_pass()

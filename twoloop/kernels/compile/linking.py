@@ -117,7 +117,7 @@ def _emit_element_address(
 
 _numba_call_type: Any = BaseFunction.get_call_type
 _call_signatures: dict[Any, tuple[Any, Any]] = {}
-# objects with options of numba, and their texts, by the id of the object; stored objects keep their ids
+# (options of numba, their text), by the id of the options; no other object gets this id while they are stored here
 _option_texts: dict[int, tuple[Any, str]] = {}
 
 
@@ -272,7 +272,7 @@ class _HelperLibrary(CPUCodeLibrary):
         pass  # the code is optimised as part of the callers
 
     def _get_module_for_linking(self) -> Any:
-        """Return the module for linking, and no copy as numba's own method does: nothing else uses this module."""
+        """Return the module for linking, not a copy as numba's own method does: nothing else uses this module."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:

@@ -78,7 +78,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the allowed error of (G x)[row]: the largest |G[row, j]| tolerance[j] over all j; G: C_q, then A."""
+    """Return the allowed error of (G x)[row], the largest |G[row, j]| tolerance of x[j]; G: constraint Jacobian."""
     largest = 0.0
     if f.form == FIXED_ORDER:
         rows, columns, _ = jacobian_entries_of(f.ldl_program)
@@ -165,7 +165,7 @@ SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this f
 # value so far, or at most LEAST_VALUE, because squares of smaller values underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
 MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: all stages may miss a force that lasts a quarter of it
-RESAMPLE_BELOW = 0.25  # sample a time again if the spacing must be below this fraction of the spacing used before
+RESAMPLE_BELOW = 0.25  # times ahead are sampled again if the spacing must be below this fraction of the last spacing
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers at t
 N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
 EQUAL_CHANGES = 1e-5  # two changes count as one if they are at most this fraction of the widest sample spacing apart
@@ -178,7 +178,7 @@ N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # accelerations do not last (see _acceleration_lasts) if one of them changes by more than this fraction of the largest
 # when velocities change by their tolerances
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # a change counts as passed if a step begins less than this number of sample spacings before it
+CHANGE_MARGIN = 0.01  # a change at most this number of sample spacings after the begin of a step counts as passed
 # rows of w.changes, whose columns are the forces, C_t and b: rows 0 to N_SAMPLES are the samples of one set
 LARGEST_ROW = N_SAMPLES + 1  # largest |value| of each column so far
 MIDDLE_ROW = N_SAMPLES + 2  # values at a time between two samples
@@ -289,7 +289,8 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
     for k in range(index - 1, index + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
         is_recorded = low - margin <= clock[at.LAST_CHANGE] <= high + margin
-        if is_recorded or k + 2 > n or low - spacing < first_recorded_time:  # no sample beside it
+        # skip a known change, and a change without samples on both sides
+        if is_recorded or k + 2 > n or low - spacing < first_recorded_time:
             continue
         if k == 0:
             _sample_forces(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE_ROW])
