@@ -68,7 +68,7 @@ FIRST_JUDGED_STEP = 2
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
 def start(f, w, t, state):
-    """Factor M, choose the partition, and store a and lam in `state`; return DONE or a failure code."""
+    """Factorize M, choose the partition, and store a and lam in `state`; return DONE or a code for the failure."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     w.last_jump = t  # a drive may start suddenly: treat t as a jump of C_t and b (of A v + b = 0)

@@ -70,7 +70,7 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
-FIRST_STEP = 0.01  # first step size over the shortest time scale of the initial motion, see _first_step_size
+FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
 GAP_RATIO = 10  # tolerances[GAP] / tolerances[DEFECT_GAP] if forces may change suddenly with position or velocity

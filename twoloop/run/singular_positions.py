@@ -196,10 +196,10 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-# rounding errors of velocities are estimated only if a singular value of the Jacobian, over the largest, is below this
+# rounding errors of velocities are estimated only if a singular value of the Jacobian is at most this times the largest
 WEAK_RATIO = 1e-2
-# rounding errors of velocities are estimated, whatever the tolerances, if the smallest pivot of the Jacobian over the
-# largest is below SMALL_PIVOT. This ratio of pivots is typically PIVOT_FACTOR times the ratio of singular values
+# rounding errors of velocities are estimated, whatever the tolerances, if the ratio of smallest to largest pivot
+# of the Jacobian is below SMALL_PIVOT. This ratio is typically PIVOT_FACTOR times the ratio of singular values
 SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 

@@ -36,8 +36,8 @@ N_PARTS = 12  # C_t and b are sampled at the ends of this number of equal parts 
 # coefficients of the thirteen samples in the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
-RATE_ROUNDING = 1e-11  # error of the twelfth difference due to rounding of samples, over the largest sample of C_t or b
-TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, over np.spacing(t) times the mean slope
+RATE_ROUNDING = 1e-11  # error of the twelfth difference due to rounding of samples, relative to the largest sample
+TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, divided by np.spacing(t) times mean slope
 STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this number of times steeper there than in the whole step
 MAX_RAMP_SHARE = 0.125  # a step must end at a ramp of C_t or b that takes at most this fraction of the step
 MIN_SPACINGS = 8.0  # bisection ends at an interval of this number of spacings of floating-point numbers
