@@ -129,7 +129,7 @@ INFINITE = float("inf")
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step
 
-# constants of the iteration; its contraction, rho, is the ratio of the changes of velocities in two successive sweeps
+# constants of the iteration. Its contraction, rho, is the ratio of the changes of velocities in two successive sweeps
 KAPPA = 0.02  # sweeps end at this iteration error, in tolerances: total errors are then at most as large as DOP853's
 TARGET_SWEEPS = 6.0  # the step size is chosen for this number of sweeps; more if the prediction has degree 6 or more
 EXTRA_SWEEPS = 7  # if a step has not converged after this number of sweeps beyond the target, it is rejected
@@ -141,8 +141,8 @@ STAGNATION_RATIO = 0.5  # sweeps end if the contraction is at least this, and ch
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to the ratio of the iteration error to KAPPA, because the logarithm of 0 is infinite
 ERROR_WEIGHT = 0.5  # factor on the estimated error of a step, see `_estimate_error`
-# if the defect at midpoints between nodes lasted for a whole step, it might change velocities by this many tolerances;
-# the limit is above 1, because most of its effect averages out in a step
+# allowed defect at midpoints between nodes: in a whole step, it would change velocities by this many tolerances. The
+# limit is above 1, because most of the effect averages out in a step
 ALLOWED_DEFECT = 16.0
 
 
@@ -200,7 +200,7 @@ class CollocationCode:
         inputs = {i for expr in exprs for i in expr.terms if graph.operations[i] is None}
         return sorted({(i - 1) % self.n for i in inputs if i > 0})
 
-    # methods that write the functions
+    # methods that write the functions called by lobatto_step.py
 
     def iterate_step(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
         """Write code that iterates the stages of a step; return its status, such as CONVERGED (data/collocation.py).
@@ -273,7 +273,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return an argument `evaluate` of `_iterate` that calls the program `index`, see `call_accelerations`."""
+        """Return a function `evaluate` for `_iterate` that writes a call of program `index` of the accelerations."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -367,7 +367,7 @@ class CollocationCode:
         return factors[0] * factors[1] * (factors[2] * factors[3])
 
     def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """Return an emitter for vectors of successive coordinates, and their first coordinates; two may overlap."""
+        """Return an emitter for vectors of successive coordinates, and the first of each; the last two may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
@@ -666,7 +666,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Do the same as `_project` by `write`, a method of SplitFunctions; `names`: the arrays that it fills."""
+        """Write the code of `_project` by `write`, a method of SplitFunctions that fills the arrays `names`."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]

@@ -36,10 +36,10 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# code that adds rows to M, or refines solutions, is used only if its accelerations at the start have at most this
-# relative error; during runs, the error grew up to 200 times
+# generated code that adds rows of G to M, or refines solutions, is used only if the relative error of its accelerations
+# near the start (`_loss`) is at most this; during runs, the error grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions to be tried for this test, and their spacing (m or rad)
+MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions that `_loss` tries at most, and their spacing (m or rad)
 
 
 def write_accelerations(
@@ -90,7 +90,7 @@ def _store_if_valid(emit: Emitter, is_valid: Value, pointers: Sequence[Value], a
 def call_accelerations(
     emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, out: Value
 ) -> Value:
-    """Write a call that stores the accelerations at `inputs`, [t, q, v], in `out`; return the flag for valid results.
+    """Write a call that stores the accelerations at `inputs`, [t, q, v], in `out`; return a flag: they are valid.
 
     `index`: index of the called program in `equations.accelerations`. 0: program with the fewest operations; -1: the
     elimination begins with M.
@@ -163,7 +163,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return a list of the pointer to the coefficients; in lanes, of two: for varying and for constant coefficients."""
+    """Return the pointers to the coefficients: one; in SIMD lanes two, to varying and to constant coefficients."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -208,7 +208,7 @@ class SplitFunctions:
             self._part_writers[name] = partial(self._write_part, program, {})
 
     def structure(self) -> Iterable[Any]:
-        """Yield everything that the functions depend on, except the values of coefficients."""
+        """Yield, for the key of cached code, everything that it depends on except the values of coefficients."""
         solution, numbers = self.solution, self.numbers
         yield solution.factor_program.sizes, list(numbers.structure(solution.factor_program))
         for program in self.position_programs.values():
@@ -229,7 +229,7 @@ class SplitFunctions:
     # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls of parts (pairs: name, arguments), and missing parts; return the flag that all are valid."""
+        """Write calls of parts (pairs: name, arguments), and missing parts; return a flag: all results are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -251,7 +251,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that stores factors and shared quantities in arguments[4]; return the flag for valid ones."""
+        """Write the part that stores factors and shared quantities in arguments[4]; return a flag: they are valid."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -262,7 +262,7 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part for a program; return the flag for valid results. `stored`: quantities loaded from memory."""
+        """Write the part for a program; return a flag: results are valid. `stored`: quantities loaded from memory."""
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
         results = program.run(lowering)
@@ -284,7 +284,7 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Write a Newton step towards C = 0: store q in `out`, its change in `moved`; return the flag for validity."""
+        """Write a Newton step towards C = 0: store q in `out`, its change in `moved`; return a flag: both are valid."""
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         _write_zeros(emit, self.n, r)

@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return the expressions for "jacobian" and for "gamma" (both kinds of Gamma), by index in the flattened array."""
+    """Return the expressions of missing "jacobian" and "gamma" (both kinds), by index in the flattened array."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -102,8 +102,7 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 Array = NDArray[np.float64]
 
 MAX_ENTRIES = 50_000  # callbacks are compared with exact derivatives if [C_q; A] has at most this many entries
-# states at which derivatives are compared: displacements from the start, of q relative to its size, of t relative to
-# FIRST_TIME_SCALE
+# states at which derivatives are compared: displacements of q in units of its size, and of t in FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
@@ -158,7 +157,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with the t and q of `states`, and with random nonzero v in the range of their q and v."""
+    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v as large as their sizes of q and v."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

@@ -54,7 +54,7 @@ PIVOT_FRACTION = 0.01
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
 # min_pivot = MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest pivot at the start, else MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# if pivots at the start are small, all rows of G are added to M on trial: if min_pivot = MIN_PIVOTS[i] with i at least
+# all rows of G are added to M on trial if pivots at the start are so small that min_pivot is MIN_PIVOTS[i], i at least
 # - MIN_INDEX_FEW, for at most N_FEW_COORDINATES coordinates
 # - MIN_INDEX_FEW_SINGULAR, if M is also singular: Euler parameters lose two digits even in sound models
 # - MIN_INDEX_MANY (plus one if M is singular), for more coordinates, because the code gets longer
@@ -101,8 +101,8 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # refine solutions only if min_pivot is smallest or little inertia may lose digits: in all other cases, random
-        # models had 8 correct digits without refinement
+        # refine solutions only if min_pivot has its smallest value, or little inertia may lose digits: in all other
+        # cases, random models had 8 correct digits without refinement
         is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _hides_little_inertia(choice, mass, G)
         choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
@@ -309,7 +309,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: number recorded by `reduced_program`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # number of operations of `reduced_program` so far
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._callback_terms("mass")
         rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]
@@ -436,7 +436,7 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for the right sides "c" of position corrections: -C; 0 for redundant rows, rows of A."""
+        """Return the program for the right sides "c" of position corrections: -C; 0 in redundant rows and in A."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 

@@ -183,7 +183,7 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return the square of `expr`; if it is part of a power, `is_high_power`: exponent above HIGH_EXPONENT."""
+        """Return the square. `is_high_power`: True if it is part of a power with an exponent above HIGH_EXPONENT."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 

@@ -49,7 +49,7 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of Taylor steps, as in kernels/steps/taylor_step.py
-# if a step is rejected because PREDICTION_ERROR > 1, the next step size is chosen so that this error will be about
+# if a step is rejected because PREDICTION_ERROR > 1, the next step size is such that this error becomes TARGET_ERROR
 TARGET_ERROR = 0.3
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # of the ratio of successive step sizes: minimum, safety factor, maximum
 MAX_REJECTIONS = 10  # if more successive steps than this are rejected, the run leaves its lane
@@ -357,7 +357,7 @@ Array = NDArray[np.float64]
 
 WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero, because they are rounding errors of products like A A
 
-# Butcher tableau A, b, c of an explicit Runge-Kutta method (its first stage is the state), and weights of two estimates
+# Butcher tableau A, b, c of an explicit Runge-Kutta method (first stage: the state), and weights of two error estimates
 Tableau = tuple[Array, Array, Array, Array, Array]
 
 

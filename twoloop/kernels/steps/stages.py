@@ -1,6 +1,6 @@
-"""Share functions and array layouts among implicit Runge-Kutta steps: `options`, constants of a method, and `memory`.
+"""Define the arrays `options` and `memory` of implicit Runge-Kutta steps, and functions that these steps share.
 
-Compiling these steps takes a third of the time of the first run, so each is imported when needed (`LazyStep`).
+Compiling a step takes a third of the time of the first run, so a step is imported only if a run needs it (`LazyStep`).
 """
 
 from importlib import import_module
@@ -13,7 +13,7 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-MAX_STEP_RATIO = 3.0  # the previous step's polynomial predicts the stages of a step that is at most this times as long
+MAX_STEP_RATIO = 3.0  # the previous step predicts the stages of a step that is at most this many times as long
 # Richardson's error estimate misses a force that jumps near an end of a step. So the error of a step is the larger of
 # Richardson's estimate and this factor times `estimate_end_error`
 END_ERROR_WEIGHT = 0.01
@@ -26,7 +26,7 @@ END_ERROR_WEIGHT = 0.01
     INNER_TOL,  # tolerance of the inner loop
     OUTER_TOL,  # tolerance of the outer loop
     EXTRAPOLATION,  # factor 1 / (2^order - 1) of Richardson's extrapolation; 0: the new state is not extrapolated
-    OUTER_TEST,  # coordinates whose changes test (32) of the paper limits. 1: all coordinates; 0: independent ones
+    OUTER_TEST,  # coordinates in the test (32) of the paper, which ends the outer loop. 1: all; 0: independent ones
     POWER,  # order of the method minus 1, see `estimate_end_error`
     N_SCALARS,
 ) = range(7)
@@ -140,18 +140,18 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     N_REAL,  # number of real eigenvalues of A
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of A
     GAMMA0,  # first real eigenvalue of A; if there is none, smallest magnitude of an eigenvalue
-    TESTS_VELOCITIES,  # 1: velocity errors are compared with the tolerances; 0: their effects, see velocity_errors.py
+    TESTS_VELOCITIES,  # 1: the error test compares velocity errors; 0: their effects by `velocity_error`
     N_EIGEN_SCALARS,
 ) = range(5)
 
-# indices of the scalars in `memory`
+# indices of the scalars in `memory`, the array in which a method keeps data from step to step
 (
-    HAS_TRIAL,  # 1: the block TRIAL is filled by the last attempted step. In diagonal_step.py, 1: a step was attempted
+    HAS_TRIAL,  # 1: the last attempted step has filled the block TRIAL; in diagonal_step.py: a step was attempted
     H_TRIAL,  # size of the last attempted step (s)
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
-    IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or at the step's end
+    IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or for this step's end
     PARTITION_NUMBER,  # value of w.generation, the number of a partition, when the stored derivatives were computed
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
     CONTRACTION,  # ratio of the last correction of Newton's method to the one before
@@ -170,7 +170,7 @@ PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # indices of the parts of w.matrices, n_q^2 numbers each. The matrices are defined in newton_systems.py: J_q and J_v
 # (derivatives of accelerations by q and v), K and D (derivatives of forces by q and v), T (velocities v = T v_i)
-# - DERIVATIVE_Q: J_q. In banded storage: the band of K, then copies of C_q and w.D. In diagonal_step.py: T^T K T
+# - DERIVATIVE_Q: J_q. In banded storage: the band of K, rows of C_q and their null space. In diagonal_step.py: T^T K T
 # - DERIVATIVE_V: J_v. In banded storage: the band of D. In diagonal_step.py: T^T D T
 # - FILTER: factors of the real matrix with which error estimates are filtered
 # - SYSTEMS: two parts for each eigenvalue of A, with the factors of its complex matrix; in diagonal_step.py, T^T M T
@@ -273,7 +273,7 @@ def newton_options_index(s):
 
 @merged
 def count_systems(options, s):
-    """Return the number of linear systems of Newton's method: one for each real eigenvalue of A, and for each pair."""
+    """Return the number of linear systems of Newton's method: one for each real eigenvalue or complex pair of A."""
     offset = newton_options_index(s)
     return int(options[offset + N_REAL] + options[offset + N_PAIRS])
 
@@ -320,7 +320,7 @@ def _storage_after_vectors(memory, s, n, k):
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view (n) of `memory`: pivot indices of the factors of the filter (k = 0), or of system k - 1 (k > 0)."""
+    """Return a view (n) of `memory`: pivot indices of the factored filter (k = 0), or linear system k - 1 (k > 0)."""
     return _storage_after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 

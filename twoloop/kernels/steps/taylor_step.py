@@ -47,13 +47,13 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
     N_NODES,  # number of quantities of the program: inputs, unknowns and results of operations
     EARLY_WIDTH,  # number of early operations (they depend on t and q only), rounded up to a multiple of eight
     LATE_WIDTH,  # number of late operations (they depend on velocities, too), rounded up to a multiple of eight
-    KEEP,  # 1: all steps use the series about the first state, to interpolate in a longer step; 0: each has its own
+    KEEP,  # 1: all steps are parts of one longer step, and use the series about its beginning; 0: each has its own
     N_SCALARS,
 ) = range(7)
 # indices of the arrays of an operation table (OperationGroups in twoloop.generate.series): its groups, and the first
 # arrays of the two lists of affine expressions (Sums) that are the arguments of its operations
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
-# indices of the arrays of a list of affine expressions (Sums)
+# indices of the arrays of a list of affine expressions, see Sums in twoloop.generate.series
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
 SUM_INDICES = N_SUMS  # index of one more array of such a list: for each expression, the index where its value is stored
 # indices, among the arrays of the series program, of the first arrays of its four parts: tables of early and of late
@@ -76,7 +76,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
     TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
     PASSED,  # if KEEP = 1: time (s) from the state about which the series is computed to the beginning of the step
     TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
-    # factor on step sizes after which ends of steps lie near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
+    # factor on step sizes with which ends of steps stay near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
     SUSPECTED,  # 1: SUSPECT is a time that the run has not passed yet; 0: there is no such time
@@ -111,7 +111,7 @@ def _float_array(options, index):
 
 @inlined
 def series_view(memory, order, n, index):
-    """Return series `index` (0 or 1) of q as a vector, which is faster than a matrix: order k of q_j at k * n + j."""
+    """Return series `index` (0 or 1) of q as a vector (faster than a matrix): entry k n + j is coefficient k of q_j."""
     begin = N_MEMORY_SCALARS + int(index) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
@@ -145,7 +145,7 @@ def sum_of_products(X, Y, K, total):
 def _fill_arguments(options, sums, groups, g, more, values, out):
     """Store in `out` an argument of each operation of a group: an affine expression of `values` without its constant.
 
-    `sums`: index of the list of these expressions. `g`: offset of the group in `groups`. `more`: its column, see KIND.
+    `sums`: index of the list of expressions. `g`: offset of the group in `groups`. `more`: MORE_FIRST or MORE_SECOND.
     """
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
@@ -158,7 +158,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Evaluate a list of affine expressions of `values` without their constants; store `scale` times each in `out`."""
+    """Evaluate the affine expressions `sums` of `values` without their constants; store them times `scale` in `out`."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -265,10 +265,11 @@ def _fill_second_factors(options, table, values, y):
 
 @inlined
 def array_views(options, memory, n, n_rows):
-    """Return views N, X1, Y1, X2, Y2, total1, total2, r and c of `memory`; row k of a matrix belongs to order k.
+    """Return views of `memory`: Taylor coefficients, sums of their products, and right-hand sides of linear systems.
 
-    N: coefficients of the quantities. X1, Y1, total1: the series x and y of early operations (see `start_operations`),
-    and sums of their products. X2, Y2, total2: the same for late operations. r (n), c (n_rows): right-hand sides.
+    N: row k has the coefficients of order k of all quantities. X1, Y1, total1: the series x and y of early operations
+    (see `start_operations`), and sums of their products. X2, Y2, total2: the same for late operations. r (n) and
+    c (n_rows): right-hand sides.
     """
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
@@ -293,7 +294,7 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Store Taylor coefficients: of t and q up to order 1; of v and early operations of order 0. Clear r and c."""
+    """Begin a Taylor series: store order 0 of v and early operations, orders 0 and 1 of t and q; set r and c to 0."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -328,9 +329,9 @@ def finish_series(w, order, series):
 
 @compiled
 def compute_coefficients(f, w, options, memory, t, state, unit):
-    """Compute the Taylor series TARGET about `state` at t, with the unit of time `unit` (s); return DONE or NOT_FINITE.
+    """Compute the Taylor series about `state` at t, with the unit of time `unit` (s); return DONE or NOT_FINITE.
 
-    The linear system of each order is solved with the factors of its matrix in w.
+    It overwrites the stored series memory[TARGET]. The linear system of each order is solved with the factors in w.
     """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = array_views(options, memory, n, n_rows)
@@ -456,7 +457,7 @@ def _evaluate_series(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the ratio of the defect at the time t + s h to the allowed defect, or infinity; q, v, a: scratch."""
+    """Return the defect at the time t + s h relative to the allowed one, infinity if undefined; q, v, a: scratch."""
     series_a = series_accelerations(memory, q.size)
     _evaluate_series(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
     if evaluate_without_projection(f, w, t + s * h, q, v, a) != DONE:
@@ -542,7 +543,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
-        was_near_singular = w.nearly_singular != 0.0  # True if the run has ever come near a singular position
+        was_near_singular = w.nearly_singular != 0.0  # True if the run is, or has been, near a singular position
         # near a singular position, check no defect: the series is off the constraints, where accelerations are wrong
         checks_defect = w.near_now == 0.0
         w.near_now = 0.0 if checks_defect else 2.0
