@@ -117,7 +117,7 @@ VECTOR = numba.types.float64[::1]
 READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # in memory, the same as VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
-# for each vector that callbacks receive, the attribute of a system that is its size; lam: the multipliers of C = 0
+# name of the attribute of a system that is the size of a vector which callbacks receive; lam: multipliers of C = 0
 STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 

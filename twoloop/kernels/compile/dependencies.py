@@ -346,7 +346,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value, if any, else the value; replace attributes `names` of modules."""
+        """Return the replacement of a value, if any, else the value; in a module, replace the attributes `names`."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)

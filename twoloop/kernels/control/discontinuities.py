@@ -167,7 +167,7 @@ LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
 MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: all stages may miss a force that lasts a quarter of it
 RESAMPLE_BELOW = 0.25  # times ahead are sampled again if the spacing must be below this fraction of the last spacing
 MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers at t
-N_BISECTIONS = 20  # number of bisections that locate the change of a value between two samples
+N_BISECTIONS = 20  # number of bisections that locate the time of a change between two samples
 EQUAL_CHANGES = 1e-5  # two changes count as one if they are at most this fraction of the widest sample spacing apart
 # changes are not recorded until this time after the start, in units of tolerances[GAP]: just after the start, rounding
 # errors make a force that begins at zero, such as 1 - cos(t), seem to change suddenly
@@ -178,7 +178,7 @@ N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
 # accelerations do not last (see _acceleration_lasts) if one of them changes by more than this fraction of the largest
 # when velocities change by their tolerances
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # a change at most this number of sample spacings after the begin of a step counts as passed
+CHANGE_MARGIN = 0.01  # a change at most this number of sample spacings after the beginning of a step counts as passed
 # rows of w.changes, whose columns are the forces, C_t and b: rows 0 to N_SAMPLES are the samples of one set
 LARGEST_ROW = N_SAMPLES + 1  # largest |value| of each column so far
 MIDDLE_ROW = N_SAMPLES + 2  # values at a time between two samples
